@@ -27,16 +27,16 @@ from geogs.depth.cuda import fusion as check_module
 from geogs.depth.cuda import plane_sweep as sweep_module
 from geogs.depth.cuda import refinement as refine_module
 from geogs.depth.cuda.classical import CudaDepthEngine
-from geogs.depth.cuda.images import KeyframeImages, homographies
+from geogs.depth.cuda.images import KeyframeImages, packed
 from geogs.depth.cuda.plane_sweep import PlaneSlots, SweptDepth
 from geogs.depth.cuda.refinement import PixelPlaces, SlantedMaps, TrackerMaps
-from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth, homographies
 from geogs.depth.evidence import (
+    TrackerEvidence,
     choose_start,
     prior_weight,
     relative_precision,
     tracker_evidence,
-    tracker_prior,
 )
 from geogs.depth.plane_sweep import SweepResult, matching_costs, plane_sweep
 from geogs.geometry.camera import Camera
@@ -123,7 +123,7 @@ def test_matching_costs(setting, window):
     reference, *others = setting.scene.views
     planes = PlaneSlots.of(setting.planes, setting.device)
     images = [KeyframeImages.of(v, setting.device) for v in setting.scene.views]
-    across = homographies(reference, others, setting.render, setting.render)
+    across = packed(*homographies(reference, others, setting.render, setting.render))
     volume = sweep_module.match_planes(
         images[0].grey, torch.stack([i.grey for i in images[1:]]), _to(setting, across), planes,
         window,
@@ -186,16 +186,15 @@ def test_path_costs_and_winners(setting, count, size):
         _close(a, b, 2e-3, 0.999)
 
 
-def _tracker(setting: Setting):
+def _tracker(setting: Setting) -> TrackerEvidence:
     view = setting.scene.views[0]
     completed = complete_inverse_depth(view.inverse_depth, view.information, view.image)
-    prior = tracker_prior(completed, setting.working, setting.render)
-    return prior, tracker_evidence(completed, setting.working, setting.render)
+    return tracker_evidence(completed, setting.working, setting.render)
 
 
 def _maps(setting: Setting) -> TrackerMaps:
-    prior, tracker = _tracker(setting)
-    maps = (prior.inverse_depth, prior.weight, tracker.weight)
+    tracker = _tracker(setting)
+    maps = (tracker.inverse_depth, tracker.prior_weight, tracker.precision)
     return TrackerMaps(*(_to(setting, m) for m in maps))
 
 
@@ -268,31 +267,31 @@ def test_grids_too_large_for_the_gpu_or_without_knowledge_are_completed_on_the_c
 
 
 def test_start_is_the_surer_of_sweep_and_tracker(setting):
-    prior, _ = _tracker(setting)
-    shape = prior.weight.shape
-    swept = prior.inverse_depth * (F(0.9) + F(0.2) * _random(*shape))
+    tracker = _tracker(setting)
+    shape = tracker.prior_weight.shape
+    swept = tracker.inverse_depth * (F(0.9) + F(0.2) * _random(*shape))
     cost, margin = _random(*shape, seed=1), F(4.0) * _random(*shape, seed=2)
-    expected = choose_start(prior, SweepResult(swept, cost, margin))
+    expected = choose_start(tracker, SweepResult(swept, cost, margin))
     maps = SweptDepth(*(_to(setting, m) for m in (swept, cost, margin)))
     rho, sure = refine_module.choose_start(_maps(setting), maps)
-    _close(rho, expected.inverse_depth, 1e-6)
-    _close(sure, expected.weight + F(0.02), 1e-5)
+    _close(rho, expected[0], 1e-6)
+    _close(sure, expected[1], 1e-5)
 
 
 def test_photometric_step(setting):
     views = setting.scene.views
     patches = cpu_refinement._gather_patches(views[0], views[1:], setting.render, setting.working)
-    _, tracker = _tracker(setting)
+    tracker = _tracker(setting)
     shape = setting.scene.truth[0].shape
     rho = (1.0 / setting.scene.truth[0]) * (F(0.98) + F(0.04) * _random(*shape))
     slopes = [F(1e-3) * _random(*shape, seed=s) for s in (1, 2)]
     state = cpu_refinement.SlantedDepth(rho, *slopes, np.zeros_like(rho))
     photo = cpu_refinement._photometric_step(state, patches)
-    misfit = (tracker.inverse_depth / state.inverse_depth - 1.0) ** 2 * tracker.weight
-    known = tracker.weight / (1.0 + misfit / 4.0)
+    misfit = (tracker.inverse_depth / state.inverse_depth - 1.0) ** 2 * tracker.precision
+    known = tracker.precision / (1.0 + misfit / 4.0)
     data = (photo * state.inverse_depth + known * tracker.inverse_depth) / (photo + known)
     images = [KeyframeImages.of(v, setting.device) for v in views]
-    finely = homographies(views[0], views[1:], setting.render, setting.working)
+    finely = packed(*homographies(views[0], views[1:], setting.render, setting.working))
     maps = SlantedMaps(*(_to(setting, m) for m in (rho, *slopes, 0 * rho)))
     precision, sure = refine_module.photometric_step(
         maps, _to(setting, patches.samples), torch.stack([i.fine for i in images[1:]]),
@@ -327,8 +326,8 @@ def test_plane_fits_with_and_without_averaging(setting):
 
 
 def test_confidence(setting):
-    _, tracker = _tracker(setting)
-    shape = tracker.weight.shape
+    tracker = _tracker(setting)
+    shape = tracker.precision.shape
     rho = tracker.inverse_depth * (F(0.95) + F(0.1) * _random(*shape))
     margin, support = F(5.0) * _random(*shape, seed=1), F(20.0) * _random(*shape, seed=2)
     near, far = float(1.0 / np.median(rho)), float(2.0 / rho.min())
@@ -352,12 +351,13 @@ def _engines(setting: Setting) -> tuple[CpuDepthEngine, CudaDepthEngine]:
 
 def test_sweep_of_a_view(setting):
     reference, *others = setting.scene.views
-    prior, _ = _tracker(setting)
+    tracker = _tracker(setting)
     expected = plane_sweep(
-        reference, others, setting.render, setting.planes, prior.inverse_depth, prior.weight,
+        reference, others, setting.render, setting.planes, tracker.inverse_depth,
+        tracker.prior_weight,
     )  # fmt: skip
     images = [KeyframeImages.of(v, setting.device) for v in setting.scene.views]
-    across = homographies(reference, others, setting.render, setting.render)
+    across = packed(*homographies(reference, others, setting.render, setting.render))
     maps = _maps(setting)
     swept = sweep_module.sweep(
         images[0], torch.stack([i.grey for i in images[1:]]), _to(setting, across),

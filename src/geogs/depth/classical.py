@@ -4,6 +4,7 @@ What is compiled is imported by the first keyframe that needs it, long after the
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -61,9 +62,8 @@ class CpuDepthEngine:
             if not rest:
                 return own.depth
             arrays, poses = [o.depth.arrays() for o in rest], [o.T_cw for o in rest]
-            return DenseDepth.of(
-                check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render)
-            )
+            checked = check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render)
+            return replace(DenseDepth.of(checked), normal=own.depth.normal)
 
         return thread_map(one, list(zip(depths, others, strict=True)))
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.depth.evidence import DepthEvidence
+from geogs.depth.evidence import TrackerEvidence
 from geogs.depth.refinement import SlantedDepth
 
 
@@ -33,7 +33,7 @@ WEIGHTS = ConfidenceWeights()
 def depth_confidence(
     refined: SlantedDepth,
     margin: Float32[np.ndarray, "h w"],
-    tracker: DepthEvidence,
+    tracker: TrackerEvidence,
 ) -> Float32[np.ndarray, "h w"]:
     """Chance that each depth is right to 2 %.
 
@@ -44,7 +44,7 @@ def depth_confidence(
     w, depth = WEIGHTS, 1.0 / refined.inverse_depth
     kernel = np.ones((3, 3), np.uint8)
     jump = np.log(cv2.dilate(depth, kernel) / cv2.erode(depth, kernel)) / w.tolerance
-    known = np.minimum(tracker.weight * np.float32(w.tolerance**2), 1.0)
+    known = np.minimum(tracker.precision * np.float32(w.tolerance**2), 1.0)
     agrees = np.exp(-0.5 * ((tracker.inverse_depth * depth - 1.0) / 0.03) ** 2)
     score = w.bias + w.margin * np.clip(margin, 0.0, 4.0)
     score += known * (w.tracker_agrees * agrees + w.tracker_differs * (1.0 - agrees))

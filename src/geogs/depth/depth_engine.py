@@ -42,9 +42,36 @@ class DepthEngine(Protocol):
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
     ) -> list[DenseDepth]:
-        """Every depth repaired, averaged and judged by its others (``check_depth``)."""
+        """Every depth repaired, averaged and judged by its others (``check_depth``).
+
+        Normals stay as they are.
+        """
         ...
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """World points that do not stand in the free space of the depths (``vote``)."""
         ...
+
+
+class AlternativeSearch:
+    """Finds depths in a way of its own and leaves everything else to the ``classical`` engine.
+
+    That is the check by other keyframes, the votes, and what a subclass asks of it.
+    """
+
+    def __init__(self, classical: DepthEngine) -> None:
+        self.classical = classical
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol."""
+        self.classical.observe(view)
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+        return self.classical.check(depths, others)
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        return self.classical.keep(points, depths)

@@ -141,6 +141,17 @@ def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:
     )
 
 
+def homographies(
+    reference: DepthView, neighbours: Sequence[DepthView], source: Camera, target: Camera
+) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]:
+    """a and b: pixel p of the reference's ``source`` camera at inverse depth rho appears at
+    a p + rho b (homogeneous) in each neighbour's ``target`` camera.
+    """
+    k, back = target.matrix().numpy(), np.linalg.inv(source.matrix().numpy())
+    relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+    return k @ relative[:, :3, :3] @ back, relative[:, :3, 3] @ k.T
+
+
 def dense_depths(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
     """Depths with confidences and their medians, for which the host does not wait for a GPU."""
     if not maps:

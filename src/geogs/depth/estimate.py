@@ -8,7 +8,7 @@ from geogs.config import DepthConfig
 from geogs.depth.completion import complete_inverse_depth
 from geogs.depth.confidence import depth_confidence
 from geogs.depth.depth_view import DepthView, KeyframeDepth
-from geogs.depth.evidence import choose_start, tracker_evidence, tracker_prior
+from geogs.depth.evidence import choose_start, tracker_evidence
 from geogs.depth.plane_sweep import plane_sweep, sweep_planes
 from geogs.depth.refinement import refine_depth
 from geogs.depth.sweep_neighbors import depth_range
@@ -34,15 +34,16 @@ def estimate_depth(
     completed = complete_inverse_depth(
         reference.inverse_depth, reference.information, reference.image
     )
-    prior = tracker_prior(completed, working, render)
+    tracker = tracker_evidence(completed, working, render)
     if not neighbours:
-        return KeyframeDepth(1.0 / prior.inverse_depth, 0.5 * prior.weight)
+        return KeyframeDepth(1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight)
     near, far = limits or depth_range(reference, neighbours, working)
     planes = sweep_planes(reference, neighbours, render, near, far, most_planes)
-    sweep = plane_sweep(reference, neighbours, render, planes, prior.inverse_depth, prior.weight)
-    start = choose_start(prior, sweep)
-    tracker = tracker_evidence(completed, working, render)
-    refined = refine_depth(reference, neighbours, render, working, start, tracker)
+    sweep = plane_sweep(
+        reference, neighbours, render, planes, tracker.inverse_depth, tracker.prior_weight
+    )
+    start = choose_start(tracker, sweep)
+    refined = refine_depth(reference, neighbours, render, working, *start, tracker)
     refined.inverse_depth = np.clip(refined.inverse_depth, 0.5 / far, 2.0 / near)
     return KeyframeDepth(
         1.0 / refined.inverse_depth, depth_confidence(refined, sweep.margin, tracker)

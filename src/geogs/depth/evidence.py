@@ -21,33 +21,26 @@ KINK = 0.06
 
 
 @dataclass(frozen=True, slots=True)
-class DepthEvidence:
-    """An inverse depth and how much it counts."""
+class TrackerEvidence:
+    """The completed depth of the tracker at the render size, and how much it counts."""
 
     inverse_depth: Float32[np.ndarray, "h w"]
-    weight: Float32[np.ndarray, "h w"]
+    prior_weight: Float32[np.ndarray, "h w"]
+    """How sure it is, in [0, 1], for the sweep."""
+    precision: Float32[np.ndarray, "h w"]
+    """Relative precision, for the refinement."""
 
 
-def tracker_prior(completed: CompletedDepth, working: Camera, render: Camera) -> DepthEvidence:
-    """The completed depth, for the sweep, with ``prior_weight``."""
-    return DepthEvidence(
-        upsample_grid(completed.inverse_depth, working, render),
-        upsample_grid(prior_weight(completed), working, render),
-    )
+def tracker_evidence(completed: CompletedDepth, working: Camera, render: Camera) -> TrackerEvidence:
+    """The completed depth with its ``prior_weight`` and ``relative_precision``."""
+    grids = (completed.inverse_depth, prior_weight(completed), relative_precision(completed))
+    return TrackerEvidence(*(upsample_grid(grid, working, render) for grid in grids))
 
 
 def prior_weight(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
     """1 / (1 + (deviation / confident one)^2) on the grid, 0 where the tracker was rejected."""
     weight = 1.0 / (1.0 + (completed.deviation / np.float32(CONFIDENT_DEVIATION)) ** 2)
     return np.where(completed.inlier, weight, np.float32(0.0))
-
-
-def tracker_evidence(completed: CompletedDepth, working: Camera, render: Camera) -> DepthEvidence:
-    """The completed depth with its ``relative_precision`` as weight."""
-    return DepthEvidence(
-        upsample_grid(completed.inverse_depth, working, render),
-        upsample_grid(relative_precision(completed), working, render),
-    )
 
 
 def relative_precision(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
@@ -62,18 +55,21 @@ def relative_precision(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"
     return _flatness(completed.inverse_depth) ** 2 / sigma**2
 
 
-def choose_start(prior: DepthEvidence, sweep: SweepResult) -> DepthEvidence:
-    """Per pixel the sweep's depth, or the tracker's where it is sure and the sweep is not better.
+def choose_start(
+    tracker: TrackerEvidence, sweep: SweepResult
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """The inverse depth to refine, and how much each pixel counts in the first plane fits.
 
-    The weight is a rough confidence in [0, 1].
+    It is the sweep's, or the tracker's where that is sure and the sweep is not better.
     """
+    prior, sure = tracker.inverse_depth, tracker.prior_weight
     unique = np.clip(0.5 * sweep.margin - 0.25, 0.0, 1.0) * (sweep.cost < 0.8)
-    agree = np.abs(sweep.inverse_depth / prior.inverse_depth - 1.0) < 0.05
-    tracker = (agree & (prior.weight > 0.3)) | ((prior.weight > 0.5) & (unique < 0.3))
-    both = np.where(agree, np.maximum(prior.weight, unique), prior.weight)
-    inverse = np.where(tracker, prior.inverse_depth, sweep.inverse_depth)
-    weight = np.where(tracker, both, 0.7 * unique)
-    return DepthEvidence(inverse.astype(np.float32), weight.astype(np.float32))
+    agree = np.abs(sweep.inverse_depth / prior - 1.0) < 0.05
+    taken = (agree & (sure > 0.3)) | ((sure > 0.5) & (unique < 0.3))
+    both = np.where(agree, np.maximum(sure, unique), sure)
+    inverse_depth = np.where(taken, prior, sweep.inverse_depth).astype(np.float32)
+    weight = np.where(taken, both, 0.7 * unique).astype(np.float32)
+    return inverse_depth, weight + np.float32(0.02)
 
 
 def _flatness(inverse_depth: Float32[np.ndarray, "gh gw"]) -> Float32[np.ndarray, "gh gw"]:

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from geogs.depth import plane_sweep_kernels as kernels
-from geogs.depth.depth_view import DepthView
+from geogs.depth.depth_view import DepthView, homographies
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
 
@@ -137,7 +137,7 @@ def matching_costs(
     mean = cv2.blur(grey, size, borderType=cv2.BORDER_REPLICATE)
     square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
     scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
-    a, b = _homographies(reference, neighbours, camera)
+    a, b = homographies(reference, neighbours, camera, camera)
     volume = np.empty((*grey.shape, len(planes)), np.float32)
     over_rows(
         lambda *rows: kernels.match_planes(
@@ -146,13 +146,3 @@ def matching_costs(
         len(grey),
     )
     return volume
-
-
-def _homographies(
-    reference: DepthView, neighbours: Sequence[DepthView], camera: Camera
-) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]:
-    """a and b: pixel p (homogeneous) at inverse depth rho appears at a p + rho b."""
-    k = camera.matrix().numpy()
-    relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
-    a = np.stack([k @ m[:3, :3] @ np.linalg.inv(k) for m in relative])
-    return a, np.stack([k @ m[:3, 3] for m in relative])

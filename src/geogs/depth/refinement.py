@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from geogs.depth import refinement_kernels as kernels
-from geogs.depth.depth_view import DepthView
-from geogs.depth.evidence import DepthEvidence
+from geogs.depth.depth_view import DepthView, homographies
+from geogs.depth.evidence import TrackerEvidence
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows
@@ -72,28 +72,27 @@ def refine_depth(
     neighbours: Sequence[DepthView],
     render: Camera,
     working: Camera,
-    start: DepthEvidence,
-    tracker: DepthEvidence,
+    rho: Float32[np.ndarray, "h w"],
+    sure: Float32[np.ndarray, "h w"],
+    tracker: TrackerEvidence,
 ) -> SlantedDepth:
     """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
 
-    ``start.weight`` (0 to 1) says which pixels make the first planes. After each step a pixel's
-    inverse depth is the precision-weighted mean of the photometric optimum, the tracker's value
-    (``tracker.weight`` = relative precision, robust) and the local plane.
+    They begin at the inverse depth ``rho``; ``sure`` (0 to 1) says which pixels make the first
+    planes. After each step a pixel's inverse depth is the precision-weighted mean of the
+    photometric optimum, the tracker's value (robust) and the local plane.
     """
     patches = _gather_patches(reference, neighbours, render, working)
     guide = _colour_guide(reference, render)
-    rho = start.inverse_depth
     state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
-    sure = start.weight + np.float32(0.02)
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
         _fit_planes(state, sure, guide, radius, tolerance, 0.0)
     state.inverse_depth = rho.copy()
     for _ in range(REFINE_STEPS):
         photo_precision = _photometric_step(state, patches)
         rho = state.inverse_depth
-        misfit = (tracker.inverse_depth / rho - 1.0) ** 2 * tracker.weight
-        tracker_precision = tracker.weight / (1.0 + misfit / 4.0)
+        misfit = (tracker.inverse_depth / rho - 1.0) ** 2 * tracker.precision
+        tracker_precision = tracker.precision / (1.0 + misfit / 4.0)
         precision = photo_precision + tracker_precision
         data = (photo_precision * rho + tracker_precision * tracker.inverse_depth) / precision
         state.inverse_depth = data
@@ -178,13 +177,12 @@ def _gather_patches(
         sample[:] = fine - np.float32(0.5)
     contrast = (samples - samples[len(samples) // 2]) ** 2
     weights = 1.0 / (1.0 + np.float32(PATCH_CONTRAST) * contrast)
-    k, k_inverse = working.matrix().numpy(), np.linalg.inv(render.matrix().numpy())
-    relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
+    a, b = homographies(reference, neighbours, render, working)
     return _Patches(
         samples=samples,
         offsets=offsets,
         weights=weights,
         images=np.stack([v.fine for v in neighbours]) - np.float32(0.5),
-        a=np.stack([k @ m[:3, :3] @ k_inverse for m in relative]),
-        b=np.stack([k @ m[:3, 3] for m in relative]),
+        a=a,
+        b=b,
     )

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from geogs.depth.completion import known_cells, upsample_grid
-from geogs.depth.depth_engine import DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
 from geogs.geometry.camera import Camera
 
@@ -33,13 +31,13 @@ def enlarged_depth(view: DepthView, working: Camera, render: Camera) -> Keyframe
     return KeyframeDepth((1 / inverse).astype(np.float32), sure.astype(np.float32))
 
 
-class TrackerDepthEngine:
+class TrackerDepthEngine(AlternativeSearch):
     """Depths as the bundle adjustment has left them; a search engine votes on points, if asked."""
 
     def __init__(
-        self, search: DepthEngine, device: torch.device, render: Camera, working: Camera
+        self, classical: DepthEngine, device: torch.device, render: Camera, working: Camera
     ) -> None:
-        self.search = search
+        super().__init__(classical)
         self.device = device
         self.render = render
         self.working = working
@@ -62,10 +60,6 @@ class TrackerDepthEngine:
     ) -> list[DenseDepth]:
         """As in the protocol; the depths stay what they are."""
         return [d.depth for d in depths]
-
-    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """As in the protocol."""
-        return self.search.keep(points, depths)
 
     def _dense(self, depth: KeyframeDepth) -> DenseDepth:
         known = depth.depth[depth.confidence > 0]

@@ -13,11 +13,11 @@ from torch import Tensor
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.fusion import check, vote
-from geogs.depth.cuda.images import KeyframeImages, homographies, image_pixels, upload
+from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed, upload
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
 from geogs.depth.cuda.refinement import PixelPlaces, TrackerMaps, choose_start, judge, refine
 from geogs.depth.depth_engine import Limits, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
 from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
@@ -165,8 +165,8 @@ class CudaDepthEngine:
         if not neighbours:
             return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
         others = [self._images_of(v) for v in neighbours]
-        across = homographies(reference, neighbours, self.render, self.render)
-        finely = homographies(reference, neighbours, self.render, self.working)
+        across = packed(*homographies(reference, neighbours, self.render, self.render))
+        finely = packed(*homographies(reference, neighbours, self.render, self.working))
         swept = sweep(
             own, torch.stack([o.grey for o in others]), upload(across, device),
             PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight,

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from geogs.depth import carve, fusion
-from geogs.depth.cuda.images import transforms, upload
+from geogs.depth.cuda.images import packed, upload
 from geogs.depth.depth_view import PosedDepth
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
@@ -25,8 +25,9 @@ def check(own: PosedDepth, others: Sequence[PosedDepth], camera: Camera) -> tupl
     depth, confidence = own.depth.depth, own.depth.confidence
     (h, w), n, device = depth.shape, len(others), depth.device
     to_others = np.stack([o.T_cw for o in others]) @ np.linalg.inv(own.T_cw)
-    both = np.stack([transforms(to_others), transforms(np.linalg.inv(to_others))])
-    matrices, maps = upload(both, device), upload(_addresses(others), device)
+    both = np.concatenate([to_others, np.linalg.inv(to_others)])
+    matrices = upload(packed(both[:, :3, :3], both[:, :3, 3]), device).view(2, n, 12)
+    maps = upload(_addresses(others), device)
     settings = upload(np.array(CHECK, np.float32), device)
     lens, kernels = (camera.fx, camera.fy, camera.cx, camera.cy), kernels_for(SOURCE, device)
     seen = torch.full((n, h, w), -1, dtype=torch.int64, device=device)
@@ -56,7 +57,8 @@ def vote(
     votes = torch.zeros(len(points), 2, dtype=torch.int32, device=device)
     for start in range(0, len(depths), VOTERS_TOGETHER):
         held = list(depths[start : start + VOTERS_TOGETHER])  # the kernel reads where they lie
-        matrices = upload(transforms(np.stack([d.T_cw for d in held])), device)
+        T_cw = np.stack([d.T_cw for d in held])
+        matrices = upload(packed(T_cw[:, :3, :3], T_cw[:, :3, 3]), device)
         kernels_for(SOURCE, device)["vote_on_points"](
             -(-len(points) // 128), 128, points, upload(_addresses(held), device), matrices,
             len(points), len(held), *held[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,

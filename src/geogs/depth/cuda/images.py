@@ -1,6 +1,5 @@
 """What the depth kernels read of a keyframe's image."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +9,6 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from geogs.depth.depth_view import DepthView
-from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import to_device
 
 
@@ -55,18 +53,8 @@ def upload(array: np.ndarray, device: torch.device) -> Tensor:
     return to_device(torch.from_numpy(np.ascontiguousarray(array)), device)
 
 
-def homographies(
-    reference: DepthView, neighbours: Sequence[DepthView], source: Camera, target: Camera
+def packed(
+    A: Float64[np.ndarray, "n 3 3"], b: Float64[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 12"]:
-    """a (3 x 3, row by row) and b: pixel p of the reference's ``source`` camera at inverse depth
-    rho appears at a p + rho b (homogeneous) in the neighbour's ``target`` camera.
-    """
-    k, back = target.matrix().numpy(), np.linalg.inv(source.matrix().numpy())
-    relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
-    a, b = k @ relative[:, :3, :3] @ back, relative[:, :3, 3] @ k.T
-    return np.concatenate([a.reshape(-1, 9), b], 1).astype(np.float32)
-
-
-def transforms(T: Float64[np.ndarray, "n 4 4"]) -> Float32[np.ndarray, "n 12"]:
-    """Rotation (row by row) and translation of each matrix, as the kernels take them."""
-    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], 1).astype(np.float32)
+    """Each matrix, row by row, and the vector that goes with it, as the kernels take them."""
+    return np.concatenate([A.reshape(-1, 9), b], 1).astype(np.float32)

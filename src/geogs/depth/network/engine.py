@@ -7,13 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
 from geogs.depth.completion import known_cells
-from geogs.depth.depth_engine import DepthEngine, Limits, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths
+from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.weights import TrainedDepth
@@ -34,10 +34,9 @@ _EDGE = 0.02
 between two surfaces."""
 
 
-class NetworkDepthEngine:
-    """The network finds depths, normals and confidence; ``classical`` does everything else.
+class NetworkDepthEngine(AlternativeSearch):
+    """Finds depths, normals and confidence by the network where there are neighbours.
 
-    That is the check by other keyframes, the votes, and depth where there are no neighbours.
     Images of the ``resident`` keyframes used last stay on the device.
     """
 
@@ -50,7 +49,7 @@ class NetworkDepthEngine:
         working: Camera,
         resident: int,
     ) -> None:
-        self.classical = classical
+        super().__init__(classical)
         self.device = device
         self.render = render
         self.working = working
@@ -63,10 +62,6 @@ class NetworkDepthEngine:
             lambda *views: self._at_render(self.network(StereoViews(*views))), "The depth network"
         )
         self._images: LruCache[int, UInt8[Tensor, "h w 3"]] = LruCache(resident)
-
-    def observe(self, view: DepthView) -> None:
-        """As in the protocol."""
-        self.classical.observe(view)
 
     def estimate(
         self,
@@ -85,17 +80,6 @@ class NetworkDepthEngine:
                 found += self.classical.estimate([reference], [[]], limits=[between])
             progress(len(found) / len(references))
         return found
-
-    def check(
-        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
-    ) -> list[DenseDepth]:
-        """As in the protocol; normals stay."""
-        checked = self.classical.check(depths, others)
-        return [replace(c, normal=d.depth.normal) for c, d in zip(checked, depths, strict=True)]
-
-    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """As in the protocol."""
-        return self.classical.keep(points, depths)
 
     @torch.no_grad()
     def _search(

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.depth_engine import DepthEngine, Limits, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths
+from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""
@@ -22,17 +20,12 @@ on four keyframes of two rendered rooms."""
 _BOUND = 0.02
 
 
-class JointDepthEngine:
+class JointDepthEngine(AlternativeSearch):
     """Searches with both engines, and takes of each what it knows; normals are the network's."""
 
     def __init__(self, network: DepthEngine, classical: DepthEngine) -> None:
-        """``network`` also has what is left to ``classical`` without one."""
+        super().__init__(classical)
         self.network = network
-        self.classical = classical
-
-    def observe(self, view: DepthView) -> None:
-        """As in the protocol."""
-        self.network.observe(view)
 
     def estimate(
         self,
@@ -52,16 +45,6 @@ class JointDepthEngine:
             joined(s, n) if others else n
             for s, n, others in zip(searched, learned, neighbours, strict=True)
         ]
-
-    def check(
-        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
-    ) -> list[DenseDepth]:
-        """As in the protocol; normals stay."""
-        return self.network.check(depths, others)
-
-    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """As in the protocol."""
-        return self.classical.keep(points, depths)
 
 
 def joined(first: DenseDepth, second: DenseDepth) -> DenseDepth:
