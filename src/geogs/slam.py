@@ -124,7 +124,7 @@ class Slam(SlamOutput):
         """Let the map follow the corrections of the keyframes."""
         for correction in self.segments.main.keyframes.take_corrections():
             with self.stopwatch("map update"):
-                self.executor.correct(correction)
+                self.executor.mapping.correct(correction)
 
     @on_one_torch_thread
     def end_stream(self) -> None:
@@ -166,8 +166,7 @@ class Slam(SlamOutput):
         In about so many ``seconds``, as after an interruption, only where there is no map yet.
         """
         label = "mapping" if self.executor.maps_at_end else "map refinement"
-        with self.stopwatch("final mapping"):
-            self.executor.refine(self.world.unmapped, partial(progress, label), seconds)
+        self.executor.refine(self.world.unmapped, partial(progress, label), seconds)
         self.world.is_refined = self.will_refine and seconds is None
 
     @on_one_torch_thread

@@ -108,11 +108,10 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
     assert mapped
     assert disks > 200
     assert len(slam.renders()) == len(mapped)
+    taken = dict(slam.stopwatch.seconds)
     slam.refine(seconds=100.0)  # there is one now
-    assert (slam.world.map.mapped, len(slam.world.map.disks)) == (
-        mapped,
-        disks,
-    )
+    assert (slam.world.map.mapped, len(slam.world.map.disks)) == (mapped, disks)
+    assert slam.stopwatch.seconds == taken
     assert not slam.world.is_refined
 
 
@@ -120,6 +119,13 @@ def test_without_a_keyframe_there_is_no_map(frames):
     slam = Slam(frames[0], quick(), defers_map=True)
     slam.refine()
     assert len(slam.snapshot()) == 0
+    assert not slam.stopwatch.seconds
+
+
+def test_what_is_not_refined_takes_no_time(frames):
+    slam = Slam(frames[0], quick())
+    slam.refine(seconds=1.0)
+    assert not slam.stopwatch.seconds
 
 
 def test_what_needs_the_map_on_the_way_has_it(frames):

@@ -90,7 +90,7 @@ def go_on_in(slam: Slam, saved: SavedResult) -> None:
     size, given = (slam.camera.width, slam.camera.height), zip(ids, saved.keyframes, strict=True)
     masks = {i: _enlarged(k.mask, size) for i, k in given if k.mask is not None}
     with slam.stopwatch("mapping"):
-        slam.executor.take_over(saved.disks, masks, ids)
+        slam.executor.mapping.take_over(saved.disks, masks, ids)
 
 
 def _enlarged(mask: Tensor, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:

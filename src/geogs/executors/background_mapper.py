@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TypeVar
 
@@ -14,7 +14,7 @@ from geogs.concurrent import PriorityGate
 from geogs.errors import GeogsError
 from geogs.executors.keyframe_mirror import KeyframeMirror
 from geogs.mapping.mapper import Mapper, never_pause
-from geogs.types import PoseCorrection
+from geogs.types import MapSnapshot, PoseCorrection
 from geogs.world.keyframes import KeyframeTable
 
 R = TypeVar("R")
@@ -78,10 +78,14 @@ class BackgroundMapper:
         """See ``Mapper.correct``."""
         self._tell(lambda mapper: mapper.correct(correction))
 
-    def begin_with(self, take_over: Callable[[Mapper], object], ids: Sequence[int]) -> None:
-        """Let the mapper take over a saved map, whose keyframes have these ids."""
+    def take_over(
+        self, disks: MapSnapshot, masks: Mapping[int, Bool[np.ndarray, "h w"]], ids: Sequence[int]
+    ) -> None:
+        """See ``Mapper.take_over``."""
         self._mirror.follow(ids)
-        self._tell(take_over)
+        self._tell(lambda mapper: mapper.take_over(disks, masks, ids))
+        if self._stream is not None:
+            torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
         """An answer from the mapper as it is between two things that it was told.

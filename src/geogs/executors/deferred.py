@@ -18,10 +18,11 @@ class Deferred(InOrder):
 
     def refine(self, unmapped: list[int], progress: Progress, seconds: float | None) -> None:
         """Make the map of all keyframes; in limited ``seconds`` only if there is none yet."""
-        if seconds is not None and (self.disks or not unmapped):
+        if (seconds is not None and self.disks) or not (unmapped or self.disks):
             return
-        for id in unmapped:
-            if id not in self.mapper.views:  # else it was interrupted after that
-                self.mapper.observe(id, self.mask.of(self.mapper.keyframes[id]))
-        map_all(self.mapper, [*unmapped], progress, seconds)
+        with self.stopwatch("final mapping"):
+            for id in unmapped:
+                if id not in self.mapper.views:  # else it was interrupted after that
+                    self.mapper.observe(id, self.mask.of(self.mapper.keyframes[id]))
+            map_all(self.mapper, [*unmapped], progress, seconds)
         unmapped.clear()

@@ -4,8 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar
 
-import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.executors.background_mapper import BackgroundMapper
@@ -15,7 +14,7 @@ from geogs.stopwatch import Stopwatch
 from geogs.tracking.locate.pose_deviation import DeviationOf
 from geogs.tracking.segment_trackers import Recall, Segments
 from geogs.tracking.tracker import TrackResult
-from geogs.types import Frame, MapSnapshot, PoseCorrection
+from geogs.types import Frame
 from geogs.world.segments import TrackState
 
 R = TypeVar("R")
@@ -37,7 +36,7 @@ class InOrder:
     ) -> None:
         self.segments, self.mapper = segments, mapper
         self.mapping: Mapper | BackgroundMapper = mapper
-        """What is told of keyframes and corrections: the mapper, or a thread that has one."""
+        """Whom keyframes and corrections are told: the mapper, or a thread that has one."""
         self.stopwatch, self.mask = stopwatch, mask
 
     # --- a frame -----------------------------------------------------------------------------
@@ -80,19 +79,6 @@ class InOrder:
         """Disks in the map."""
         return len(self.mapper.table.disks)
 
-    def take_over(
-        self,
-        disks: MapSnapshot,
-        masks: dict[int, Bool[np.ndarray, "h w"]],
-        ids: Sequence[int],
-    ) -> None:
-        """Begin with a saved map, see :meth:`Mapper.take_over`."""
-        self.mapper.take_over(disks, masks, ids)
-
-    def correct(self, correction: PoseCorrection) -> None:
-        """Let the map follow a correction of the keyframes."""
-        self.mapping.correct(correction)
-
     def map(
         self, unmapped: list[int], final: Sequence[int], lag: int, active: Sequence[int]
     ) -> None:
@@ -119,8 +105,9 @@ class InOrder:
 
     def refine(self, unmapped: list[int], progress: Progress, seconds: float | None) -> None:
         """Train the map over all keyframes; not in limited time, as there is a map already."""
-        if seconds is None:
-            self.mapper.refine(progress)
+        if seconds is None and self.mapper.table.mapped and self.mapper.config.final_iterations:
+            with self.stopwatch("final mapping"):
+                self.mapper.refine(progress)
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
         """An answer from the mapper."""

@@ -6,9 +6,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.concurrent import BackgroundTask
@@ -22,7 +21,7 @@ from geogs.tracking.follower import Follower
 from geogs.tracking.locate.pose_deviation import DeviationOf
 from geogs.tracking.segment_trackers import Recall, Segments
 from geogs.tracking.tracker import TrackResult
-from geogs.types import Frame, MapSnapshot
+from geogs.types import Frame
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.segments import TrackState
 
@@ -133,18 +132,6 @@ class Live(InOrder):
     def disks(self) -> int:
         """Disks in the map when a keyframe was last mapped."""
         return self._background.disks
-
-    def take_over(
-        self,
-        disks: MapSnapshot,
-        masks: dict[int, Bool[np.ndarray, "h w"]],
-        ids: Sequence[int],
-    ) -> None:
-        """Begin with a saved map, see :meth:`Mapper.take_over`."""
-        take_over = partial(Mapper.take_over, disks=disks, masks=masks, ids=ids)
-        self._background.begin_with(take_over, ids)
-        if self._stream is not None:
-            torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
 
     def _refine_poses(self, active: Sequence[int]) -> None:
         """Poses stay the tracker's, which does not wait for the map."""

@@ -216,9 +216,8 @@ class Mapper:
             self.growth.insert(view, self.config.disk.insert_confidence)
 
     def refine(self, progress: Progress = silent) -> None:
-        """Train over all keyframes with the final poses, after searching their depths again."""
-        if not self.table.mapped or self.config.final_iterations == 0:
-            return
+        """Train over all mapped keyframes, which there must be, with the final poses, after
+        searching their depths again."""
         searched, start = self._searched(), SEARCHED if self.config.final_depth else 0.0
         if self.config.final_depth and searched:
             self.depths.estimate(searched, lambda fraction: progress(SEARCHED * fraction))

@@ -102,12 +102,6 @@ class TimeBudget:
             return None
         return self._deadline - self.output_cost.of(self.views or len(self._read))
 
-    @property
-    def training_left(self) -> float:
-        """Seconds until training must have ended."""
-        end = self.training_end
-        return np.inf if end is None else end - time.perf_counter()
-
     def count_image(self) -> None:
         """An image has been read."""
         self._read.append(time.perf_counter())
