@@ -21,7 +21,7 @@ class StageTimes:
     seconds: dict[str, float] = field(default_factory=dict)
     """By stage."""
     until_stream_end: float | None = None
-    """Of all stages up to the end of the stream; none before it."""
+    """Those of all stages up to the end of the stream; none before it."""
 
 
 class _Here(threading.local):

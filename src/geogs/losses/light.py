@@ -18,7 +18,7 @@ _FEWEST = 50
 """Weights of pixels, summed, that tell anything."""
 _LARGEST_GAIN = 8.0
 _THREADS = 1024
-"""Of the one block that fits on a GPU."""
+"""Threads of the one block, as many as one may have."""
 
 
 def same_light(device: torch.device | str) -> Float[Tensor, "2"]:

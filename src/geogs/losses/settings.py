@@ -62,7 +62,7 @@ class PhotoSettings(NamedTuple):
 
 
 def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> SingleViewSettings:
-    """Of views of a camera; ``unit`` is a length in map units that makes distortion unitless."""
+    """Settings for views of a camera; ``unit``, a length of the map, makes distortion unitless."""
     c, pixels = config, camera.width * camera.height
     return SingleViewSettings(
         camera.fx, camera.fy, camera.cx, camera.cy,
@@ -82,7 +82,7 @@ def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> Sin
 
 
 def photo_settings(config: LossConfig, camera: Camera, share: float = 1.0) -> PhotoSettings:
-    """Of pairs of photometric images of a camera, which count ``share`` of their loss each."""
+    """Settings for pairs of a camera's photometric images; ``share`` of each one's loss counts."""
     c, pixels = config, camera.width * camera.height
     return PhotoSettings(
         camera.fx, camera.fy, camera.cx, camera.cy,

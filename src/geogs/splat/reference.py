@@ -63,7 +63,7 @@ class PixelValues(NamedTuple):
     distortion: Tensor
     median_depth: Tensor
     visible: Tensor
-    """Of each projected disk: whether any of these pixels blends it."""
+    """Whether any of these pixels blends a projected disk, one for each."""
 
 
 def render_reference(

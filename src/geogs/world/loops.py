@@ -36,7 +36,7 @@ class Vocabulary:
     keyframes: list[int] = field(default_factory=list)
     """Indexed so far, earliest first."""
     counts: list[Int64[np.ndarray, "_ 2"]] = field(default_factory=list)
-    """Of each of them: its words, ascending, and how often it contains them."""
+    """For each of them its words, ascending, and how often it contains them."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ _DTYPES = frozenset({
     "bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float16",
     "float32", "float64",
 })  # fmt: skip
-"""Of arrays in archives."""
+"""Types of arrays in archives."""
 
 
 @dataclass
@@ -120,7 +120,7 @@ def _stored(kind: Any) -> dict[str, Any]:
 
 
 def _alternatives(kind: Any) -> tuple[Any, ...]:
-    """Of a union, but for None."""
+    """Kinds in a union, but for None."""
     return tuple(k for k in get_args(kind) if k is not type(None))
 
 

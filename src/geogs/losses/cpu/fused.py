@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from geogs.config import LossConfig
-from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.cpu import multi_view_kernels as multi
 from geogs.losses.cpu.single_view_kernels import single_view_rows
@@ -27,10 +26,6 @@ from geogs.threads import over_rows
 
 def _array(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
-
-
-def _lens(camera: Camera) -> list[float]:
-    return [camera.fx, camera.fy, camera.cx, camera.cy]
 
 
 class _SingleView(torch.autograd.Function):
@@ -105,8 +100,8 @@ class _MultiView(torch.autograd.Function):
         tables = (*_enlargement(len(small), height), *_enlargement(small.shape[1], width))
         hidden = np.empty((0, 0), np.float32) if target_depth is None else _array(target_depth)
         seen = target.camera if target_depth is None else target.camera.resized(*hidden.shape[::-1])
-        lenses = [_lens(c) for c in (reference.camera, target.camera, seen)]
-        lenses = np.array(lenses, np.float32)
+        cameras = (reference.camera, target.camera, seen)
+        lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], np.float32)
         settings = record(photo_settings(config, target.camera))
         half = config.ncc_patch // 2 if config.ncc_weight > 0 else -1
         with_depth, with_pose = ctx.needs_input_grad[:2]

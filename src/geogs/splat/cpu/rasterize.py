@@ -76,7 +76,7 @@ class Trace:
 
 @dataclass(slots=True)
 class Gradients:
-    """Of the four parameter arrays, float32, and of the upper three rows of T_cw, float64."""
+    """Gradients of the four parameter arrays, float32, and of T_cw's upper three rows, float64."""
 
     position: np.ndarray
     quaternion: np.ndarray

@@ -48,7 +48,7 @@ class Maps:
     distortion: Float[Tensor, "*b h w"]
     median_depth: Float[Tensor, "*b h w"]
     visible: Bool[Tensor, "n"]
-    """Of any view."""
+    """Whether any view blends a disk."""
 
     @staticmethod
     def empty(camera: Camera, views: tuple[int, ...], disks: int, device: torch.device) -> "Maps":
@@ -66,7 +66,7 @@ class Maps:
 
 @dataclass(slots=True)
 class MapGradients:
-    """Of a loss, with respect to the maps; contiguous float32."""
+    """Gradients of a loss with respect to the maps; contiguous float32."""
 
     depth: Float[Tensor, "*b h w"]
     normal: Float[Tensor, "..."]
