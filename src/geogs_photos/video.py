@@ -12,7 +12,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
-from geogs.io.sources.sniff import Stream
+from geogs.io.sources.frame_source import Source
 from geogs.stopwatch import Stopwatch
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
@@ -29,14 +29,14 @@ NEXT = 6
 """Chosen frames after each that it is matched with in any case."""
 
 
-def place_video(video: Stream, seed: int, report: Progress, stopwatch: Stopwatch) -> PlacedVideo:
+def place_video(video: Source, seed: int, report: Progress, stopwatch: Stopwatch) -> PlacedVideo:
     """Choose the sharp frames of a video and find where they were taken.
 
     Its camera stays as it is where its calibration is given. What is wanted of it, and what it
     raises: ``geogs.application.photos.place_video``.
     """
     with stopwatch("choosing frames"):
-        every = stretch_length(float(getattr(video, "fps", 30.0)), video.length)
+        every = stretch_length(video.fps, video.length)
         chosen = sharpest_frames(video, every)
     with stopwatch("structure from motion"):
         return place_frames(chosen, video.camera, not video.is_calibration_open, seed, report)

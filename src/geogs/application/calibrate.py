@@ -12,7 +12,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.progress import RunProgress
 from geogs.config import Config
 from geogs.io.sources.calibration import Calibration, FocalRefinement
-from geogs.io.sources.sniff import Stream
+from geogs.io.sources.frame_source import Source
 from geogs.shutter.shutter import Shutter
 
 if TYPE_CHECKING:
@@ -24,12 +24,12 @@ F = TypeVar("F")
 
 
 def self_calibrated(
-    source: Stream,
+    source: Source,
     config: Config | None = None,
     device: str | torch.device = "cpu",
     progress: RunProgress | None = None,
     stop: Stop | None = None,
-) -> Stream:
+) -> Source:
     """The source with its focal length refined, if that is a guess or nominal and may be refined.
 
     Where the video does not tell, or after a request to stop, the guess stays and ``progress``
@@ -104,8 +104,8 @@ def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
 
 
 def with_shutter_found(
-    source: Stream, progress: RunProgress | None = None, stop: Stop | None = None
-) -> Stream:
+    source: Source, progress: RunProgress | None = None, stop: Stop | None = None
+) -> Source:
     """The source with the readout of its rolling shutter found, if nobody gave it.
 
     Where the video does not show one, or after a request to stop, the shutter counts as global, and

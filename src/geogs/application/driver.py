@@ -20,8 +20,8 @@ from geogs.application.results.write import write_results
 from geogs.application.settings import ReconstructSettings, RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.errors import DeviceError
+from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Work(ABC):
 
     @property
     @abstractmethod
-    def source(self) -> Stream | PosedSource:
+    def source(self) -> Source | PosedSource:
         """What it was made from."""
 
     @property

@@ -13,7 +13,7 @@ from geogs.application.photos import PlacedVideo, localiser, place_video
 from geogs.config import Config, ReconstructConfig
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.sniff import Stream
+from geogs.io.sources.frame_source import Source
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import Stopwatch
 from geogs.tracking.frames.interpolation import bridged
@@ -27,7 +27,7 @@ class PlacedOffline(Work):
     default settings; of the run's, input, mesh and seed count.
     """
 
-    def __init__(self, config: Config, video: Stream) -> None:
+    def __init__(self, config: Config, video: Source) -> None:
         self._config = replace(
             ReconstructConfig(), seed=config.seed, input=config.input, mesh=config.mesh
         )
@@ -42,7 +42,7 @@ class PlacedOffline(Work):
         return self._scene
 
     @property
-    def source(self) -> Stream:
+    def source(self) -> Source:
         """The video, calibrated as soon as its sharp frames have been placed."""
         return self._source
 
@@ -109,7 +109,7 @@ class OfflineScene(Reconstruction):
 
 
 def _place_all(
-    source: Stream,
+    source: Source,
     scene: OfflineScene,
     placed: PlacedVideo,
     config: ReconstructConfig,
@@ -133,7 +133,7 @@ def _place_all(
     return T_cw
 
 
-def _of_source(source: Stream, placed: PlacedVideo) -> Calibration:
+def _of_source(source: Source, placed: PlacedVideo) -> Calibration:
     """The camera that was found, for the images as they came."""
     was = source.calibration
     found = replace(placed.calibration, origin="structure from motion of the video")

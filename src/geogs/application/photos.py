@@ -15,8 +15,8 @@ from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch
 from geogs.types import Frame
 
@@ -61,7 +61,7 @@ class PlacedVideo:
 
 
 def place_video(
-    video: Stream,
+    video: Source,
     seed: int,
     report: Callable[[str, float], None],
     stopwatch: Stopwatch,

@@ -15,7 +15,6 @@ from geogs.application.checkpoints.run_state import (
     RunMetadata,
     RunState,
     SavedRun,
-    frames_after,
     run_state,
 )
 from geogs.application.driver import Ending, Job, Work
@@ -36,7 +35,8 @@ from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.sources.sniff import Stream, open_source
+from geogs.io.sources.frame_source import Source
+from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
@@ -104,7 +104,7 @@ def seen_by(base: SavedResult, config: Config) -> InputConfig:
 
 
 def _begun(
-    settings: RunSettings, job: Job, opened: Stream, base: SavedResult | None
+    settings: RunSettings, job: Job, opened: Source, base: SavedResult | None
 ) -> "TrackedVideo":
     """A system for an opened source, calibrated; in the map of ``base`` if that is given."""
     config, progress, stop = settings.config, job.progress, job.stop
@@ -166,7 +166,7 @@ def resume(
             )  # fmt: skip
         progress.write(f"Going on after {slam.frames} frames.")
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
-        frames = frames_after(source, saved.metadata.place)
+        frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, settings, metadata, folder)
         return Job(settings, folder, device, progress, stop, observer).complete(work)
 
@@ -195,7 +195,7 @@ class TrackedVideo(Work):
     """A video whose frames are tracked one by one, by a system that has been made ready."""
 
     slam: Slam
-    video: Stream
+    video: Source
     """Calibrated."""
     frames: Generator[Frame, None, None]
     """That are left."""
@@ -210,7 +210,7 @@ class TrackedVideo(Work):
         return self.slam
 
     @property
-    def source(self) -> Stream:
+    def source(self) -> Source:
         """The video."""
         return self.video
 

@@ -17,7 +17,8 @@ from geogs.application.results.write import write_config
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.sources.sniff import Stream, open_source
+from geogs.io.sources.frame_source import Source
+from geogs.io.sources.sniff import open_source
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map_with_views
@@ -31,7 +32,7 @@ from geogs.tracking.keyframes.saved_keyframes import add_saved_keyframes
 
 
 def track(
-    source: str | Path | Sequence[str | Path] | Stream,
+    source: str | Path | Sequence[str | Path] | Source,
     config: Config | None = None,
     device: str = "auto",
     slam: Slam | None = None,
@@ -65,7 +66,7 @@ def track(
         yield slam.process(frame)
 
 
-def _opened(source: str | Path | Sequence[str | Path] | Stream, config: InputConfig) -> Stream:
+def _opened(source: str | Path | Sequence[str | Path] | Source, config: InputConfig) -> Source:
     if isinstance(source, str | Path):
         return open_source(source, config)
     return open_source(source, config) if isinstance(source, Sequence) else source

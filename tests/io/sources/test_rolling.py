@@ -8,8 +8,8 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources import clips
-from geogs.io.sources.frame_source import ReadingPlace, Source
+from geogs.io.sources import readout_clips as clips
+from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.shutter.shutter import Shutter
 from io_samples import write_image, write_video
@@ -66,10 +66,10 @@ def test_a_camera_that_stands_still_loses_nothing(tmp_path):
 
 def test_going_on_gives_the_same_bytes(folder):
     source = opened(folder, start=1, stop=7)
-    whole = list(source)
+    whole, places = zip(*((frame, source.place) for frame in source), strict=True)
     assert len(whole) == 6
     for place in (1, 3, 5):
-        rest = list(source.frames_after(ReadingPlace(place)))
+        rest = list(source.frames_after(places[place - 1]))
         assert [frame.index for frame in rest] == list(range(place, 6))
         for frame, expected in zip(rest, whole[place:], strict=True):
             np.testing.assert_array_equal(frame.image, expected.image)
@@ -89,9 +89,9 @@ def test_an_unreadable_neighbour_is_skipped_and_the_other_side_tells(folder, tmp
         (tmp_path / f"{k}.png").write_bytes((folder / f"{k:03d}.png").read_bytes())
     (tmp_path / "2.png").write_bytes(b"damaged")
     source = opened(tmp_path)
-    frames = list(source)
-    assert (len(frames), source.skipped) == (4, 1)
-    after = list(source.frames_after(ReadingPlace(2, 1)))
+    frames, places = zip(*((frame, source.place) for frame in source), strict=True)
+    assert (len(frames), source.place.skipped) == (4, 1)
+    after = list(source.frames_after(places[1]))
     assert len(after) == 2
     for frame, expected in zip(after, frames[2:], strict=True):
         np.testing.assert_array_equal(frame.image, expected.image)

@@ -13,7 +13,7 @@ from geogs.cli import main as cli
 from geogs.config import Config, DepthConfig, InputConfig, LoopConfig, MappingConfig, TrackingConfig
 from geogs.errors import InputError
 from geogs.evaluation.trajectory_errors import evaluate_trajectory
-from geogs.io.sources.several import PAUSE
+from geogs.io.sources.frame_source import PAUSE
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
@@ -52,6 +52,7 @@ def test_frames_are_numbered_and_timed_through(tmp_path):
         assert times[3] == pytest.approx(times[2] + PAUSE)
         assert [int(f.image[0, 0, 0]) for f in read] == [0, 10, 20, 0, 10, 20, 30]
     assert source.length == 7
+    assert open_source(paths, replace(config, stride=3)).fps == pytest.approx(10)
     assert [(s.name, s.first_frame) for s in source.spans] == [("a", 0), ("b", 3)]
 
 

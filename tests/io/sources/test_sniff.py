@@ -26,7 +26,7 @@ def test_image_folder_in_natural_order_with_nominal_times(tmp_path):
     write_images(tmp_path, [f"view{i}.png" for i in range(12)])
     source = open_source(tmp_path, NATIVE)
     frames = list(source)
-    assert (source.kind, source.length, source.skipped) == ("images", 12, 0)
+    assert (source.kind, source.length, source.place.skipped) == ("images", 12, 0)
     assert source.name == tmp_path.name
     assert source.fps == pytest.approx(30)
     assert [frame.index for frame in frames] == list(range(12))
@@ -159,7 +159,7 @@ def test_unreadable_images_are_skipped_and_counted(tmp_path, caplog):
     source = open_source(tmp_path, NATIVE)
     with caplog.at_level(logging.WARNING, logger="geogs"):
         frames = list(source)
-    assert source.skipped == 2
+    assert source.place.skipped == 2
     assert [frame.index for frame in frames] == [0, 1, 2]
     np.testing.assert_allclose([f.timestamp * 30 for f in frames], [1, 2, 4])  # not shifted
     assert "0.jpg cannot be read; skipped" in caplog.text

@@ -8,7 +8,6 @@ import pytest
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.frame_source import ReadingPlace
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.atomic import write_text
 from io_samples import gradient_image, write_image, write_images, write_video
@@ -28,14 +27,15 @@ def test_damaged_images_are_used_counted_and_told_once(tmp_path, caplog):
         damage(tmp_path / f"{number}.jpg")
     source = open_source(tmp_path, InputConfig(intrinsics="300,300,160,120"))
     with caplog.at_level("WARNING", "geogs"):
-        assert len(list(source)) == 5
-    assert (source.damaged, source.skipped) == (2, 0)
+        places = [source.place for _ in source]
+    assert len(places) == 5
+    assert (source.place.damaged, source.place.skipped) == (2, 0)
     assert caplog.messages == [
         f"{tmp_path / '1.jpg'} is damaged; used as far as it goes.",
         f"{tmp_path.name}: 2 images are damaged.",
     ]
-    assert len(list(source.frames_after(ReadingPlace(2, 0, 1)))) == 3
-    assert source.damaged == 2
+    assert len(list(source.frames_after(places[1]))) == 3
+    assert source.place.damaged == 2
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5000), (5000, 3), (11, 200)])
@@ -53,7 +53,7 @@ def test_a_listed_file_that_is_no_plain_one_is_skipped(tmp_path, listed):
     (tmp_path / "rgb.txt").write_text(f"1.0 {listed}\n2.0 b.png\n")
     source = open_source(tmp_path, GIVEN)
     assert [frame.timestamp for frame in source] == [2.0]
-    assert source.skipped == 1
+    assert source.place.skipped == 1
 
 
 @pytest.mark.parametrize(

@@ -105,8 +105,8 @@ def test_damaged_packets_are_skipped_and_counted(tmp_path, caplog):
     source = open_source(path, NATIVE)
     with caplog.at_level(logging.WARNING, logger="geogs"):
         frames = list(source)
-    assert source.skipped >= 1
-    assert len(frames) + source.skipped == 30
+    assert source.place.skipped >= 1
+    assert len(frames) + source.place.skipped == 30
     assert "cannot be read; skipped" in caplog.text
     times = [frame.timestamp for frame in frames]
     np.testing.assert_allclose(times[-1], 29 * 0.033, atol=1e-3)  # later frames are not shifted

@@ -1,6 +1,6 @@
 """The checkpoint of a run: all of its work so far, which survives Ctrl-C and kill."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,12 +11,9 @@ from geogs.application.checkpoints.checkpoint import SavedState
 from geogs.application.settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.frame_source import ReadingPlace
-from geogs.io.sources.several import JointPlace, SeveralSources
-from geogs.io.sources.sniff import Stream
+from geogs.io.sources.frame_source import ReadingPlace, Source
 from geogs.shutter.shutter import Shutter
 from geogs.slam import Slam
-from geogs.types import Frame
 from geogs.world.world import World
 
 
@@ -32,7 +29,7 @@ class RunMetadata:
     """Fingerprint of the source."""
     calibration: Calibration | None
     """Found before the run; none if the source's own was taken."""
-    place: ReadingPlace | JointPlace = field(default_factory=ReadingPlace)
+    place: ReadingPlace = field(default_factory=ReadingPlace)
     """How far the source has been read."""
     shutter: Shutter = field(default_factory=Shutter)
     """Given, or found before the run."""
@@ -46,7 +43,7 @@ class RunState:
     world: World
 
 
-def run_state(metadata: RunMetadata, slam: Slam, source: Stream) -> RunState | None:
+def run_state(metadata: RunMetadata, slam: Slam, source: Source) -> RunState | None:
     """What a checkpoint holds of a run as it is now; none before a map has been started."""
     if not slam.segments.keyframe_ids:
         return None
@@ -68,7 +65,7 @@ class SavedRun:
         with self._saved.in_a_sentence():
             yield world
 
-    def calibrated(self, source: Stream) -> Stream:
+    def calibrated(self, source: Source) -> Source:
         """The source as the run read it. Raises InputError if its files are not what they were."""
         if source.fingerprint() != self.metadata.fingerprint:
             raise InputError(
@@ -78,13 +75,3 @@ class SavedRun:
         found = self.metadata.calibration
         calibrated = source if found is None else source.with_calibration(found)
         return calibrated.with_shutter(self.metadata.shutter)
-
-
-def frames_after(source: Stream, place: ReadingPlace | JointPlace) -> Generator[Frame, None, None]:
-    """The frames of a source after a place in it. Raises InputError if there cannot be one."""
-    if isinstance(source, SeveralSources):
-        if isinstance(place, JointPlace):
-            return source.frames_after(place)
-    elif isinstance(place, ReadingPlace):
-        return source.frames_after(place)
-    raise InputError(f"{source.name} is not what it was when the run began.")

@@ -9,8 +9,8 @@ from geogs.application.progress import RunProgress
 from geogs.application.results.scene import MappedScene
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.verdict import Verdict, verdict
+from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.sources.sniff import Stream
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
@@ -21,7 +21,7 @@ class Result:
 
     scene: MappedScene
     """A ``Slam`` or a ``Reconstruction``, whose work is done."""
-    source: Stream | PosedSource
+    source: Source | PosedSource
     """What it was made from, read to the end."""
     is_interrupted: bool = False
     """Whether the final stages were left out, or cut short."""

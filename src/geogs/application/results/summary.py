@@ -10,9 +10,8 @@ import torch
 from geogs.application.machine.device import device_summary, peak_memory
 from geogs.application.results.result import Result
 from geogs.application.results.scene import MappedScene
+from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.sources.several import SeveralSources
-from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch
 from geogs.types import FrameState, Trajectory
 from geogs.version import __version__
@@ -64,7 +63,7 @@ def _finite(values: dict[str, object]) -> dict[str, object]:
     }
 
 
-def source_summary(source: Stream | PosedSource) -> dict[str, object]:
+def source_summary(source: Source | PosedSource) -> dict[str, object]:
     """What a unit of the map is, and which images were not used."""
     if isinstance(source, PosedSource):
         held_out = {"held_out": source.held_out} if source.held_out else {}
@@ -75,13 +74,12 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
             **({"left_out": left_out} if left_out else {}),
             **held_out,
         }
-    spans = source.spans if isinstance(source, SeveralSources) else []
     live = {"dropped_frames": source.dropped} if source.is_live else {}
-    videos = {"videos": [asdict(span) for span in spans]} if spans else {}
+    videos = {"videos": [asdict(span) for span in source.spans]} if source.spans else {}
     return {
         "scale": "arbitrary (monocular)",
-        "skipped_images": source.skipped,
-        "damaged_images": source.damaged,
+        "skipped_images": source.place.skipped,
+        "damaged_images": source.place.damaged,
         "shutter": {"readout": source.shutter.readout, "origin": source.shutter.origin},
         **live,
         **videos,

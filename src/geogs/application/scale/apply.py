@@ -9,21 +9,21 @@ from geogs.application.scale.find import find_scale
 from geogs.application.scale.scene import MeasurableScene, SeenKeyframe, said
 from geogs.application.scale.source import ScaleSource, SensorScale
 from geogs.errors import InputError
-from geogs.io.sources.sniff import Stream
+from geogs.io.sources.frame_source import Source
 from geogs.on_demand import OnDemand
 from geogs.slam import Slam
 from geogs.tracking.graph.measured_odometry import OdometryAgreement
 from geogs.types import MetricScale
 
 
-def check_scale_source(source: ScaleSource | None, stream: Stream) -> None:
+def check_scale_source(source: ScaleSource | None, stream: Source) -> None:
     """Raises InputError where a scale is asked for that cannot be had of a source."""
     if isinstance(source, SensorScale) and not stream.uses_depth:
         raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
 
 
 def make_metric(
-    slam: Slam, stream: Stream, source: ScaleSource | None, progress: RunProgress
+    slam: Slam, stream: Source, source: ScaleSource | None, progress: RunProgress
 ) -> None:
     """Bring the map to metres by what is known; where it does not tell, say so and leave it."""
     if not slam.segments.keyframe_ids:

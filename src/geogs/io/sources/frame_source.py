@@ -1,54 +1,44 @@
-"""A source: working images in order, with their times and the camera that took them.
-
-A format supplies a reader (how images are stored); :class:`Source` adds what all have in common:
-the selection of frames, the calibration, the shutter, the working resolution and reading ahead.
-"""
+"""A source: one or several recordings of a place, read as a single stream of frames."""
 
 import logging
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal
 
-import numpy as np
-from jaxtyping import Bool, Float
-
-from geogs.config import InputConfig
-from geogs.documents import expanded
 from geogs.errors import InputError
-from geogs.geometry.camera import Camera
-from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.clips import read_clips
-from geogs.io.sources.depth_files import RecordedDepth, RectifiedDepth
-from geogs.io.sources.frame_masks import FrameMasks, masked_out
-from geogs.io.sources.known_intrinsics import resolve_intrinsics
-from geogs.io.sources.pose_priors import chosen_poses
-from geogs.io.sources.reader import (
-    NeverWaits,
-    RawFrame,
-    Reader,
-    fingerprint_of,
-    of_one_size,
-    read_ahead,
-)
-from geogs.io.sources.undistort import Rectifier
-from geogs.shutter.angular_motion import AngularMotion
-from geogs.shutter.neighbours import with_angular_motion
+from geogs.io.sources.reader import NeverWaits, RawFrame
+from geogs.io.sources.working_images import WorkingImages
 from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.types import Frame, MeasuredDepth
+from geogs.types import Frame
 
 _log = logging.getLogger(__name__)
-LEAST_EDGE = 12
-"""Pixels of the shorter side of a working image."""
+PAUSE = 1.0
+"""Seconds between the last frame of a recording and the first of the next, in the joint time."""
+SAME = 0.01
+"""Relative difference up to which two focal lengths count as one."""
 
 
 @dataclass(frozen=True, slots=True)
-class ReadingPlace:
-    """How far a source has been read."""
+class RecordingSpan:
+    """One recording within the joint stream."""
 
+    name: str
+    first_frame: int
+    first_time: float
+    """Seconds, in the joint time."""
+    own_time: float
+    """Time of its first frame in its own clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingPlace:
+    """How far one recording has been read."""
+
+    span: RecordingSpan | None = None
+    """None before its first frame."""
+    shift: float = 0.0
+    """Seconds from its own clock to the joint time."""
     frames: int = 0
     """Given."""
     skipped: int = 0
@@ -56,150 +46,105 @@ class ReadingPlace:
     damaged: int = 0
     """Images among them of which a part is damaged."""
 
+    def after(self, raw: RawFrame) -> "RecordingPlace":
+        """The place after one more image, which is logged if it is the first of its faults."""
+        if raw.image is None:
+            if not self.skipped:
+                _log.warning("%s; skipped.", raw.fault)
+            return replace(self, skipped=self.skipped + 1)
+        if raw.is_damaged and not self.damaged:
+            _log.warning("%s is damaged; used as far as it goes.", raw.label)
+        return replace(self, frames=self.frames + 1, damaged=self.damaged + raw.is_damaged)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingPlace:
+    """How far a source has been read."""
+
+    frames: int = 0
+    """Given, of all recordings together."""
+    time: float = 0.0
+    """Time of the last, seconds in the joint time."""
+    recordings: tuple[RecordingPlace, ...] = ()
+    """In each recording that was begun."""
+
+    @property
+    def skipped(self) -> int:
+        """Images that could not be read or are of another size."""
+        return sum(place.skipped for place in self.recordings)
+
+    @property
+    def damaged(self) -> int:
+        """Images of which a part is damaged."""
+        return sum(place.damaged for place in self.recordings)
+
 
 class Source:
-    """Frames at working resolution, undistorted, in time order; can be iterated repeatedly.
+    """Frames of the recordings one after the other, numbered and timed through.
 
-    The rows of a rolling shutter, where its readout is known, are rectified to the middle one.
+    They are at working resolution, undistorted, in time order, as one pinhole camera took them all,
+    and can be iterated over repeatedly. No motion links the first frame of a recording to the last
+    of the one before.
     """
 
-    def __init__(
-        self,
-        reader: Reader,
-        config: InputConfig,
-        calibration: Calibration | None = None,
-        shutter: Shutter | None = None,
-    ) -> None:
-        """``calibration`` of the upright images, where it is known better than the reader's.
-
-        ``shutter``, where it is known better than the settings'.
-        """
-        _check_selection(config, reader.length)
-        if config.depth == "sensor" and not reader.has_depth:
-            raise InputError(
-                f"{reader.name} has no depth of a sensor beside its images that can be read here; "
-                "leave out --depth."
-            )
-        self._poses = chosen_poses(config.poses, reader, reader.name)
-        self._reader = reader
-        self._config = config
-        self.calibration = calibration or resolve_intrinsics(
-            config.intrinsics,
-            reader.calibration,
-            reader.width,
-            reader.height,
-            reader.quarter_turns,
-        )
-        """The camera of the images as they came, upright, with its distortion."""
-        self.shutter = shutter or shutter_of(config.readout)
+    def __init__(self, recordings: Sequence[WorkingImages]) -> None:
+        """At least one recording. Raises InputError if their cameras differ."""
+        first, *others = recordings
+        for other in others:
+            _check_same(first, other)
+        self._recordings = tuple(recordings)
+        self.name = " + ".join(images.name for images in recordings)
+        """Names of the sequences."""
+        self.kind: str = first.reader.kind
+        """The format of the first: video, images, bag, replica, tum or 7scenes."""
+        self.camera = first.camera
+        """The pinhole camera of every frame."""
+        self.calibration = first.calibration
+        """The camera of the first recording's images as they came, upright, with its distortion."""
+        self.shutter = first.shutter
         """By which rows are rectified."""
-        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
-        check_large_enough(self._rectifier.camera, reader.name)
-        masks = None if config.mask is None else expanded(config.mask)
-        self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
-        self.mask = None if masks is None or self._masks is not None else self._working_mask(masks)
+        self.mask = first.mask
         """Pixels of every frame that may show the scene; none where all do."""
-        self.skipped = 0
-        """Images that could not be read or are of another size, so far in this iteration."""
-        self.damaged = 0
-        """Images of which a part is damaged, so far in this iteration."""
+        self.fps = first.fps
+        """Frames per second after the stride, nominal."""
+        lengths = [images.length for images in recordings]
+        self.length = None if None in lengths else sum(n for n in lengths if n is not None)
+        """Frames to expect, unreadable ones included; none where it is not known beforehand."""
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
 
     @property
     def black_is_masked(self) -> bool:
         """Whether pixels of frames that are quite black are masked out."""
-        return self._masks is not None
-
-    def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
-        """A mask for all images, straightened as they are."""
-        return self._straight(read_mask(path, (self._reader.height, self._reader.width)))
-
-    def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
-        grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
-        return self._rectifier(grey)[..., 0] > 127
-
-    @property
-    def name(self) -> str:
-        """Name of the sequence."""
-        return self._reader.name
-
-    @property
-    def kind(self) -> str:
-        """The format: video, images, bag, replica, tum or 7scenes."""
-        return self._reader.kind
-
-    @property
-    def camera(self) -> Camera:
-        """The pinhole camera of every frame."""
-        return self._rectifier.camera
+        return self._recordings[0].black_is_masked
 
     @property
     def uses_depth(self) -> bool:
-        """Whether frames come with the depth that a sensor measured."""
-        return self._config.depth != "none" and self._reader.has_depth
+        """Whether frames of any recording come with the depth that a sensor measured."""
+        return any(images.uses_depth for images in self._recordings)
 
     @property
     def uses_poses(self) -> bool:
-        """Whether frames come with poses of another tracker, as priors."""
-        return self._poses.is_used
-
-    @property
-    def is_calibration_open(self) -> bool:
-        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
-        asked = self._config.intrinsics.strip().lower() == "auto"
-        return asked and (self.calibration.is_guess or self.calibration.is_nominal)
-
-    def with_calibration(self, calibration: Calibration) -> "Source":
-        """The same frames, undistorted by another calibration of the images as they came."""
-        fitted = calibration.fit(self._reader.width, self._reader.height)
-        return Source(self._reader, self._config, fitted, self.shutter)
+        """Whether frames of any recording come with poses of another tracker, as priors."""
+        return any(images.poses.is_used for images in self._recordings)
 
     @property
     def is_live(self) -> bool:
-        """Whether frames do not wait until they are asked for."""
-        return isinstance(self._reader, NeverWaits)
+        """Whether frames do not wait until they are asked for; such a recording is read alone."""
+        return self._recordings[0].is_live
 
     @property
     def dropped(self) -> int:
         """Frames of a live source that came too fast to be used, so far in this iteration."""
-        return self._reader.dropped if isinstance(self._reader, NeverWaits) else 0
+        reader = self._recordings[0].reader
+        return reader.dropped if isinstance(reader, NeverWaits) else 0
 
     @property
-    def is_shutter_open(self) -> bool:
-        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
-        if self.is_live:
-            return False
-        return self._config.readout == "auto" and self.shutter == Shutter()
-
-    def with_shutter(self, shutter: Shutter) -> "Source":
-        """The same frames, with their rows rectified by another readout."""
-        return Source(self._reader, self._config, self.calibration, shutter)
-
-    @property
-    def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`clips` gives."""
-        turns = self._reader.quarter_turns
-        lines = self._reader.width if turns % 2 else self._reader.height
-        return self._rectifier.rolling_camera(lines, turns)
-
-    def clips(self) -> Generator[list[RawFrame], None, None]:
-        """Neighbouring images at working size as they came, from all over the selection."""
-        return read_clips(self._reader, self._config, self._at_working_size)
-
-    def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
-        """Neighbours in the source at working size, lens and rows as they came."""
-        return map(self._at_working_size, self._reader.read(start, stop, 1))
-
-    def _at_working_size(self, raw: RawFrame) -> RawFrame:
-        raw = of_one_size(raw, self._reader)
-        if raw.image is None:
-            return raw
-        return replace(raw, image=self._rectifier.resized(raw.image))
-
-    def linked_frames(self) -> Generator[Frame, None, None]:
-        """Frames between which there is no cut."""
-        return iter(self)
+    def spans(self) -> list[RecordingSpan]:
+        """Where each of several recordings begins that was read so far; none of a single one."""
+        if len(self._recordings) == 1:
+            return []
+        return [place.span for place in self.place.recordings if place.span is not None]
 
     @property
     def intrinsics_origin(self) -> str:
@@ -207,140 +152,101 @@ class Source:
         return self.calibration.origin
 
     @property
-    def fps(self) -> float:
-        """Frames per second after the stride, nominal."""
-        return self._reader.fps / self._config.stride
+    def is_calibration_open(self) -> bool:
+        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        return any(images.is_calibration_open for images in self._recordings)
+
+    def with_calibration(self, calibration: Calibration) -> "Source":
+        """The same frames, undistorted by another calibration of the images as they came."""
+        return Source([images.with_calibration(calibration) for images in self._recordings])
 
     @property
-    def length(self) -> int | None:
-        """Frames to expect, unreadable ones included; none where it is not known beforehand."""
-        if self._reader.length is None:
-            return None
-        stop = self._config.stop
-        stop = self._reader.length if stop is None else min(stop, self._reader.length)
-        return len(range(self._config.start, stop, self._config.stride))
+    def is_shutter_open(self) -> bool:
+        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        return self._recordings[0].is_shutter_open
+
+    def with_shutter(self, shutter: Shutter) -> "Source":
+        """The same frames, with their rows rectified by another readout."""
+        return Source([images.with_shutter(shutter) for images in self._recordings])
+
+    @property
+    def rolling_camera(self) -> RollingCamera:
+        """The camera of the images that :meth:`clips` gives."""
+        return self._recordings[0].rolling_camera
+
+    def clips(self) -> Generator[list[RawFrame], None, None]:
+        """Neighbouring images of the first recording at working size, as they came."""
+        return self._recordings[0].clips()
+
+    def linked_frames(self) -> Generator[Frame, None, None]:
+        """The frames of the first recording, between which there is no cut."""
+        return iter(Source(self._recordings[:1]))
 
     def fingerprint(self) -> str:
-        """Sixteen digits that change with the names and sizes of the files."""
-        return fingerprint_of(self._reader.paths)
+        """Sixteen digits for each recording that change with the names and sizes of its files."""
+        return "-".join(images.fingerprint() for images in self._recordings)
 
     def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames; the next one is read while the present one is used.
 
         Raises:
-            InputError: there is no image that can be used.
+            InputError: there is no image of a recording that can be used.
         """
         return self.frames_after(ReadingPlace())
 
     def frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
-        """Yield the frames after a place; otherwise as the iteration over all."""
-        self.place, self.skipped, index = place, place.skipped, place.frames
-        self.damaged = place.damaged
-        working = self._masked(self._working(place.frames + place.skipped))
-        for raw in working if self.is_live else read_ahead(working):
-            if raw.image is None:
-                self.skipped += 1
-                if self.skipped == 1:
-                    _log.warning("%s; skipped.", raw.fault)
-                continue
-            if raw.is_damaged:
-                self.damaged += 1
-                if self.damaged == 1:
-                    _log.warning("%s is damaged; used as far as it goes.", raw.label)
-            self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
-            pose = self._poses.of(raw.timestamp, raw.pose)
-            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth, pose=pose, rows=raw.rows)
-            index += 1
-        if index == 0:
-            raise InputError(self._why_empty())
-        if self.skipped > 1:
-            _log.warning("%s: skipped %d images that cannot be used.", self.name, self.skipped)
-        if self.damaged > 1:
-            _log.warning("%s: %d images are damaged.", self.name, self.damaged)
+        """Yield the frames after a place; otherwise as the iteration over all.
 
-    def _working(self, first: int) -> Iterator[RawFrame]:
-        """The working images of the selection from its ``first`` on."""
-        config, reader = self._config, self._reader
-        start = config.start + first * config.stride
-        if self.shutter.readout:
-            yield from self._with_rows_rectified(start)
-            return
-        for raw in reader.read(start, config.stop, config.stride):
-            raw = of_one_size(raw, reader)
-            if raw.image is not None:
-                image = self._rectifier(raw.image)
-                raw = replace(raw, image=image, depth=self._rectified(raw.depth))
-            yield raw
-
-    def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
-        """Working images with what masks of their own leave out black."""
-        for raw in working:
-            if self._masks is None or raw.image is None:
-                yield raw
-                continue
-            valid = self._masks.read(raw.name, (self._reader.height, self._reader.width))
-            straight = None if valid is None else self._straight(valid)
-            yield replace(raw, image=masked_out(raw.image, straight))
-
-    def _rectified(
-        self,
-        depth: MeasuredDepth | None,
-        moved: Float[np.ndarray, "h w 2"] | None = None,
-    ) -> MeasuredDepth | None:
-        """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
-        if not (self.uses_depth and isinstance(depth, RecordedDepth)):
-            return None
-        return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
-
-    def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
-        """The same for a rolling shutter, from a place in the source on.
-
-        The turning is measured between neighbours in the source, whatever the stride, and the
-        image before the first is read, too.
+        Raises:
+            InputError: the place is none of this source.
         """
-        config, rolling, readout = self._config, self.rolling_camera, self.shutter.readout
-        before = min(start, 1)
-        stop = None if config.stop is None else config.stop + 1
+        if len(place.recordings) > len(self._recordings):
+            raise InputError(f"{self.name} is not what it was when the run began.")
+        return self._frames_after(place)
 
-        def is_selected(position: int) -> bool:
-            after = position - before
-            inside = config.stop is None or start + after < config.stop
-            return after >= 0 and after % config.stride == 0 and inside
+    def _frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
+        self.place = place
+        for number in range(max(len(place.recordings) - 1, 0), len(self._recordings)):
+            yield from self._frames_of(number)
 
-        images = self._resized(start - before, stop)
-        offsets = RowOffsets(rolling, self.camera)
-        for raw, turning in with_angular_motion(images, rolling, readout, is_selected):
+    def _frames_of(self, number: int) -> Generator[Frame, None, None]:
+        """The frames of a recording after the present place."""
+        images, former = self._recordings[number], self.place.recordings[:number]
+        here = (*self.place.recordings, RecordingPlace())[number]
+        index, end = self.place.frames, self.place.time
+        for raw in images.read(here.frames + here.skipped):
+            here = here.after(raw)
             if raw.image is None:
-                yield raw
+                self.place = ReadingPlace(index, end, (*former, here))
                 continue
-            nodes = offsets.nodes(AngularMotion() if turning.is_still else turning, readout)
-            moved = None if turning.is_still else offsets.dense(nodes)
-            image = self._rectifier.straightened(raw.image, moved)
-            depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
-            yield replace(raw, image=image, depth=depth, rows=rows)
+            follows_cut = here.span is None and index > 0
+            if here.span is None:
+                shift = end + PAUSE - raw.timestamp if index else 0.0
+                span = RecordingSpan(images.name, index, raw.timestamp + shift, raw.timestamp)
+                here = replace(here, span=span, shift=shift)
+            end = raw.timestamp + here.shift
+            self.place = ReadingPlace(index + 1, end, (*former, here))
+            pose = images.poses.of(raw.timestamp, raw.pose)
+            pose = None if pose is None else replace(pose, world=number)
+            yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows)
+            index += 1
+        if not here.frames:
+            raise InputError(images.why_empty(here.skipped))
+        if here.skipped > 1:
+            _log.warning("%s: skipped %d images that cannot be used.", images.name, here.skipped)
+        if here.damaged > 1:
+            _log.warning("%s: %d images are damaged.", images.name, here.damaged)
 
-    def _why_empty(self) -> str:
-        if self.skipped:
-            return f"{self.name}: none of its {self.skipped} images can be used."
-        return f"{self.name} ends before frame {self._config.start}; give a smaller start."
 
-
-def shutter_of(readout: float | Literal["auto"]) -> Shutter:
-    """The shutter that the settings ask for; a global one until it is found."""
-    return Shutter() if readout == "auto" else Shutter(readout, "as given")
-
-
-def _check_selection(config: InputConfig, length: int | None) -> None:
-    if length is not None and config.start >= length:
+def _check_same(first: WorkingImages, other: WorkingImages) -> None:
+    a, b = first.camera, other.camera
+    if (a.width, a.height) != (b.width, b.height):
         raise InputError(
-            f"start is {config.start}, but the source has only {length} frames; give a smaller one."
+            f"{first.name} gives images of {a.width} x {a.height} pixels, {other.name} of "
+            f"{b.width} x {b.height}; videos can be joined that were taken with one camera mode."
         )
-
-
-def check_large_enough(camera: Camera, name: str) -> None:
-    """Raises InputError where working images have too few pixels on a side to track anything."""
-    if min(camera.width, camera.height) < LEAST_EDGE:
+    if abs(a.fx / b.fx - 1) > SAME or abs(a.fy / b.fy - 1) > SAME:
         raise InputError(
-            f"{name} gives working images of {camera.width}x{camera.height} pixels; both sides "
-            f"need {LEAST_EDGE} at least, so give larger images or a larger --long-edge."
+            f"{first.name} and {other.name} have different focal lengths ({a.fx:.0f} and "
+            f"{b.fx:.0f} pixels); videos can be joined that were taken with one camera."
         )

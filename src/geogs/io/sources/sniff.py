@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import overload
 
 from geogs.config import InputConfig
 from geogs.documents import expanded
@@ -25,10 +24,7 @@ from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import Reader
 from geogs.io.sources.ros.bag import Bag, is_bag
-from geogs.io.sources.several import SeveralSources
-
-Stream = Source | SeveralSources
-"""What a run reads."""
+from geogs.io.sources.working_images import WorkingImages
 
 # Earlier ones win.
 _FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], Reader]], ...] = (
@@ -49,13 +45,9 @@ _POSED_FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]
 )
 
 
-@overload
-def open_source(path: str | Path, config: InputConfig | None = None) -> Source: ...
-@overload
-def open_source(path: Sequence[str | Path], config: InputConfig | None = None) -> Stream: ...
 def open_source(
     path: str | Path | Sequence[str | Path], config: InputConfig | None = None
-) -> Stream:
+) -> Source:
     """Open a video, a folder of images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     The format follows from the content. Ground truth that lies beside the images is not read.
@@ -69,20 +61,20 @@ def open_source(
     Raises:
         InputError: nothing usable is there, ``config`` does not fit it, or the cameras differ.
     """
-    if isinstance(path, str | Path):
-        config = config or InputConfig()
-        address = live_address(path)
-        if address is not None:
-            return Source(_live_reader(address, config), config)
-        return Source(_reader(expanded(path), config), config)
-    if not path:
+    paths = [path] if isinstance(path, str | Path) else path
+    config = config or InputConfig()
+    if not paths:
         raise InputError("Nothing to read; give a video or a folder of images.")
-    if len(path) > 1 and any(live_address(one) is not None for one in path):
+    addresses = [live_address(one) for one in paths]
+    if len(paths) > 1 and any(addresses):
         raise InputError(
             "A camera, a stream or a pipe is read alone; give no other source with it."
         )
-    sources = [open_source(one, config) for one in path]
-    return sources[0] if len(sources) == 1 else SeveralSources(sources)
+    readers = (
+        _reader(expanded(one), config) if address is None else _live_reader(address, config)
+        for one, address in zip(paths, addresses, strict=True)
+    )
+    return Source([WorkingImages(reader, config) for reader in readers])
 
 
 def _live_reader(address: LiveAddress, config: InputConfig) -> Reader:

@@ -14,6 +14,7 @@ from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.live.pipe import Pipe
 from geogs.io.sources.reader import RawFrame
 from geogs.io.sources.sniff import open_source
+from geogs.io.sources.working_images import WorkingImages
 
 SECONDS = 0.02
 
@@ -33,7 +34,8 @@ class Clip:
 
 
 def played(config=None, clip=None):
-    return Source(LiveReader(Played(clip or Clip(), "clip")), config or InputConfig())
+    reader = LiveReader(Played(clip or Clip(), "clip"))
+    return Source([WorkingImages(reader, config or InputConfig())])
 
 
 def test_a_file_plays_at_its_pace_and_nothing_waits_for_who_is_late():

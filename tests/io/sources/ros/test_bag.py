@@ -28,7 +28,7 @@ def test_raw_images_with_their_times_and_camera(tmp_path, kind, encoding):
             bag.image("/camera/image_raw", k, gradient_image(k), encoding, padding=5)
     source = geogs.open_source(bag.path, NATIVE)
     frames = list(source)
-    assert (source.kind, source.length, source.skipped) == ("bag", 4, 0)
+    assert (source.kind, source.length, source.place.skipped) == ("bag", 4, 0)
     assert source.fps == pytest.approx(20)
     np.testing.assert_allclose([f.timestamp for f in frames], 1000 + np.arange(4) / 20, atol=1e-6)
     calibration = source.calibration
@@ -36,7 +36,7 @@ def test_raw_images_with_their_times_and_camera(tmp_path, kind, encoding):
     assert calibration.distortion == (0.1, -0.02, 0.001, 0.002, 0.0)
     assert calibration.origin == "/camera/camera_info of the bag"
     assert not source.is_calibration_open
-    for k, raw in enumerate(source._reader.read(0, None, 1)):
+    for k, raw in enumerate(source._recordings[0].reader.read(0, None, 1)):
         true = gradient_image(k)
         if encoding.startswith("mono"):
             true = np.repeat(cv2.cvtColor(true, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
@@ -93,7 +93,7 @@ def test_the_likeliest_topic_is_read_and_another_can_be_asked_for(tmp_path):
             if k % 2:
                 bag.image("/d400/color/image_raw", k, gradient_image(k))
     source = geogs.open_source(bag.path, NATIVE)
-    assert (source._reader.topic, source.length) == ("/d400/color/image_raw", 2)
+    assert (source._recordings[0].reader.topic, source.length) == ("/d400/color/image_raw", 2)
     asked = InputConfig(long_edge=0, topic="/debug/image")
     assert geogs.open_source(bag.path, asked).length == 4
     with pytest.raises(InputError, match="no images on the topic asked for; there are: /d400/co"):
@@ -146,7 +146,7 @@ def test_damaged_messages_and_times_that_do_not_increase_are_skipped(tmp_path):
         bag.image_at("/image/compressed", 4)
     source = geogs.open_source(bag.path, NATIVE)
     assert len(list(source)) == 4
-    assert source.skipped == 2
+    assert source.place.skipped == 2
 
 
 def test_an_unset_stamp_is_when_the_message_was_received(tmp_path):

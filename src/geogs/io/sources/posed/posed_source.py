@@ -11,7 +11,6 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
-from geogs.io.sources.frame_source import check_large_enough
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_set import (
     PosedSet,
@@ -21,6 +20,7 @@ from geogs.io.sources.posed.posed_set import (
 )
 from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
 from geogs.io.sources.reader import fingerprint_of, read_ahead, size_of
+from geogs.io.sources.working_images import check_large_enough
 
 _log = logging.getLogger(__name__)
 

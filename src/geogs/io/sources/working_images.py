@@ -1,0 +1,271 @@
+"""Working images of one recording, in order, with their times and the camera that took them.
+
+A format supplies a reader (how images are stored); :class:`WorkingImages` adds what all have in
+common: the selection, the calibration, the shutter, the working resolution and reading ahead.
+"""
+
+from collections.abc import Generator, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from geogs.config import InputConfig
+from geogs.documents import expanded
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.pictures import read_mask
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import RecordedDepth, RectifiedDepth
+from geogs.io.sources.frame_masks import FrameMasks, masked_out
+from geogs.io.sources.known_intrinsics import resolve_intrinsics
+from geogs.io.sources.pose_priors import chosen_poses
+from geogs.io.sources.reader import (
+    NeverWaits,
+    RawFrame,
+    Reader,
+    fingerprint_of,
+    of_one_size,
+    read_ahead,
+)
+from geogs.io.sources.readout_clips import read_clips
+from geogs.io.sources.undistort import Rectifier
+from geogs.shutter.angular_motion import AngularMotion
+from geogs.shutter.neighbours import with_angular_motion
+from geogs.shutter.rolling_camera import RollingCamera
+from geogs.shutter.rows import RowOffsets
+from geogs.shutter.shutter import Shutter
+from geogs.types import MeasuredDepth
+
+LEAST_EDGE = 12
+"""Pixels of the shorter side of a working image."""
+
+
+class WorkingImages:
+    """Images of a recording at working resolution, undistorted, in time order.
+
+    The rows of a rolling shutter, where its readout is known, are rectified to the middle one.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        config: InputConfig,
+        calibration: Calibration | None = None,
+        shutter: Shutter | None = None,
+    ) -> None:
+        """``calibration`` of the upright images, where it is known better than the reader's.
+
+        ``shutter``, where it is known better than the settings'.
+        """
+        _check_selection(config, reader.length)
+        if config.depth == "sensor" and not reader.has_depth:
+            raise InputError(
+                f"{reader.name} has no depth of a sensor beside its images that can be read here; "
+                "leave out --depth."
+            )
+        self.poses = chosen_poses(config.poses, reader, reader.name)
+        """Of another tracker, beside the images."""
+        self.reader = reader
+        """How they are stored."""
+        self.name = reader.name
+        """Name of the sequence."""
+        self._config = config
+        self.calibration = calibration or resolve_intrinsics(
+            config.intrinsics,
+            reader.calibration,
+            reader.width,
+            reader.height,
+            reader.quarter_turns,
+        )
+        """The camera of the images as they came, upright, with its distortion."""
+        self.shutter = shutter or shutter_of(config.readout)
+        """By which rows are rectified."""
+        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
+        self.camera = self._rectifier.camera
+        """The pinhole camera of the working images."""
+        check_large_enough(self.camera, reader.name)
+        masks = None if config.mask is None else expanded(config.mask)
+        self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
+        self.mask = None if masks is None or self._masks is not None else self._working_mask(masks)
+        """Pixels of every frame that may show the scene; none where all do."""
+
+    @property
+    def black_is_masked(self) -> bool:
+        """Whether pixels of frames that are quite black are masked out."""
+        return self._masks is not None
+
+    def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
+        """A mask for all images, straightened as they are."""
+        return self._straight(read_mask(path, (self.reader.height, self.reader.width)))
+
+    def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
+        grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
+        return self._rectifier(grey)[..., 0] > 127
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether images come with the depth that a sensor measured."""
+        return self._config.depth != "none" and self.reader.has_depth
+
+    @property
+    def is_calibration_open(self) -> bool:
+        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        asked = self._config.intrinsics.strip().lower() == "auto"
+        return asked and (self.calibration.is_guess or self.calibration.is_nominal)
+
+    def with_calibration(self, calibration: Calibration) -> "WorkingImages":
+        """The same images, undistorted by another calibration of the images as they came."""
+        fitted = calibration.fit(self.reader.width, self.reader.height)
+        return WorkingImages(self.reader, self._config, fitted, self.shutter)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames do not wait until they are asked for."""
+        return isinstance(self.reader, NeverWaits)
+
+    @property
+    def is_shutter_open(self) -> bool:
+        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        if self.is_live:
+            return False
+        return self._config.readout == "auto" and self.shutter == Shutter()
+
+    def with_shutter(self, shutter: Shutter) -> "WorkingImages":
+        """The same images, with their rows rectified by another readout."""
+        return WorkingImages(self.reader, self._config, self.calibration, shutter)
+
+    @property
+    def rolling_camera(self) -> RollingCamera:
+        """The camera of the images that :meth:`clips` gives."""
+        turns = self.reader.quarter_turns
+        lines = self.reader.width if turns % 2 else self.reader.height
+        return self._rectifier.rolling_camera(lines, turns)
+
+    def clips(self) -> Generator[list[RawFrame], None, None]:
+        """Neighbouring images at working size as they came, from all over the selection."""
+        return read_clips(self.reader, self._config, self._at_working_size)
+
+    def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
+        """Neighbours in the source at working size, lens and rows as they came."""
+        return map(self._at_working_size, self.reader.read(start, stop, 1))
+
+    def _at_working_size(self, raw: RawFrame) -> RawFrame:
+        raw = of_one_size(raw, self.reader)
+        if raw.image is None:
+            return raw
+        return replace(raw, image=self._rectifier.resized(raw.image))
+
+    @property
+    def fps(self) -> float:
+        """Frames per second after the stride, nominal."""
+        return self.reader.fps / self._config.stride
+
+    @property
+    def length(self) -> int | None:
+        """Images to expect, unreadable ones included; none where it is not known beforehand."""
+        if self.reader.length is None:
+            return None
+        stop = self._config.stop
+        stop = self.reader.length if stop is None else min(stop, self.reader.length)
+        return len(range(self._config.start, stop, self._config.stride))
+
+    def fingerprint(self) -> str:
+        """Sixteen digits that change with the names and sizes of the files."""
+        return fingerprint_of(self.reader.paths)
+
+    def read(self, first: int) -> Iterator[RawFrame]:
+        """Read the selection from its ``first`` image on; unless it is live, the next one is read
+        while the present one is used."""
+        images = self._masked(self._working(first))
+        return images if self.is_live else read_ahead(images)
+
+    def _working(self, first: int) -> Iterator[RawFrame]:
+        """The working images of the selection from its ``first`` on."""
+        config, reader = self._config, self.reader
+        start = config.start + first * config.stride
+        if self.shutter.readout:
+            yield from self._with_rows_rectified(start)
+            return
+        for raw in reader.read(start, config.stop, config.stride):
+            raw = of_one_size(raw, reader)
+            if raw.image is not None:
+                image = self._rectifier(raw.image)
+                raw = replace(raw, image=image, depth=self._rectified(raw.depth))
+            yield raw
+
+    def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
+        """Working images with what masks of their own leave out black."""
+        for raw in working:
+            if self._masks is None or raw.image is None:
+                yield raw
+                continue
+            valid = self._masks.read(raw.name, (self.reader.height, self.reader.width))
+            straight = None if valid is None else self._straight(valid)
+            yield replace(raw, image=masked_out(raw.image, straight))
+
+    def _rectified(
+        self,
+        depth: MeasuredDepth | None,
+        moved: Float[np.ndarray, "h w 2"] | None = None,
+    ) -> MeasuredDepth | None:
+        """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
+        if not (self.uses_depth and isinstance(depth, RecordedDepth)):
+            return None
+        return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
+
+    def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
+        """The same for a rolling shutter, from a place in the source on.
+
+        The turning is measured between neighbours in the source, whatever the stride, and the
+        image before the first is read, too.
+        """
+        config, rolling, readout = self._config, self.rolling_camera, self.shutter.readout
+        before = min(start, 1)
+        stop = None if config.stop is None else config.stop + 1
+
+        def is_selected(position: int) -> bool:
+            after = position - before
+            inside = config.stop is None or start + after < config.stop
+            return after >= 0 and after % config.stride == 0 and inside
+
+        images = self._resized(start - before, stop)
+        offsets = RowOffsets(rolling, self.camera)
+        for raw, turning in with_angular_motion(images, rolling, readout, is_selected):
+            if raw.image is None:
+                yield raw
+                continue
+            nodes = offsets.nodes(AngularMotion() if turning.is_still else turning, readout)
+            moved = None if turning.is_still else offsets.dense(nodes)
+            image = self._rectifier.straightened(raw.image, moved)
+            depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
+            yield replace(raw, image=image, depth=depth, rows=rows)
+
+    def why_empty(self, skipped: int) -> str:
+        """What to say where there is no image but those that were skipped."""
+        if skipped:
+            return f"{self.name}: none of its {skipped} images can be used."
+        return f"{self.name} ends before frame {self._config.start}; give a smaller start."
+
+
+def shutter_of(readout: float | Literal["auto"]) -> Shutter:
+    """The shutter that the settings ask for; a global one until it is found."""
+    return Shutter() if readout == "auto" else Shutter(readout, "as given")
+
+
+def _check_selection(config: InputConfig, length: int | None) -> None:
+    if length is not None and config.start >= length:
+        raise InputError(
+            f"start is {config.start}, but the source has only {length} frames; give a smaller one."
+        )
+
+
+def check_large_enough(camera: Camera, name: str) -> None:
+    """Raises InputError where working images have too few pixels on a side to track anything."""
+    if min(camera.width, camera.height) < LEAST_EDGE:
+        raise InputError(
+            f"{name} gives working images of {camera.width}x{camera.height} pixels; both sides "
+            f"need {LEAST_EDGE} at least, so give larger images or a larger --long-edge."
+        )
