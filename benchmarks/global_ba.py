@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from geogs.bundle.camera_system import SparseCameraSystem
+from geogs.bundle.dense import FLOOR
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop import global_bundle as settings
@@ -89,7 +90,7 @@ def through_rooms(count: int) -> None:
         torch.ones(count, 6, dtype=torch.float64),
     )
     tick = time.perf_counter()
-    system.solve(1.0)
+    system.solve(1.0, FLOOR)
     print(
         f"{count:5d} keyframes, {len(pairs):6d} pairs: choice {chosen:6.1f} s, {system.size} "
         f"blocks, at most {system.bandwidth} frames apart, "

@@ -351,7 +351,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
         moved.correct(c)
         T_cw = torch.stack([c.after[k] for k in range(KEYFRAMES)])
         print(judge.row(name, moved, T_cw, seconds), flush=True)
-    moved.prune()
+    moved.growth.prune([moved.views[k] for k in moved.table.mapped])
     print(judge.row("blended, then pruned", moved, T_cw, seconds), flush=True)
 
 

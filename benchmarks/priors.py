@@ -119,13 +119,14 @@ class MapScore:
 
 def map_score(slam: Slam, walk: Walk) -> MapScore:
     """Errors of a finished map."""
-    states = [slam.segments.main.keyframes[k] for k in slam.segments.main.keyframe_ids]
+    keyframes = slam.segments.main.keyframes
+    states = [keyframes[k] for k in keyframes.ids]
     x = torch.stack([torch.linalg.inv(s.T_cw)[:3, 3] for s in states])
     y = torch.from_numpy(walk.T_wc[[s.frame_index for s in states], :3, 3])
     scale = float(umeyama(x, y)[0])
     errors, angles, bare = [], [], []
     for seen in slam.renders():
-        view = walk.views[slam.segments.main.keyframes[seen.keyframe_id].frame_index]
+        view = walk.views[keyframes[seen.keyframe_id].frame_index]
         size = seen.depth.shape[::-1]
         nearest = cv2.INTER_NEAREST
         depth, normal = (

@@ -47,6 +47,9 @@ class Shadowed:
     def texture(self, encoded: Any) -> float:
         return self.main.texture(encoded[0])
 
+    def grey(self, encoded: Any) -> torch.Tensor:
+        return self.main.grey(encoded[0])
+
     def measure(
         self,
         first: Sequence[Any],
