@@ -29,11 +29,11 @@ from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.world.grid import SampleGrid
+from geogs_train.flow.flow_loss import run_network
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 from geogs_train.flow.flow_scores import CellErrors, summarise
 from geogs_train.flow.flow_validation import Validation, cell_errors
-from geogs_train.flow.objective import run_network
 from geogs_train.flow.starts import StartOptions, disturbed_starts
 
 STARTS = {

@@ -28,9 +28,9 @@ from geogs.tracking.flow.own import OwnFlowOptions, load_network
 from geogs.world.grid import SampleGrid
 from geogs_synth.clips.room_options import only_scene
 from geogs_synth.clips.sampler import RoomSampler
+from geogs_train.flow.flow_loss import run_network
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
-from geogs_train.flow.objective import run_network
 from geogs_train.flow.starts import StartOptions
 
 EDGES = 6

@@ -1,44 +1,50 @@
 """Plans of the next training steps, drawn by other processes while the GPU works."""
 
 import multiprocessing
+import os
 import pickle
 from collections import deque
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 
 from geogs_synth.clips.room_options import RoomOptions
-from geogs_synth.clips.sampler import Plan, draw_plan
+from geogs_synth.clips.sampler import Plan, RoomSampler, draw_plan
+from geogs_train.course import Worker
 
-PROCESSES = 3
+MOST_PROCESSES = 6
 AHEAD = 8
 """Plans that are ready, beside those that are being drawn."""
 
 
 class PlansAhead:
-    """The plans of consecutive steps; drawing one takes longer than a step may."""
+    """The plans of consecutive steps; drawing one takes longer than a step on a GPU may."""
 
-    def __init__(
-        self,
-        options: RoomOptions,
-        materials: int,
-        seed: int,
-        batch: int,
-        rank: int,
-        processes: int = PROCESSES,
-    ) -> None:
-        self._draw = partial(_pickled_plan, options, materials, seed, batch, rank)
-        self._pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
-        self._ahead = AHEAD + processes
+    def __init__(self, rooms: RoomSampler, batch: int, worker: Worker, least: int = 1) -> None:
+        """At ``least`` so many processes draw them ahead for a GPU; on a CPU they are drawn when
+        they are asked for."""
+        self._on_demand = partial(rooms.plan, batch=batch, rank=worker.rank)
+        self._pool: ProcessPoolExecutor | None = None
+        if worker.device.type == "cuda":
+            cores = len(os.sched_getaffinity(0)) // worker.count
+            processes = max(least, min(MOST_PROCESSES, (cores - 2) // 2))
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(processes, context)
+            self._ahead = AHEAD + processes
+        drawn = rooms.options, rooms.bank.materials, rooms.seed, batch, worker.rank
+        self._draw = partial(_pickled_plan, *drawn)
         self._waiting: deque[tuple[int, Future[bytes]]] = deque()
 
     def plan(self, step: int) -> Plan:
         """The plan of a step; those of the steps after it are begun."""
+        if self._pool is None:
+            return self._on_demand(step)
         while self._waiting and self._waiting[0][0] != step:
             self._waiting.popleft()[1].cancel()
         first = self._waiting[-1][0] + 1 if self._waiting else step
         for following in range(first, step + self._ahead):
             self._waiting.append((following, self._pool.submit(self._draw, following)))
-        return pickle.loads(self._waiting.popleft()[1].result())
+        plan: Plan = pickle.loads(self._waiting.popleft()[1].result())
+        return plan
 
     def rest(self) -> None:
         """Draw nothing until a plan is asked for again."""
@@ -47,7 +53,8 @@ class PlansAhead:
 
     def close(self) -> None:
         """End the processes."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _pickled_plan(

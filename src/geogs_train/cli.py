@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional, Settings
 from geogs_train.depth.depth_options import DepthTraining
-from geogs_train.flow.flow_options import FlowTraining, TrainingRunOptions
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.training_options import TrainingRunOptions
 
 
 @dataclass(frozen=True)

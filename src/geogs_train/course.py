@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from geogs_train.training_options import TrainingSchedule
+
 Panels = tuple[tuple[str, tuple[str, ...], bool], ...]
 """Pictures of scores: title, names of scores, whether on a logarithmic scale."""
 
@@ -19,46 +21,6 @@ class Worker:
     device: torch.device
     rank: int = 0
     count: int = 1
-
-
-@runtime_checkable
-class TrainingSchedule(Protocol):
-    """The settings that every training has; those of a course have more."""
-
-    @property
-    def steps(self) -> int:
-        """Steps of the whole run."""
-        ...
-
-    @property
-    def learning_rate(self) -> float:
-        """Peak."""
-        ...
-
-    @property
-    def warmup(self) -> int:
-        """Steps in which the learning rate grows from zero."""
-        ...
-
-    @property
-    def weight_decay(self) -> float:
-        """Weight decay of AdamW."""
-        ...
-
-    @property
-    def clip(self) -> float:
-        """Largest norm of a gradient."""
-        ...
-
-    @property
-    def ema(self) -> float:
-        """Decay of the running mean of the weights."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Seed of everything random."""
-        ...
 
 
 @runtime_checkable
@@ -89,8 +51,8 @@ class Course(Protocol):
     """What is drawn of the scores."""
 
     @property
-    def options(self) -> Any:
-        """A dataclass with the settings of a :class:`TrainingSchedule` and more."""
+    def options(self) -> TrainingSchedule:
+        """The settings."""
         ...
 
     @property

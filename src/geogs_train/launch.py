@@ -12,11 +12,13 @@ from geogs.gpu.installation import require_device
 from geogs_train.course import Course, Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining
+from geogs_train.flow.bundle_course import BundleCourse
 from geogs_train.flow.flow_course import FlowCourse
-from geogs_train.flow.flow_options import FlowTraining, TrainingRunOptions
+from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.pace import shared
 from geogs_train.training_checkpoint import read_options
 from geogs_train.training_curves import draw_curves
+from geogs_train.training_options import TrainingRunOptions
 from geogs_train.training_run import train
 
 
@@ -36,17 +38,18 @@ def launch(
     with _worker(device) as worker:
         if run.resume:
             training = read_options(out, type(training))
-        course = _course(training, worker)
+        course = course_of(training, worker)
         train(course, run, out, worker, progress)
         shared(0.0, worker)  # nobody leaves before the first has written everything
     if worker.rank == 0:
         draw_curves(out, course.curves)
 
 
-def _course(training: FlowTraining | DepthTraining, worker: Worker) -> Course:
+def course_of(training: FlowTraining | DepthTraining, worker: Worker) -> Course:
+    """What the settings ask for. Raises InputError where they do not fit each other."""
     if isinstance(training, DepthTraining):
         return DepthCourse(training, worker)
-    return FlowCourse(training, worker)
+    return (FlowCourse if training.stage == "flow" else BundleCourse)(training, worker)
 
 
 @contextmanager

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
-from geogs_train.course import Course, TrainingSchedule, Worker
+from geogs_train.course import Course, Worker
 from geogs_train.step_graph import StepGraph
+from geogs_train.training_options import TrainingSchedule
 
 
 class NetworkTrainer:

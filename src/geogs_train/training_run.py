@@ -9,10 +9,10 @@ from typing import Any
 
 from geogs.errors import GeogsError, InputError
 from geogs_train.course import Course, Examination, ValidationScores, Worker
-from geogs_train.flow.flow_options import TrainingRunOptions
 from geogs_train.network_trainer import NetworkTrainer
 from geogs_train.pace import EVERY, Clock, shared
 from geogs_train.training_checkpoint import load_checkpoint, save_checkpoint
+from geogs_train.training_options import TrainingRunOptions
 
 LOG = "log.jsonl"
 REPORT_EVERY = 50

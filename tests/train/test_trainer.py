@@ -22,12 +22,12 @@ from geogs.tracking.flow.own_network import (
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_train.course import Worker
 from geogs_train.flow.bundle import reproject
-from geogs_train.flow.flow_course import FlowCourse
 from geogs_train.flow.flow_loss import descriptor_loss, flow_loss
 from geogs_train.flow.flow_options import BundleTraining, FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 from geogs_train.flow.flow_scores import CellErrors, has_texture, summarise
 from geogs_train.flow.starts import StartOptions, disturbed_starts
+from geogs_train.launch import course_of
 from geogs_train.network_trainer import NetworkTrainer, schedule
 from geogs_train.training_checkpoint import load_checkpoint, read_options, save_checkpoint
 from random_rooms import use_fast_rooms
@@ -54,7 +54,7 @@ CPU = Worker(torch.device("cpu"))
 
 
 def trainer_of(options: FlowTraining) -> NetworkTrainer:
-    return NetworkTrainer(FlowCourse(options, CPU), CPU)
+    return NetworkTrainer(course_of(options, CPU), CPU)
 
 
 def plane_pair(count: int = 64) -> dict:

@@ -56,7 +56,7 @@ class RoomSampler:
         """``bank`` may be that of a sampler with the same textures."""
         self.options = options
         self.device = torch.device(device)
-        self._seed = seed
+        self.seed = seed
         self.bank = bank or make_bank(
             options.textures, options.texture_size, seed, self.device, options.validation
         )
@@ -71,7 +71,7 @@ class RoomSampler:
 
     def plan(self, step: int, batch: int, rank: int = 0) -> Plan:
         """What :meth:`sample` draws on the host."""
-        return draw_plan(self.options, self.bank.materials, self._seed, step, batch, rank)
+        return draw_plan(self.options, self.bank.materials, self.seed, step, batch, rank)
 
     @torch.no_grad()
     def film(self, plan: Plan) -> ClipBatch:

@@ -7,8 +7,9 @@ from jaxtyping import Float, Float16, UInt8
 from torch import Tensor
 
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.sampler import Plan, RoomSampler
+from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.ahead import PlansAhead
+from geogs_train.course import Worker
 
 QUANTILES = (0.05, 0.5, 0.95)
 """Quantiles of depth, which stand for what a tracker knows of a view."""
@@ -50,22 +51,10 @@ class StoredClips:
 class ClipPool:
     """At turn t it holds the batches t to t + ``plans`` - 1 of an endless supply."""
 
-    def __init__(
-        self,
-        rooms: RoomSampler,
-        plans: int,
-        clips: int,
-        seed: int,
-        rank: int = 0,
-        processes: int = 0,
-    ) -> None:
-        """``processes`` draw rooms ahead, each batch of ``clips``; none draws them when needed."""
-        self._rooms, self._plans, self._clips, self._rank = rooms, plans, clips, rank
-        self._ahead = (
-            PlansAhead(rooms.options, rooms.bank.materials, seed, clips, rank, processes)
-            if processes
-            else None
-        )
+    def __init__(self, rooms: RoomSampler, plans: int, clips: int, worker: Worker) -> None:
+        """Batches are of so many ``clips``."""
+        self._rooms, self._plans, self._clips = rooms, plans, clips
+        self._ahead = PlansAhead(rooms, clips, worker)
         self._stored: StoredClips | None = None
         self._turn = 0
 
@@ -77,7 +66,7 @@ class ClipPool:
         else:
             missing = range(self._turn + self._plans, turn + self._plans)
         for number in missing:
-            self._put(number, StoredClips.of(self._rooms.film(self._plan(number))))
+            self._put(number, StoredClips.of(self._rooms.film(self._ahead.plan(number))))
         self._turn = turn
         assert self._stored is not None
         return self._stored
@@ -85,18 +74,11 @@ class ClipPool:
     def empty(self) -> None:
         """Free what is stored, and draw nothing ahead until clips are asked for again."""
         self._stored = None
-        if self._ahead is not None:
-            self._ahead.rest()
+        self._ahead.rest()
 
     def close(self) -> None:
         """End the processes."""
-        if self._ahead is not None:
-            self._ahead.close()
-
-    def _plan(self, number: int) -> Plan:
-        if self._ahead is not None:
-            return self._ahead.plan(number)
-        return self._rooms.plan(number, self._clips, self._rank)
+        self._ahead.close()
 
     def _put(self, number: int, clips: StoredClips) -> None:
         if self._stored is None:

@@ -1,6 +1,5 @@
 """The depth network's course: keyframes drawn from pools of clips of random rooms."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,9 +48,8 @@ class DepthCourse:
             options.seed + 1,
             large.bank,
         )
-        self._pools = [
-            self._pool(rooms, options.seed + n) for n, rooms in enumerate((large, small))
-        ]
+        pool = options.pool
+        self._pools = [ClipPool(r, pool.plans, pool.rooms, worker) for r in (large, small)]
         self._held_out: DepthValidation | None = None
 
     def network(self) -> DepthNetwork:
@@ -108,11 +106,3 @@ class DepthCourse:
         """End the processes that draw rooms."""
         for pool in self._pools:
             pool.close()
-
-    def _pool(self, rooms: RoomSampler, seed: int) -> ClipPool:
-        options, worker = self.options.pool, self.worker
-        processes = 0
-        if worker.device.type == "cuda":
-            cores = len(os.sched_getaffinity(0)) // worker.count
-            processes = max(1, min(6, (cores - 2) // 2))
-        return ClipPool(rooms, options.plans, options.rooms, seed, worker.rank, processes)

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from geogs.config import Seed
 from geogs.config.setting import Count, Fraction, Positive, Range, Settings, Weight
 from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs_synth.clips.room_options import MotionWeights, RoomOptions
+from geogs_train.training_options import TrainingSchedule
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,12 @@ class DepthLossOptions(Settings, group="training.loss"):
 
 
 @dataclass(frozen=True)
-class DepthTraining(Settings, group="training"):
-    """What a training run does; saved with every checkpoint."""
+class DepthTraining(TrainingSchedule):
+    """What a training run of the depth network does."""
 
     steps: Annotated[int, Range(1)] = 12_000
-    """Steps of the whole run; the learning rate ends at zero with the last."""
+    learning_rate: Positive = 6e-4
+    weight_decay: Weight = 1e-2
     batch: Count = 12
     """Keyframes per step and device."""
     small_batch: Count = 24
@@ -108,14 +109,4 @@ class DepthTraining(Settings, group="training"):
     pool: PoolOptions = field(default_factory=PoolOptions)
     tuples: TupleOptions = field(default_factory=TupleOptions)
     loss: DepthLossOptions = field(default_factory=DepthLossOptions)
-    learning_rate: Positive = 6e-4
-    """Peak, reached after the warm-up."""
-    warmup: Count = 300
-    """Steps in which the learning rate grows from zero."""
-    weight_decay: Weight = 1e-2
-    clip: Positive = 1.0
-    """Largest norm of a gradient."""
-    ema: Annotated[float, Range(0, below=1)] = 0.999
-    """Decay of the running mean of the weights, which is what is validated and shipped."""
-    seed: Seed = 0
     network: DepthNetworkOptions = field(default_factory=DepthNetworkOptions)

@@ -1,6 +1,5 @@
-"""The flow network's course: clips of random rooms and one of the two stages of its training."""
+"""The flow network's course in the first stage of its training: flow of pairs of views."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +9,26 @@ from torch import Tensor
 
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork
+from geogs_synth.clips.clips import ClipBatch
 from geogs_synth.clips.room_options import SCENE_KINDS
-from geogs_synth.clips.sampler import Plan, RoomSampler
-from geogs_train.ahead import PROCESSES, PlansAhead
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_train.ahead import PlansAhead
 from geogs_train.course import Panels, Worker
+from geogs_train.flow.flow_loss import flow_loss, run_network
 from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_pairs import flow_batch
 from geogs_train.flow.flow_validation import SceneScores, SceneValidation
-from geogs_train.flow.objective import objective
+from geogs_train.flow.starts import StartOptions
 from geogs_train.trained_weights import write_weights
+
+LEAST_PROCESSES = 3
+"""Draw plans for a GPU: a step of this network is short."""
 
 
 class FlowCourse:
     """Every step films other rooms."""
 
+    recordable = True
     weights = "flow.safetensors"
     curves: Panels = (
         (
@@ -42,10 +48,8 @@ class FlowCourse:
 
     def __init__(self, options: FlowTraining, worker: Worker) -> None:
         self.options, self.worker = options, worker
-        self.objective = objective(options)
-        self.recordable = self.objective.recordable
         self.rooms = RoomSampler(options.rooms, worker.device, options.seed)
-        self._plans: PlansAhead | None = None
+        self._plans = PlansAhead(self.rooms, options.batch, worker, LEAST_PROCESSES)
 
     def network(self) -> FlowNetwork:
         """As in the protocol."""
@@ -58,15 +62,21 @@ class FlowCourse:
 
     def batch(self, step: int, progress: float) -> Any:
         """As in the protocol."""
-        clips = self.rooms.film(self._plan(step))
+        clips = self.rooms.film(self._plans.plan(step))
         generator = torch.Generator(self.worker.device)
         generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
         with torch.no_grad():
-            return self.objective.prepare(clips, generator)
+            return self.prepare(clips, generator)
+
+    def prepare(self, clips: ClipBatch, generator: torch.Generator) -> Any:
+        """Every ordered pair of neighbouring views, from disturbed starts; all that is random is
+        drawn here."""
+        return flow_batch(clips, StartOptions(far=self.options.far), generator)
 
     def loss(self, network: FlowNetwork, batch: Any) -> Float[Tensor, ""]:
-        """As in the protocol."""
-        return self.objective.loss(network, batch)
+        """The flow of all iterations and its likelihood."""
+        found = run_network(network, batch, self.options.iterations)
+        return flow_loss(*found, batch, self.options)
 
     def examination(self, batches: int) -> SceneValidation:
         """As in the protocol."""
@@ -82,17 +92,4 @@ class FlowCourse:
 
     def close(self) -> None:
         """End the processes that draw rooms."""
-        if self._plans is not None:
-            self._plans.close()
-
-    def _plan(self, step: int) -> Plan:
-        options, rank = self.options, self.worker.rank
-        if self.worker.device.type != "cuda":
-            return self.rooms.plan(step, options.batch, rank)
-        if self._plans is None:
-            cores = len(os.sched_getaffinity(0)) // self.worker.count
-            self._plans = PlansAhead(
-                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank,
-                processes=max(PROCESSES, min(6, (cores - 2) // 2)),
-            )  # fmt: skip
-        return self._plans.plan(step)
+        self._plans.close()

@@ -1,4 +1,4 @@
-"""What the flow network is trained to do."""
+"""What the flow network says of a batch, and what it is trained to say."""
 
 from collections.abc import Sequence
 
@@ -7,12 +7,27 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.tracking.flow.lookup import RADIUS, WINDOW, correlation_windows
-from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures
+from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures, FlowNetwork
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 
 MAX_ERROR = 100.0
 """Errors beyond so many pixels count as such; nothing is learned from how far lost a cell is."""
+
+
+def run_network(
+    network: FlowNetwork, batch: FlowBatch, iterations: int
+) -> tuple[FlowFeatures, list[FlowEstimate], Float[Tensor, "e h w 2"]]:
+    """Features, estimates of every iteration, upsampled flow of the last; bfloat16 on a GPU."""
+    device = batch.images.device
+    with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+        images = batch.images
+        if device.type == "cuda":
+            images = images.contiguous(memory_format=torch.channels_last)
+        features = network.encode(images)
+        estimates = list(network.iterate(features, batch.edges, batch.start, iterations))
+        dense = network.upsample(estimates[-1], *batch.truth.shape[1:3])
+    return features, estimates, dense
 
 
 def flow_loss(

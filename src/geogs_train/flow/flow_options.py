@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from geogs.config import Seed
-from geogs.config.setting import Count, Fraction, Positive, Range, Settings, Weight
+from geogs.config.setting import Count, Fraction, Range, Settings, Weight
 from geogs.tracking.flow.own_options import NetworkOptions
 from geogs_synth.clips.room_options import RoomOptions, SceneWeights
+from geogs_train.training_options import TrainingSchedule
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,11 @@ class BundleTraining(Settings, group="training.bundle"):
 
 
 @dataclass(frozen=True)
-class FlowTraining(Settings, group="training"):
-    """What a training run does; saved with every checkpoint."""
+class FlowTraining(TrainingSchedule):
+    """What a training run of the flow network does."""
 
     stage: Literal["flow", "bundle"] = "flow"
     """Pairs of views with exact flow, or clips through the dense bundle adjustment."""
-    steps: Annotated[int, Range(1)] = 20_000
-    """Steps of the whole run; the learning rate ends at zero with the last."""
     batch: Count = 16
     """Clips per step and device."""
     rooms: RoomOptions = field(
@@ -47,15 +45,6 @@ class FlowTraining(Settings, group="training"):
     """Fraction of the edges, beside those from nothing, whose start is off by 16 to 64 pixels."""
     iterations: Count = 6
     """Iterations of the network per edge."""
-    learning_rate: Positive = 8e-4
-    """Peak, reached after the warm-up."""
-    warmup: Count = 300
-    """Steps in which the learning rate grows from zero."""
-    weight_decay: Weight = 1e-4
-    clip: Positive = 1.0
-    """Largest norm of a gradient."""
-    ema: Annotated[float, Range(0, below=1)] = 0.999
-    """Decay of the running mean of the weights, which is what is validated and shipped."""
     decay: Annotated[float, Range(above=0, most=1)] = 0.8
     """Weight of an iteration's loss relative to the next."""
     likelihood: Literal["joint", "separate"] = "joint"
@@ -68,27 +57,5 @@ class FlowTraining(Settings, group="training"):
     """Weight of the cross-entropy between correlation windows and where the truth lies in them."""
     occluded: Weight = 0.3
     """Weight of cells that the other view does not see, relative to those that it sees."""
-    seed: Seed = 0
     bundle: BundleTraining = field(default_factory=BundleTraining)
     network: NetworkOptions = field(default_factory=NetworkOptions)
-
-
-@dataclass(frozen=True)
-class TrainingRunOptions(Settings, group="run"):
-    """How a run is watched and when it pauses."""
-
-    validate_every: Count = 1000
-    """Steps between validations, each with a checkpoint."""
-    validation_batches: Count = 8
-    minutes: Annotated[float | None, Range(above=0)] = None
-    """The run stops with a checkpoint after so many minutes, if any; it goes on with ``resume``."""
-    paced: bool = False
-    """Whether the run is as long as its minutes instead of its steps: the learning rate ends at
-    zero with the last minute. How many steps that are depends on the machine, and a run that goes
-    on has its minutes again for what was left."""
-    resume: bool = False
-    """Go on from the checkpoint in the output folder, with its settings."""
-    begin_with: str = ""
-    """Weights file to begin with; "" for random ones."""
-    fuse: bool = False
-    """Whether the network is compiled; worth its minute on a GPU."""

@@ -8,10 +8,10 @@ from geogs.tracking.flow.own_network import FlowNetwork
 from geogs_synth.clips.room_options import SCENE_KINDS, only_scene
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.textures.pyramids import TextureBank
+from geogs_train.flow.flow_loss import run_network
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
 from geogs_train.flow.flow_scores import CellErrors, FlowScores, has_texture, summarise
-from geogs_train.flow.objective import run_network
 from geogs_train.flow.starts import StartOptions
 
 SEED = 2718

@@ -9,6 +9,7 @@ import torch
 from depth_tuples import TRAINING, use_fast_rooms
 from geogs.depth.network.plane_views import cell_rays
 from geogs_synth.clips.sampler import RoomSampler
+from geogs_train.course import Worker
 from geogs_train.depth.clip_pool import ClipPool, StoredClips
 from geogs_train.depth.depth_options import TupleOptions
 from geogs_train.depth.depth_tuples import Chance, disturbed_poses, draw_tuples, known_range, relit
@@ -103,7 +104,7 @@ def test_light_changes_view_by_view():
 def test_a_pool_goes_on_as_if_it_had_never_stopped(monkeypatch):
     use_fast_rooms(monkeypatch)
     rooms = RoomSampler(replace(TRAINING.rooms, width=32, height=32), "cpu", 1)
-    pool, later = (ClipPool(rooms, 2, 1, 1) for _ in range(2))
+    pool, later = (ClipPool(rooms, 2, 1, Worker(torch.device("cpu"))) for _ in range(2))
     for turn in range(3):
         found = pool.at(turn)
     for mine, theirs in zip(found.tensors(), later.at(2).tensors(), strict=True):

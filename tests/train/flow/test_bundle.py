@@ -23,7 +23,7 @@ from geogs_train.flow.bundle import (
     adjust,
     reproject,
 )
-from geogs_train.flow.bundle_objective import true_state
+from geogs_train.flow.bundle_course import true_state
 from tracking_scenes import CAMERA as ROOM
 from tracking_scenes import pose, render
 

@@ -6,12 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.errors import InputError
 from geogs.geometry.lie import retract
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlowOptions
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.room_options import only_scene
+from geogs_train.course import Worker
 from geogs_train.flow.bundle import (
     ClipBundleOptions,
     ClipCameras,
@@ -21,6 +24,7 @@ from geogs_train.flow.bundle import (
     adjust,
     reproject,
 )
+from geogs_train.flow.flow_course import FlowCourse
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import MARGIN
 from geogs_train.flow.pose_loss import PoseLossOptions, pose_loss
@@ -60,7 +64,7 @@ def true_state(T_cw: Float[Tensor, "b v 4 4"], depth: Float[Tensor, "b v h w"]) 
     return ClipState(T, d / scale)
 
 
-class BundleObjective:
+class BundleCourse(FlowCourse):
     """What poses and depths come out of adjusting the network's flow with its weights.
 
     Rounds of flow from the present reprojection and adjustment, as the tracker's; the loss is
@@ -70,8 +74,14 @@ class BundleObjective:
 
     recordable = False
 
-    def __init__(self, options: FlowTraining) -> None:
-        self.options = options
+    def __init__(self, options: FlowTraining, worker: Worker) -> None:
+        """Raises InputError for rooms in which something moves or looks unusual."""
+        if options.rooms.scenes != only_scene("usual"):
+            raise InputError(
+                "The bundle stage is for still rooms: --training.rooms.scenes.* must be 0 for all "
+                "kinds but usual."
+            )
+        super().__init__(options, worker)
 
     def prepare(self, clips: ClipBatch, generator: torch.Generator) -> BundleBatch:
         """Disturb poses and depths; the first two poses, which set the scale, stay."""
