@@ -26,8 +26,7 @@ from geogs.io.sources.sniff import open_source
 from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
-from geogs.tracking.flow.own import load_network
-from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
+from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels, load_flow_network
 from geogs.world.grid import SampleGrid
 from geogs_train.flow.flow_loss import run_network
 from geogs_train.flow.flow_options import FlowTraining
@@ -54,7 +53,7 @@ def main() -> None:
     parser.add_argument("--scenes", default="usual", help="kinds, separated by commas")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    network = load_network(options.weights).to(device)
+    network = load_flow_network(options.weights).to(device)
     bank = None
     for scene in options.scenes.split(",") if options.data is None else ["data"]:
         validation: Validation | None = None

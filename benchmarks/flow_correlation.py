@@ -24,7 +24,8 @@ import torch
 from geogs.geometry.camera import Camera
 from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical_flow import ClassicalFlow
-from geogs.tracking.flow.own import OwnFlowOptions, load_network
+from geogs.tracking.flow.own import OwnFlowOptions
+from geogs.tracking.flow.own_network import load_flow_network
 from geogs.world.grid import SampleGrid
 from geogs_synth.clips.room_options import only_scene
 from geogs_synth.clips.sampler import RoomSampler
@@ -52,7 +53,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=288)
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    network = load_network(options.weights).to(device)
+    network = load_flow_network(options.weights).to(device)
     bank = None
     for scene in options.scenes.split(","):
         rooms = replace(

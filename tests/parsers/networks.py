@@ -9,16 +9,14 @@ import torch
 from safetensors.torch import save_file
 
 import mutations
-from geogs.depth.network.calibration import DepthCalibration
-from geogs.depth.network.model import DepthNetwork
+from geogs.depth.network.depth_calibration import DepthCalibration
+from geogs.depth.network.model import DepthNetwork, load_depth_network
 from geogs.depth.network.network_sizes import DepthNetworkOptions
-from geogs.depth.network.weights import load_depth_network
 from geogs.geometry.camera import Camera
 from geogs.networks.tensor_files import read_tensors
 from geogs.priors.card import load_card
 from geogs.priors.onnx import OnnxPrior
-from geogs.tracking.flow.own import load_network
-from geogs.tracking.flow.own_network import FlowNetwork, NetworkOptions
+from geogs.tracking.flow.own_network import FlowNetwork, NetworkOptions, load_flow_network
 from io_samples import gradient_image
 from parsers.base import Parser, written
 
@@ -44,7 +42,7 @@ def networks() -> dict[str, Parser]:
             lambda f: read_tensors(f / WEIGHTS),
         ),
         "weights-flow": Parser(
-            flow, (WEIGHTS,), mutations.safetensors, lambda f: load_network(f / WEIGHTS)
+            flow, (WEIGHTS,), mutations.safetensors, lambda f: load_flow_network(f / WEIGHTS)
         ),
         "weights-depth": Parser(
             depth, (WEIGHTS,), mutations.safetensors, lambda f: load_depth_network(f / WEIGHTS)

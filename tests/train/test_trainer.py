@@ -11,13 +11,13 @@ import torch
 from geogs.cli.main import main
 from geogs.geometry.lie import se3_exp
 from geogs.tracking.flow.lookup import CHANNELS, DescriptorPyramid, Edges, PyramidLevel
-from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
     FlowFeatures,
     LaplaceMixture,
     NetworkOptions,
     cell_pixels,
+    load_flow_network,
 )
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_train.course import Worker
@@ -261,7 +261,7 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path, monkeypatch):
                "--training.rooms.least-density", "0.02",
                "--training.rooms.most-density", "0.05", "--device", "cpu"]  # fmt: skip
     assert main(["train", "flow", str(out), "--training.steps", "1", *options]) == 0
-    network = load_network(out / "flow.safetensors")
+    network = load_flow_network(out / "flow.safetensors")
     assert sum(p.numel() for p in network.parameters()) > 1e6
     entries = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert entries[-1]["scores"]["usual"]["epe"] > 0

@@ -30,7 +30,7 @@ def depth_engine(
 
         return TrackerDepthEngine(classical, torch.device(device), render, working)
     from geogs.depth.network.engine import NetworkDepthEngine
-    from geogs.depth.network.weights import load_depth_network
+    from geogs.depth.network.model import load_depth_network
     from geogs.networks.weights_files import find_weights
 
     trained = load_depth_network(find_weights("depth", config.weights))

@@ -1,16 +1,21 @@
 """Reading tensors from weights files, without running what may be hidden in them."""
 
+import json
 import pickle
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 
+from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.networks.weights_files import require_intact
+
+N = TypeVar("N", bound=nn.Module)
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -31,6 +36,36 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         such = ascii(other[0])[1:-1][:40]
         raise InputError(f"{path} holds more than named tensors (such as {such}).")
     return dict(content)
+
+
+def load_trained(
+    path: Path, kind: Literal["flow", "depth"], build: Callable[[dict[str, Any]], N]
+) -> N:
+    """A network of ours as ``geogs train`` writes it, in single precision and ready to be run.
+
+    ``build`` makes it of what stands in the file about it: by name, the fields of dataclasses.
+    Raises InputError where the file is missing or another's.
+    """
+    if not path.is_file():
+        option = "--tracking.operator" if kind == "flow" else "--mapping.depth.engine"
+        raise InputError(
+            f"There are no weights of the {kind} network at {path}; train some with geogs train "
+            f"{kind}, or take {option} classical."
+        )
+    try:
+        with safe_open(path, "pt") as file:
+            about = {name: json.loads(text) for name, text in (file.metadata() or {}).items()}
+            tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+        options = about["options"].items()
+        about["options"] = {k: tuple(v) if isinstance(v, list) else v for k, v in options}
+        network = build(about)
+        network.load_state_dict(tensors)
+    except Exception as error:  # whatever another file makes the reader stumble over
+        raise InputError(
+            f"{path} does not hold weights of our {kind} network ({in_short(error)})."
+        ) from error
+    network.eval().requires_grad_(False)
+    return network
 
 
 def _safetensors(path: Path) -> object:

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.network.calibration import TOLERANCE, DepthCalibration, right_logit
+from geogs.depth.network.depth_calibration import TOLERANCE, DepthCalibration, right_logit
 from geogs_train.depth.depth_scores import DepthErrors
 
 BELIEVED = 0.5

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.weights import load_depth_network
+from geogs.depth.network.model import DepthNetwork, load_depth_network
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
 from geogs_train.course import Panels, Worker
@@ -94,7 +93,7 @@ class DepthCourse:
 
     def load(self, path: Path) -> DepthNetwork:
         """As in the protocol."""
-        return load_depth_network(path).network.requires_grad_(True)
+        return load_depth_network(path).requires_grad_(True)
 
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
         """As in the protocol; calibrated on rooms that neither training nor validation show."""

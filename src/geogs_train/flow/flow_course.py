@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.tracking.flow.own import load_network
-from geogs.tracking.flow.own_network import FlowNetwork
+from geogs.tracking.flow.own_network import FlowNetwork, load_flow_network
 from geogs_synth.clips.clips import ClipBatch
 from geogs_synth.clips.room_options import SCENE_KINDS
 from geogs_synth.clips.sampler import RoomSampler
@@ -84,7 +83,7 @@ class FlowCourse:
 
     def load(self, path: Path) -> FlowNetwork:
         """As in the protocol."""
-        return load_network(path)
+        return load_flow_network(path)
 
     def export(self, network: FlowNetwork, path: Path, step: int, scores: SceneScores) -> None:
         """As in the protocol."""

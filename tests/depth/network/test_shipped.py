@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from geogs.depth.network.weights import load_depth_network
+from geogs.depth.network.model import load_depth_network
 from geogs.networks.weights_files import PACKAGED, find_weights
 
 WEIGHTS = PACKAGED / "depth.safetensors"
@@ -21,6 +21,6 @@ def test_it_is_found_and_its_calibration_is_a_small_correction(monkeypatch, tmp_
     monkeypatch.setenv("GEOGS_CACHE", str(tmp_path))
     assert find_weights("depth") == WEIGHTS
     trained = load_depth_network(WEIGHTS)
-    assert sum(p.numel() for p in trained.network.parameters()) < 6e6
+    assert sum(p.numel() for p in trained.parameters()) < 6e6
     assert trained.calibration.scale == pytest.approx(1.0, abs=0.2)
     assert trained.calibration.gain == pytest.approx(1.0, abs=0.3)

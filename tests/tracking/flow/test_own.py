@@ -9,7 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.classical_flow_cuda import CudaClassicalFlow
 from geogs.tracking.flow.lookup import Edges
-from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions, load_network
+from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
     FlowNetwork,
@@ -17,6 +17,7 @@ from geogs.tracking.flow.own_network import (
     LaplaceMixture,
     NetworkOptions,
     cell_pixels,
+    load_flow_network,
 )
 from geogs.world.grid import SampleGrid
 from geogs_train.flow.flow_scores import FlowScores
@@ -161,10 +162,10 @@ def test_cells_that_leave_the_image_have_no_weight(operator):
 
 def test_weights_of_something_else_are_refused_in_one_sentence(tmp_path):
     with pytest.raises(InputError, match="no weights"):
-        load_network(tmp_path / "none.safetensors")
+        load_flow_network(tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"0" * 64)
     with pytest.raises(InputError, match="does not hold weights"):
-        load_network(tmp_path / "bad.safetensors")
+        load_flow_network(tmp_path / "bad.safetensors")
 
 
 def test_cells_that_jump_from_a_warm_start_have_no_weight(operator):

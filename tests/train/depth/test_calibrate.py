@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from geogs.depth.network.calibration import TOLERANCE, DepthCalibration, right_logit
+from geogs.depth.network.depth_calibration import TOLERANCE, DepthCalibration, right_logit
 from geogs_train.depth.confidence_fit import calibrated, logistic_fit
 from geogs_train.depth.depth_scores import DepthErrors
 

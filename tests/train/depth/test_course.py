@@ -8,7 +8,7 @@ import torch
 
 from depth_tuples import NETWORK, TRAINING, use_fast_rooms
 from geogs.cli.main import main
-from geogs.depth.network.weights import load_depth_network
+from geogs.depth.network.model import load_depth_network
 from geogs_train.course import Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining
@@ -97,7 +97,7 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path, capsys):
                "--training.steps", "1", "--run.validate-every", "9"]  # fmt: skip
     assert main(["train", "depth", str(out), "--device", "cpu", *options]) == 0
     trained = load_depth_network(out / "depth.safetensors")
-    assert trained.network.options == NETWORK
+    assert trained.options == NETWORK
     assert trained.calibration.scale > 0
     entries = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     assert entries[-1]["scores"]["absolute"] > 0

@@ -14,9 +14,9 @@ from torch.nn import functional
 from geogs.depth.completion import known_cells
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
+from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
-from geogs.depth.network.weights import TrainedDepth
 from geogs.depth.sweep_neighbors import seen_inverse_depth
 from geogs.geometry.camera import Camera
 from geogs.gpu.recorded import Recorded
@@ -42,7 +42,7 @@ class NetworkDepthEngine(AlternativeSearch):
 
     def __init__(
         self,
-        trained: TrainedDepth,
+        network: DepthNetwork,
         classical: DepthEngine,
         device: torch.device,
         render: Camera,
@@ -54,8 +54,7 @@ class NetworkDepthEngine(AlternativeSearch):
         self.render = render
         self.working = working
         self.seen = working.with_long_edge(min(EDGE, max(working.width, working.height)))
-        self.calibration = trained.calibration
-        self.network = trained.network.to(device)
+        self.network = network.to(device)
         lens = [self.seen.fx, self.seen.fy, self.seen.cx, self.seen.cy]
         self._intrinsics = torch.tensor([lens], dtype=torch.float32, device=device)
         self._recorded = Recorded(
@@ -132,7 +131,7 @@ class NetworkDepthEngine(AlternativeSearch):
 
     def _at_render(self, found: DepthPrediction) -> tuple[Tensor, Tensor, Tensor]:
         """Depth over the typical depth, confidence, and normals at the size of the render."""
-        confidence = self.calibration.confidence(found.log_scale, found.outlier)
+        confidence = self.network.calibration.confidence(found.log_scale, found.outlier)
         sure = 2 / found.concentration < MOST_ANGLE
         normal = found.normal * sure[:, None]
         maps = torch.cat([found.log_depth[:, None], confidence[:, None], normal], 1)

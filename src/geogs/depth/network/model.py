@@ -7,6 +7,8 @@ their likelihoods. It sees lengths relative to the typical depth only.
 """
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,11 +16,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from geogs.depth.network.decoder import DepthReadout, VolumeNetwork
+from geogs.depth.network.depth_calibration import DepthCalibration
 from geogs.depth.network.encoders import ContextEncoder, MatchingEncoder, normalised
 from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs.depth.network.plane_views import log_planes
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.volume import PlaneVolume
+from geogs.networks.tensor_files import load_trained
 
 MULTIPLE = 32
 """Images are padded to a multiple of so many pixels."""
@@ -27,9 +31,15 @@ MULTIPLE = 32
 class DepthNetwork(nn.Module):
     """Encoders, plane sweep, network over the planes, read-out."""
 
-    def __init__(self, options: DepthNetworkOptions | None = None) -> None:
+    def __init__(
+        self,
+        options: DepthNetworkOptions | None = None,
+        calibration: DepthCalibration | None = None,
+    ) -> None:
         super().__init__()
         self.options = options or DepthNetworkOptions()
+        self.calibration = calibration or DepthCalibration()
+        """What makes its words hold; no part of what is trained."""
         self.matching = MatchingEncoder(self.options)
         self.context = ContextEncoder(self.options)
         self.volume = PlaneVolume(self.options)
@@ -54,6 +64,16 @@ class DepthNetwork(nn.Module):
             body = self.body(volume, context[1:])
             found = self.readout(body, context[0], planes, views.intrinsics, volume[:, :-1])
         return _cropped(found, height, width)
+
+
+def load_depth_network(path: Path) -> DepthNetwork:
+    """The network of a weights file; raises InputError where it is missing or another's."""
+
+    def build(about: dict[str, Any]) -> DepthNetwork:
+        calibration = DepthCalibration(**about["calibration"])
+        return DepthNetwork(DepthNetworkOptions(**about["options"]), calibration)
+
+    return load_trained(path, "depth", build)
 
 
 def _padded(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h2 w2"]:

@@ -1,7 +1,6 @@
 """The flow operator that is trained for this system (``geogs train flow``)."""
 
 import functools
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,23 +9,15 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from safetensors import safe_open
 from torch import Tensor
 
-from geogs.documents import in_short
-from geogs.errors import InputError
 from geogs.gpu.recorded import Maps, Recorded
 from geogs.gpu.transfer import to_device
 from geogs.threads import opencv_on_one_thread
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator, Memories, check_image_size
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
-from geogs.tracking.flow.own_network import (
-    FlowEstimate,
-    FlowFeatures,
-    FlowNetwork,
-)
-from geogs.tracking.flow.own_options import NetworkOptions
+from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures, load_flow_network
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -93,7 +84,7 @@ class OwnFlow:
         self.classical = classical
         self.options = options or OwnFlowOptions()
         self.device = torch.device(grid.device)
-        network = load_network(weights)
+        network = load_flow_network(weights)
         network.to(self.device)
         # PyTorch's stubs do not know the memory format.
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -238,26 +229,6 @@ class OwnFlow:
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16)
-
-
-def load_network(path: Path) -> FlowNetwork:
-    """The network of a weights file; raises InputError where it is missing or another's."""
-    if not path.is_file():
-        raise InputError(
-            f"There are no weights at {path}; train some with geogs train flow, or take "
-            "--tracking.operator classical."
-        )
-    try:
-        with safe_open(path, "pt") as file:
-            values = json.loads((file.metadata() or {})["options"])
-            tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
-        network = FlowNetwork(NetworkOptions(**{**values, "levels": tuple(values["levels"])}))
-        network.load_state_dict(tensors)
-    except Exception as error:
-        raise InputError(
-            f"{path} does not hold weights of our flow network ({in_short(error)})."
-        ) from error
-    return network.eval().requires_grad_(False)
 
 
 def _stack(parts: Sequence[FlowFeatures]) -> FlowFeatures:

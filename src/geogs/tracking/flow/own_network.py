@@ -8,12 +8,14 @@ cells that are matched and one for cells that are not.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from geogs.networks.tensor_files import load_trained
 from geogs.tracking.flow.lookup import (
     CHANNELS,
     WINDOW,
@@ -149,6 +151,11 @@ class FlowNetwork(nn.Module):
             pad = (0, 0, 0, max(0, width - full.shape[2]), 0, max(0, height - full.shape[1]))
             full = _replicated(full, pad)
         return full[:, :height, :width]
+
+
+def load_flow_network(path: Path) -> FlowNetwork:
+    """The network of a weights file; raises InputError where it is missing or another's."""
+    return load_trained(path, "flow", lambda about: FlowNetwork(NetworkOptions(**about["options"])))
 
 
 class FlowEncoder(nn.Module):
