@@ -10,8 +10,8 @@ from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
-from geogs_bench.runner import Task
-from geogs_bench.scene import Scene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.runners.runner import Task
 
 SCALE = 0.25
 """Map units per metre of the results."""
@@ -34,13 +34,13 @@ def poses(n: int = 20) -> np.ndarray:
     return T
 
 
-def write_truth(folder: Path, name: str = "hall") -> Scene:
+def write_truth(folder: Path, name: str = "hall") -> BenchmarkScene:
     """The wall and its poses; nothing has to be read from the source."""
     folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "traj.txt", poses().reshape(-1, 16))
     write_mesh(folder / "mesh.ply", *wall())
     truth = Truth(TruePoses(folder / "traj.txt"), folder / "mesh.ply", culling="done")
-    return Scene(name, folder, truth)
+    return BenchmarkScene(name, folder, truth)
 
 
 def write_result(

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geogs.errors import InputError
+from geogs_bench.bench_options import BenchOptions
 from geogs_bench.benchmark import Benchmark
-from geogs_bench.commands import runners
+from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
+from geogs_bench.data.benchmark_scene import Option
+from geogs_bench.data.motion_cells import render_cells
+from geogs_bench.data.synthetic_rooms import no_data, synthetic_rooms
 from geogs_bench.harness import Harness
-from geogs_bench.motion_cells import render_cells
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
-from geogs_bench.record import Record
-from geogs_bench.registry import BENCHMARKS, find_benchmark
-from geogs_bench.scene import Option
-from geogs_bench.settings import BenchSettings
-from geogs_bench.synthetic import no_data, synthetic_rooms
+from geogs_bench.results.record import Record
+from geogs_bench.runners.command_runners import runners
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Benched:
     """Those of earlier calls in the same folder included."""
 
 
-def bench(settings: BenchSettings, say: Callable[[str], None]) -> Benched:
+def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:
     """Run and score every scene, and write the tables.
 
     Raises:
@@ -47,7 +47,7 @@ def bench(settings: BenchSettings, say: Callable[[str], None]) -> Benched:
     return Benched(benchmark, output, harness.run(jobs))
 
 
-def _name(settings: BenchSettings) -> str:
+def _name(settings: BenchOptions) -> str:
     """Name of the benchmark: some have another for a switch."""
     name = settings.name
     if settings.known_poses:
@@ -72,7 +72,7 @@ def listing() -> str:
     return "\n".join(lines)
 
 
-def _wishes(settings: BenchSettings, benchmark: Benchmark) -> Wishes:
+def _wishes(settings: BenchOptions, benchmark: Benchmark) -> Wishes:
     common = [Option("device", settings.device), Option("seed", str(settings.seed))]
     if settings.preset:
         common.append(Option("preset", settings.preset))

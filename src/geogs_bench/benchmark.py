@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from geogs_bench.motion_cells import Cell
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
+from geogs_bench.data.motion_cells import Cell
 from geogs_bench.published import PublishedTable
-from geogs_bench.record import Record
-from geogs_bench.runner import Command
-from geogs_bench.scene import Option, Scene
+from geogs_bench.results.record import Record
+from geogs_bench.runners.runner import Command
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Benchmark:
     name: str
     title: str
     command: Command
-    find: Callable[[Path], list[Scene]]
+    find: Callable[[Path], list[BenchmarkScene]]
     needs: str
     """The folder that the user gives."""
     source: str

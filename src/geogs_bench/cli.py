@@ -2,25 +2,15 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from geogs.cli.options import parse_options
-from geogs_bench.settings import BenchSettings
+from geogs_bench.bench_options import BenchOptions
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from geogs_bench.bench import Benched
-
-
-@dataclass(frozen=True)
-class BenchOptions(BenchSettings):
-    """Run a benchmark on your copy of its data, score it, write the tables.
-
-    ``geogs bench list`` says which there are, what data each needs and where to get it. What was
-    finished before in the same folder is not run again.
-    """
 
 
 def main(argv: Sequence[str]) -> int:
@@ -45,7 +35,7 @@ def _tables(done: "Benched") -> "list[Table]":
     """The tables of a benchmark for a terminal."""
     from rich.table import Table
 
-    from geogs_bench.tables import result_tables
+    from geogs_bench.tables.result_tables import result_tables
 
     shown = []
     for table in result_tables(done.benchmark, done.records):

@@ -11,13 +11,10 @@ from geogs.errors import GeogsError
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.machine import forget_peak_memory, machine_name, program_version
-from geogs_bench.plan import Job
-from geogs_bench.record import Cost, Provenance, Record, read_record, write_json
-from geogs_bench.report import write_report
-from geogs_bench.result import ResultFolder
-from geogs_bench.runner import Command, Runner
-from geogs_bench.scoring.scores import score
-from geogs_bench.store import (
+from geogs_bench.plan import BenchmarkJob
+from geogs_bench.results.record import Cost, Provenance, Record, read_record, write_json
+from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.results.store import (
     RECORD_FILE,
     CompletedRun,
     clear,
@@ -26,6 +23,9 @@ from geogs_bench.store import (
     records_below,
     write_completed_run,
 )
+from geogs_bench.runners.runner import Command, Runner
+from geogs_bench.scoring.scores import scored
+from geogs_bench.tables.benchmark_report import write_report
 
 _ERROR_FILE = "bench_error.txt"
 
@@ -52,7 +52,7 @@ class Harness:
         self._commit = program_version()
         self._machine = machine_name()
 
-    def run(self, jobs: Sequence[Job]) -> list[Record]:
+    def run(self, jobs: Sequence[BenchmarkJob]) -> list[Record]:
         """All records of the benchmark, those of earlier calls in the same folder included.
 
         A job that fails leaves a record that says why, and the others go on. The report is written
@@ -73,7 +73,7 @@ class Harness:
             write_report(self._output, self._benchmark, records)
         return records
 
-    def _ordered(self, records: Sequence[Record], jobs: Sequence[Job]) -> list[Record]:
+    def _ordered(self, records: Sequence[Record], jobs: Sequence[BenchmarkJob]) -> list[Record]:
         scenes = [*self._benchmark.scenes, *(job.scene.name for job in jobs)]
         variants = [job.variant for job in jobs]
 
@@ -82,7 +82,7 @@ class Harness:
 
         return sorted(records, key=place)
 
-    def _do(self, job: Job, settings: dict[str, object]) -> None:
+    def _do(self, job: BenchmarkJob, settings: dict[str, object]) -> None:
         """Run and score a job, as far as needed, and write its record."""
         folder = job.task.output
         digest = config_hash(job.task.command, settings)
@@ -100,7 +100,8 @@ class Harness:
         try:
             done = done or self._run(job, provenance)
             record = replace(record, provenance=done.provenance, cost=done.cost)
-            record = self._scored(job, record)
+            self._say("  scoring")
+            record = scored(record, job.scene, ResultFolder(folder))
         except GeogsError as error:
             record = replace(record, error=str(error))
         except Exception as error:  # whatever it is, the other scenes go on
@@ -112,7 +113,7 @@ class Harness:
             self._say(f"  failed: {record.error}")
         write_json(folder / RECORD_FILE, record)
 
-    def _run(self, job: Job, provenance: Provenance) -> CompletedRun:
+    def _run(self, job: BenchmarkJob, provenance: Provenance) -> CompletedRun:
         """Run a job; its folder says so only once the run is complete."""
         folder = clear(job.task.output)
         forget_peak_memory()
@@ -128,18 +129,6 @@ class Harness:
         run = CompletedRun(source, provenance, cost_of(result, seconds))
         write_completed_run(folder, run)
         return run
-
-    def _scored(self, job: Job, record: Record) -> Record:
-        self._say("  scoring")
-        result = ResultFolder(job.task.output)
-        scores = score(job.scene, job.task.command, result, record.provenance.seed)
-        return replace(
-            record,
-            stages=scores.stages,
-            photo=scores.photo,
-            motion=scores.motion,
-            curve=scores.curve,
-        )
 
 
 def cost_of(result: ResultFolder, seconds: float) -> Cost:

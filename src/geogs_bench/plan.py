@@ -6,8 +6,8 @@ from pathlib import Path
 
 from geogs.errors import InputError
 from geogs_bench.benchmark import Benchmark, Variant
-from geogs_bench.runner import Command, Task
-from geogs_bench.scene import Option, Scene
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
+from geogs_bench.runners.runner import Command, Task
 
 _BUDGET = 120.0
 """Seconds of reconstructions beside runs."""
@@ -30,15 +30,17 @@ class Wishes:
 
 
 @dataclass(frozen=True)
-class Job:
+class BenchmarkJob:
     """One row of the results to be."""
 
-    scene: Scene
+    scene: BenchmarkScene
     variant: str
     task: Task
 
 
-def find_scenes(benchmark: Benchmark, folder: Path, names: Sequence[str] = ()) -> list[Scene]:
+def find_scenes(
+    benchmark: Benchmark, folder: Path, names: Sequence[str] = ()
+) -> list[BenchmarkScene]:
     """The scenes to run: those named, else the paper's, else all that are there.
 
     Raises:
@@ -58,8 +60,8 @@ def find_scenes(benchmark: Benchmark, folder: Path, names: Sequence[str] = ()) -
 
 
 def make_jobs(
-    benchmark: Benchmark, scenes: Sequence[Scene], output: Path, wishes: Wishes
-) -> list[Job]:
+    benchmark: Benchmark, scenes: Sequence[BenchmarkScene], output: Path, wishes: Wishes
+) -> list[BenchmarkJob]:
     """One job for each scene and variant, scene by scene; what needs depth only where it is there.
 
     Raises:
@@ -114,7 +116,9 @@ def _timed(name: str, seconds: float) -> str:
     return f"{name}-{seconds:g}s" if name else f"{seconds:g}s"
 
 
-def _job(benchmark: Benchmark, scene: Scene, variant: Variant, output: Path, wishes: Wishes) -> Job:
+def _job(
+    benchmark: Benchmark, scene: BenchmarkScene, variant: Variant, output: Path, wishes: Wishes
+) -> BenchmarkJob:
     options = merged(scene.options, wishes.options, variant.options)
     folder = output / scene.name / variant.name
     command = variant.command or benchmark.command
@@ -122,7 +126,7 @@ def _job(benchmark: Benchmark, scene: Scene, variant: Variant, output: Path, wis
         command = "reconstruct"
         budget = (Option("budget", f"{_BUDGET:g}s"),)
         options = merged(budget, [o for o in options if o.name != "online-results"])
-    return Job(scene, variant.name, Task(command, scene.source, folder, options))
+    return BenchmarkJob(scene, variant.name, Task(command, scene.source, folder, options))
 
 
 def merged(*groups: Sequence[Option]) -> tuple[Option, ...]:

@@ -15,19 +15,23 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.mesh.extract import extract_mesh
-from geogs_bench.appearance import trainer as trainer_module
-from geogs_bench.appearance.config import AppearanceConfig
+from geogs_bench.appearance import appearance_trainer as trainer_module
+from geogs_bench.appearance.appearance_config import AppearanceConfig
+from geogs_bench.appearance.appearance_disks import (
+    AppearanceDisks,
+    constant_from_colour,
+    disks_at_points,
+)
+from geogs_bench.appearance.appearance_losses import normal_loss, photometric_loss, ssim
+from geogs_bench.appearance.appearance_trainer import AppearanceTrainer
+from geogs_bench.appearance.crossing_depth import crossing_depth, depth_views
 from geogs_bench.appearance.densify import GradientStatistics, refine, split_disks
-from geogs_bench.appearance.depth import crossing_depth, depth_views
-from geogs_bench.appearance.disks import AppearanceDisks, constant_from_colour, disks_at_points
+from geogs_bench.appearance.disk_optimizer import DiskOptimizer
 from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
-from geogs_bench.appearance.losses import normal_loss, photometric_loss, ssim
-from geogs_bench.appearance.optimizer import DiskOptimizer
 from geogs_bench.appearance.rasteriser import MedianDisks, normals_of_depth, shifted_matrix
-from geogs_bench.appearance.schedule import RefinementClock, Schedule
 from geogs_bench.appearance.start_points import find_start_points, in_visual_hull
-from geogs_bench.appearance.trainer import AppearanceTrainer
-from geogs_bench.appearance.views import TrainingView, scene_scale
+from geogs_bench.appearance.training_schedule import RefinementClock, Schedule
+from geogs_bench.appearance.training_views import TrainingView, scene_scale
 from oracles.appearance_reference import ReferenceRasteriser, basis, view_colours
 
 pytestmark = pytest.mark.system

@@ -130,8 +130,8 @@ OPTIONS_OF_ABLATIONS = """
 import json, sys
 from pathlib import Path
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
-from geogs_bench.registry import find_benchmark
-from geogs_bench.commands import CommandRunner
+from geogs_bench.catalogue.registry import find_benchmark
+from geogs_bench.runners.command_runners import CommandRunner
 
 for name in sys.argv[2:]:
     benchmark = find_benchmark(name)

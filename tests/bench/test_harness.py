@@ -9,15 +9,15 @@ import pytest
 from bench_results import FakeRunner, write_truth
 from geogs.errors import InputError
 from geogs_bench.benchmark import Benchmark, Variant
-from geogs_bench.columns import COST, area_layout, trajectory_layout
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
 from geogs_bench.harness import Harness
 from geogs_bench.machine import machine_name, program_version
 from geogs_bench.plan import Wishes, make_jobs, merged
-from geogs_bench.scene import Option, Scene
-from geogs_bench.store import clear
+from geogs_bench.results.store import clear
+from geogs_bench.tables.columns import COST, area_layout, trajectory_layout
 
 
-def benchmark(scenes: list[Scene], **changes) -> Benchmark:
+def benchmark(scenes: list[BenchmarkScene], **changes) -> Benchmark:
     values = {
         "name": "halls",
         "title": "Halls",
@@ -31,7 +31,7 @@ def benchmark(scenes: list[Scene], **changes) -> Benchmark:
 
 
 @pytest.fixture
-def scenes(tmp_path) -> list[Scene]:
+def scenes(tmp_path) -> list[BenchmarkScene]:
     return [write_truth(tmp_path / "data" / name, name) for name in ("attic", "cellar", "hall")]
 
 

@@ -7,19 +7,18 @@ import pytest
 
 from flat_rooms import SIZE, flat_room
 from geogs.errors import InputError
-from geogs_bench.layouts.dtu import find_dtu
-from geogs_bench.layouts.mixed import find_mixed
-from geogs_bench.layouts.objects import find_objects
-from geogs_bench.layouts.posed_rooms import find_any_posed, find_posed_rooms
-from geogs_bench.layouts.replica import find_relighted, find_replica, find_rooms
-from geogs_bench.layouts.scannet import find_scannet
-from geogs_bench.layouts.scannetpp import find_scannetpp
-from geogs_bench.layouts.seven_scenes import find_seven_scenes
-from geogs_bench.layouts.tum import find_tum
+from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
+from geogs_bench.data.benchmark_scene import Option
+from geogs_bench.data.dtu_scenes import find_dtu
+from geogs_bench.data.mixed_scenes import find_mixed
+from geogs_bench.data.posed_scenes import find_any_posed, find_objects, find_posed_rooms
+from geogs_bench.data.replica_scenes import find_relighted, find_replica, find_rooms
+from geogs_bench.data.scannet_scenes import find_scannet
+from geogs_bench.data.scannetpp_scenes import find_scannetpp
+from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
+from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.data.tum_scenes import find_tum
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
-from geogs_bench.registry import BENCHMARKS, find_benchmark
-from geogs_bench.scene import Option
-from geogs_bench.truth import read_true_poses
 from io_samples import write_images
 from posed_layouts import write_colmap_text, write_dtu, write_scannet
 

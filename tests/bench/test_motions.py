@@ -12,11 +12,10 @@ from geogs.application.settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
-from geogs_bench.layouts.motions import find_motions
-from geogs_bench.motion_cells import FULL, SMALL, render_cells
-from geogs_bench.result import ResultFolder
-from geogs_bench.scoring.motion import compare_motion, rotation_error, score_motion
-from geogs_bench.tracking_only import track_to_folder
+from geogs_bench.data.motion_cells import FULL, SMALL, find_motions, render_cells
+from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.runners.tracking_only import track_to_folder
+from geogs_bench.scoring.motion_scores import compare_motion, rotation_error, score_motion
 
 
 def _trajectory(T_wc: np.ndarray) -> Trajectory:

@@ -7,10 +7,10 @@ import pytest
 
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.map_file import load_map
-from geogs_bench.commands import UpdateRunner
-from geogs_bench.runner import Task
-from geogs_bench.saved_map import FOLDER
-from geogs_bench.scene import Option
+from geogs_bench.data.benchmark_scene import Option
+from geogs_bench.runners.command_runners import UpdateRunner
+from geogs_bench.runners.runner import Task
+from geogs_bench.runners.saved_map import FOLDER
 
 pytestmark = pytest.mark.system
 

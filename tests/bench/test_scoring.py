@@ -11,8 +11,9 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface
 from geogs.io.writers.ply_writer import write_mesh
 from geogs_bench import published as paper
-from geogs_bench.ablations import MAP_UPDATE
-from geogs_bench.record import (
+from geogs_bench.catalogue.ablations import MAP_UPDATE
+from geogs_bench.catalogue.registry import DTU, REPLICA, TUM
+from geogs_bench.results.record import (
     Cost,
     CurvePoint,
     Provenance,
@@ -23,16 +24,20 @@ from geogs_bench.record import (
     read_record,
     write_json,
 )
-from geogs_bench.registry import DTU, REPLICA, TUM
-from geogs_bench.report import markdown, write_report
-from geogs_bench.result import ResultFolder
-from geogs_bench.scoring.scores import score
+from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.scores import scored
 from geogs_bench.scoring.tessellation import with_short_edges
+from geogs_bench.tables.benchmark_report import markdown, write_report
 from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
 
 FROM = Provenance("run", "abc123", "a processor, 2 cores", "cpu", 0, "0123456789ab")
+
+
+def made_by(command: str) -> Record:
+    """The record of a run that has not been scored."""
+    return Record("", "hall", "", "", Provenance(command, "", "", "cpu", 0, ""))
 
 
 def surface(weighting="vertices", value=1.0, unit="cm") -> SurfaceScore:
@@ -49,7 +54,7 @@ def test_slam_stages_are_aligned_each_by_its_own_trajectory(tmp_path):
     write_result(tmp_path / "out", 0.01, 0.0)
     write_result(tmp_path / "out" / "online", 0.03, None)
     write_result(tmp_path / "out" / "adjusted", 0.02, None)
-    scores = score(scene, "run", ResultFolder(tmp_path / "out"), 0)
+    scores = scored(made_by("run"), scene, ResultFolder(tmp_path / "out"))
     online, adjusted, final = scores.stages
     assert (online.stage, adjusted.stage, final.stage) == ("online", "adjusted", "final")
     assert adjusted.trajectory.ate == pytest.approx(2.0, rel=0.05)
@@ -72,11 +77,11 @@ def test_a_result_in_metres_is_aligned_rigidly_too(tmp_path):
     scene = write_truth(tmp_path / "hall")
     write_result(tmp_path / "out", 0.01, None)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    (plain,) = score(scene, "run", ResultFolder(tmp_path / "out"), 0).stages
+    (plain,) = scored(made_by("run"), scene, ResultFolder(tmp_path / "out")).stages
     assert plain.trajectory.rigid_ate is None
     summary["metric_scale"] = {"origin": "depth sensor", "factor": 1.0, "deviation": 0.01}
     (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))
-    (metric,) = score(scene, "run", ResultFolder(tmp_path / "out"), 0).stages
+    (metric,) = scored(made_by("run"), scene, ResultFolder(tmp_path / "out")).stages
     assert metric.trajectory.ate == plain.trajectory.ate
     # It calls itself metric at a quarter of the size: the way is off by three quarters of itself.
     truth = poses()[:, :3, 3]
@@ -105,7 +110,7 @@ def test_a_result_without_refinement_is_the_papers_stage(tmp_path):
     write_result(tmp_path / "out", 0.01, 0.0, refined=False)
     write_result(tmp_path / "out" / "online", 0.03, None)
     write_result(tmp_path / "out" / "adjusted", 0.02, None)  # of an earlier run
-    online, adjusted = score(scene, "run", ResultFolder(tmp_path / "out"), 0).stages
+    online, adjusted = scored(made_by("run"), scene, ResultFolder(tmp_path / "out")).stages
     assert (online.stage, adjusted.stage) == ("online", "adjusted")
     assert adjusted.trajectory.ate == pytest.approx(1.0, rel=0.05)
     assert adjusted.surface("area").chamfer < 0.3
@@ -116,7 +121,7 @@ def test_known_poses_are_not_aligned_and_make_a_curve(tmp_path):
     result = tmp_path / "out"
     write_result(result, 0.0, 0.02, posed=True)
     write_mesh(result / "snapshots" / "5" / "mesh.ply", *wall(0.05))
-    scores = score(scene, "reconstruct", ResultFolder(result), 0)
+    scores = scored(made_by("reconstruct"), scene, ResultFolder(result))
     (final,) = scores.stages
     assert final.trajectory is None
     # Two centimetres further away: a little less along the normals.
@@ -139,7 +144,7 @@ def test_an_object_is_scored_in_millimetres_inside_its_masks(tmp_path):
         write_image(tmp_path / f"jug/results/frame{i:06d}.png", np.zeros((60, 80, 3), np.uint8))
         write_image(tmp_path / f"jug/results/mask{i:06d}.png", np.full((60, 80, 3), 255, np.uint8))
     write_result(tmp_path / "out", 0.0, 0.002, posed=True)
-    (final,) = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0).stages
+    (final,) = scored(made_by("reconstruct"), scene, ResultFolder(tmp_path / "out")).stages
     (measured,) = final.surfaces
     assert measured.unit == "mm"
     assert measured.accuracy == pytest.approx(1.85, abs=0.15)
@@ -150,7 +155,7 @@ def test_no_truth_and_no_mesh_are_sentences(tmp_path):
     write_result(tmp_path / "out", 0.0, 0.0, posed=True)
     (tmp_path / "out" / "mesh.ply").unlink()
     with pytest.raises(InputError, match="no mesh to score"):
-        score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+        scored(made_by("reconstruct"), scene, ResultFolder(tmp_path / "out"))
     (tmp_path / "out" / "summary.json").write_text("{")
     with pytest.raises(InputError, match="is damaged"):
         _ = ResultFolder(tmp_path / "out").summary
@@ -239,21 +244,21 @@ def test_published_tables_are_complete_and_their_means_are_those_printed():
 
 @pytest.mark.long
 def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
-    from geogs_bench.scene import Scene, Truth
+    from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
     from geogs_synth.sequence.scene_mesh import scene_mesh
     from posed_layouts import render_room, write_dtu
 
     room = render_room(6, 12, 160, 120)
-    scene = Scene("scan7", write_dtu(room, tmp_path / "scan7"), Truth(), kind="scan")
+    scene = BenchmarkScene("scan7", write_dtu(room, tmp_path / "scan7"), Truth(), kind="scan")
     write_result(tmp_path / "out", 0.0, None, posed=True)
     write_mesh(tmp_path / "out" / "mesh.ply", *scene_mesh(lit_room(3).scene))
     with pytest.raises(InputError, match="held no image out"):
-        score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+        scored(made_by("reconstruct"), scene, ResultFolder(tmp_path / "out"))
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     scores = []
     for held_out in ([1, 4], ["000001.png", "000004.png"]):
         (tmp_path / "out" / "summary.json").write_text(json.dumps(summary | {"held_out": held_out}))
-        found = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+        found = scored(made_by("reconstruct"), scene, ResultFolder(tmp_path / "out"))
         assert found.stages == ()
         scores.append(found.photo)
     assert scores[0] == scores[1]
@@ -269,7 +274,7 @@ def test_a_dtu_scan_is_scored_by_its_own_protocol_in_millimetres(tmp_path):
     from scipy.io import savemat
 
     from flat_rooms import flat_room
-    from geogs_bench.layouts.dtu import find_dtu
+    from geogs_bench.data.dtu_scenes import find_dtu
     from posed_layouts import write_dtu
 
     shutil.rmtree(write_dtu(flat_room(), tmp_path / "scan7") / "mask")
@@ -285,7 +290,7 @@ def test_a_dtu_scan_is_scored_by_its_own_protocol_in_millimetres(tmp_path):
     (scene,) = find_dtu(tmp_path)
     write_result(tmp_path / "out", 0.0, None, posed=True)
     write_mesh(tmp_path / "out" / "mesh.ply", 10 * vertices + [0, 0, 0.5], faces)
-    (final,) = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0).stages
+    (final,) = scored(made_by("reconstruct"), scene, ResultFolder(tmp_path / "out")).stages
     (measured,) = final.surfaces
     assert (measured.weighting, measured.unit) == ("points", "mm")
     # Half a millimetre away, a little less along the normals.

@@ -11,7 +11,7 @@ from geogs.cli.options import parse_options
 from geogs.config.leaves import Leaf, leaves
 from geogs.config.setting import Positional
 from geogs.errors import GeogsError, InputError
-from geogs_bench.cli import BenchOptions
+from geogs_bench.bench_options import BenchOptions
 from geogs_fleet import cli as fleet
 from geogs_synth import cli as synth
 from geogs_train.cli import TrainDepthOptions, TrainOptions

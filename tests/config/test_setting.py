@@ -17,7 +17,7 @@ from geogs.application.settings import ReconstructSettings, RunSettings
 from geogs.cli.demo import DemoOptions
 from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError
-from geogs_bench.settings import BenchSettings
+from geogs_bench.bench_options import BenchOptions
 from geogs_synth.camera.flaws import Flaws
 from geogs_synth.cli import SynthOptions
 from geogs_train.cli import TrainOptions
@@ -25,7 +25,7 @@ from geogs_train.cli import TrainOptions
 TREES = (config.Config(), config.ReconstructConfig())
 TRAINING = TrainOptions("flow", Path("x"))
 COMMANDS = (
-    RunSettings, ReconstructSettings, EvalSettings, BenchSettings, DemoOptions, SynthOptions,
+    RunSettings, ReconstructSettings, EvalSettings, BenchOptions, DemoOptions, SynthOptions,
     Flaws,
 )  # fmt: skip
 

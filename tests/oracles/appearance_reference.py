@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs_bench.appearance.disks import AppearanceDisks
+from geogs_bench.appearance.appearance_disks import AppearanceDisks
 from geogs_bench.appearance.rasteriser import (
     MIN_ALPHA,
     PIXEL_SHARPNESS,

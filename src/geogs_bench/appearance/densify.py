@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs_bench.appearance.config import AppearanceConfig
-from geogs_bench.appearance.disks import AppearanceDisks
+from geogs_bench.appearance.appearance_config import AppearanceConfig
+from geogs_bench.appearance.appearance_disks import AppearanceDisks
 
 
 class GradientStatistics:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.errors import DeviceError, InputError
 from geogs.geometry.camera import Camera
-from geogs_bench.appearance.disks import AppearanceDisks
+from geogs_bench.appearance.appearance_disks import AppearanceDisks
 from geogs_bench.appearance.rasteriser import (
     MedianDisks,
     Rendering,

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs_bench.appearance.disks import AppearanceDisks
+from geogs_bench.appearance.appearance_disks import AppearanceDisks
 
 MIN_ALPHA = 1 / 255
 """Below this a disk does not hit a pixel."""

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
-from geogs_bench.appearance.views import TrainingView
+from geogs_bench.appearance.training_views import TrainingView
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.features import find_features
 from geogs_photos.library import load_colmap

@@ -16,12 +16,11 @@ from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks
 from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.evaluation.true_scene import silhouettes
 from geogs.io.sources.sniff import open_posed_source
-from geogs_bench.record import SurfaceScore
-from geogs_bench.result import ResultFolder
-from geogs_bench.scene import Scene
-from geogs_bench.scoring.comparison import Comparison
-from geogs_bench.scoring.surface import read_true_surface, score_surface
-from geogs_bench.truth import read_true_poses
+from geogs_bench.data.benchmark_scene import BenchmarkScene
+from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.results.record import SurfaceScore
+from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.surface_scores import Comparison, read_true_surface, score_surface
 
 Judge = Callable[[Surface], tuple[tuple[SurfaceScore, ...], Comparison]]
 """Scores of a mesh (the one to plot last) and where it is wrong."""
@@ -30,7 +29,7 @@ _MASK_EDGE = 1600
 """Pixels; DTU's masks are of this size."""
 
 
-def judge_of(scene: Scene, result: ResultFolder, seed: int) -> Judge | None:
+def judge_of(scene: BenchmarkScene, result: ResultFolder, seed: int) -> Judge | None:
     """The judge for a scene, its truth read once; none where the scene has no true surface.
 
     Raises:
@@ -45,7 +44,7 @@ def judge_of(scene: Scene, result: ResultFolder, seed: int) -> Judge | None:
     return _room_judge(scene, result, seed)
 
 
-def _room_judge(scene: Scene, result: ResultFolder, seed: int) -> Judge:
+def _room_judge(scene: BenchmarkScene, result: ResultFolder, seed: int) -> Judge:
     poses = read_true_poses(scene)
     if poses is None:
         raise InputError(f"{scene.name} has no true poses, which say what its camera saw.")
@@ -54,7 +53,7 @@ def _room_judge(scene: Scene, result: ResultFolder, seed: int) -> Judge:
     return lambda mesh: score_surface(mesh, truth, False, seed)
 
 
-def _object_judge(scene: Scene, seed: int) -> Judge:
+def _object_judge(scene: BenchmarkScene, seed: int) -> Judge:
     assert scene.truth.surface is not None  # the caller has looked
     truth = read_surface(scene.truth.surface)
     points = None if scene.truth.points is None else read_surface(scene.truth.points)
@@ -70,7 +69,7 @@ def _object_judge(scene: Scene, seed: int) -> Judge:
     return judge
 
 
-def _scan_judge(scene: Scene, seed: int) -> Judge:
+def _scan_judge(scene: BenchmarkScene, seed: int) -> Judge:
     assert scene.truth.dtu is not None  # the caller has looked
     reference = read_dtu_reference(scene.truth.dtu.folder, scene.truth.dtu.scan)
     masks = _masks(scene)
@@ -85,7 +84,7 @@ def _scan_judge(scene: Scene, seed: int) -> Judge:
     return judge
 
 
-def _masks(scene: Scene) -> list[Silhouette]:
+def _masks(scene: BenchmarkScene) -> list[Silhouette]:
     """The masks of all images, widened as DTU's protocol does; empty where images have none."""
     source = open_posed_source(scene.source, InputConfig(long_edge=_MASK_EDGE))
     return [mask.dilated() for mask in silhouettes(source) or ()]

@@ -1,51 +1,41 @@
 """All scores of a result, by the command that made it."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from geogs_bench.record import CurvePoint, MotionScore, PhotoScore, StageScore
-from geogs_bench.result import ResultFolder
-from geogs_bench.runner import Command
-from geogs_bench.scene import Scene
+from geogs_bench.data.benchmark_scene import BenchmarkScene
+from geogs_bench.results.record import Record
+from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.judges import judge_of
-from geogs_bench.scoring.motion import score_motion
-from geogs_bench.scoring.photo import score_photo
-from geogs_bench.scoring.pictures import draw
-from geogs_bench.scoring.posed import score_posed, score_snapshots
-from geogs_bench.scoring.slam import StageErrors, score_slam
+from geogs_bench.scoring.motion_scores import score_motion
+from geogs_bench.scoring.photo_scores import score_photo
+from geogs_bench.scoring.posed_scores import score_posed, score_snapshots
+from geogs_bench.scoring.score_pictures import draw
+from geogs_bench.scoring.slam_scores import StageErrors, score_slam
 
 
-@dataclass(frozen=True)
-class Scores:
-    """What there is to say of a result."""
-
-    stages: tuple[StageScore, ...] = ()
-    photo: PhotoScore | None = None
-    motion: MotionScore | None = None
-    curve: tuple[CurvePoint, ...] = ()
-
-
-def score(scene: Scene, command: Command, result: ResultFolder, seed: int) -> Scores:
-    """Score a result and draw it beside the truth, in its report folder.
+def scored(record: Record, scene: BenchmarkScene, result: ResultFolder) -> Record:
+    """The record of a run with the scores of its result, drawn beside the truth in its report.
 
     Raises:
         InputError: the result or the truth cannot be read, or they do not fit each other.
         OutputError: the pictures cannot be written.
     """
+    seed = record.provenance.seed
     if scene.kind == "motion":
-        return Scores(motion=score_motion(scene, result))
-    if command in ("run", "update"):
+        return replace(record, motion=score_motion(scene, result))
+    if record.provenance.command in ("run", "update"):
         stages = score_slam(scene, result, seed)
         _draw_last(stages, result)
-        return Scores(tuple(stage.score for stage in stages))
+        return replace(record, stages=tuple(stage.score for stage in stages))
     judge = judge_of(scene, result, seed)
     if judge is None:
-        return Scores(photo=score_photo(scene, result))
+        return replace(record, photo=score_photo(scene, result))
     stages = score_posed(judge, result)
     _draw_last(stages, result)
     curve = score_snapshots(judge, result)
-    return Scores(tuple(stage.score for stage in stages), curve=curve)
+    return replace(record, stages=tuple(stage.score for stage in stages), curve=curve)
 
 
 def _draw_last(stages: list[StageErrors], result: ResultFolder) -> None:

@@ -1,0 +1,1 @@
+"""Every benchmark by its name, and what papers printed for it."""

@@ -1,0 +1,78 @@
+"""A scene of a benchmark: what to read, how, and what is known of the truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+PoseFormat = Literal["poses", "scannet", "colmap"]
+"""A file or folder as ``geogs eval --gt`` takes it; ScanNet's ``pose/``; a COLMAP model whose image
+names carry the frame number."""
+
+
+Culling = Literal["done", "frustum", "occlusion"]
+"""By its provider; to what lies inside the images; and of that to what is not hidden."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of ``geogs run`` or ``geogs reconstruct``: dotted name and value as text.
+
+    A switch has no value.
+    """
+
+    name: str
+    value: str = ""
+
+    def arguments(self) -> list[str]:
+        """As on a command line."""
+        return [f"--{self.name}", self.value] if self.value else [f"--{self.name}"]
+
+
+@dataclass(frozen=True)
+class TruePoses:
+    """Where the true poses are."""
+
+    path: Path
+    format: PoseFormat = "poses"
+    rate: float = 30.0
+    """Frames per second by which frame numbers become times, where the format has numbers."""
+
+
+@dataclass(frozen=True)
+class DtuTruth:
+    """The official files that DTU's protocol needs for a scan."""
+
+    folder: Path
+    """``SampleSet/MVS Data``, with ``ObsMask`` and ``Points/stl``."""
+    scan: int
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a result can be compared with; a part is none where it is not there."""
+
+    poses: TruePoses | None = None
+    surface: Path | None = None
+    """PLY in metres, in the frame of the poses."""
+    points: Path | None = None
+    """PLY of what the camera saw of it; completeness is measured on them."""
+    culling: Culling = "occlusion"
+    """How ``surface`` is to be cut down to what the camera saw before whole meshes are compared."""
+    dtu: DtuTruth | None = None
+
+
+@dataclass(frozen=True)
+class BenchmarkScene:
+    """One sequence of a benchmark."""
+
+    name: str
+    source: Path
+    """What ``geogs run`` or ``geogs reconstruct`` reads."""
+    truth: Truth
+    options: tuple[Option, ...] = ()
+    """That this scene needs, such as its intrinsics."""
+    kind: Literal["room", "object", "scan", "motion"] = "room"
+    """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU; of a
+    motion the trajectory alone is scored."""
+    has_depth: bool = False
+    """Whether the images come with the depth of a sensor."""

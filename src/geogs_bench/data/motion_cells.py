@@ -1,0 +1,157 @@
+"""The matrix of motions and cameras that ``geogs bench motions`` renders, and finds again."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from geogs.errors import InputError
+from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.scene_folders import folders_like
+from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
+from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
+
+if TYPE_CHECKING:
+    from geogs_synth.raycast.raycaster import Raycaster
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One sequence of the matrix."""
+
+    name: str
+    motion: MotionKind
+    flaws: Flaws
+    frames: int
+    width: int
+    height: int
+    moving: float = 0.0
+    """Share of the image that moves."""
+
+    @property
+    def on_street(self) -> bool:
+        """Whether it is driven, not walked through a room."""
+        return self.motion == "driving"
+
+
+def _cell(
+    motion: MotionKind,
+    camera: CameraKind,
+    frames: int,
+    size: tuple[int, int],
+    moving: float = 0.0,
+) -> Cell:
+    name = f"{motion}-{camera}" + (f"-moving-{100 * moving:.0f}" if moving else "")
+    return Cell(name, motion, camera_flaws(camera), frames, *size, moving)
+
+
+def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
+    """Turning at 60 degrees a second with a flaw of the Kinect at a time."""
+    flaws = {
+        "readout": Flaws(readout=0.03),
+        "blur": Flaws(exposure=0.016),
+        "readout-and-blur": Flaws(readout=0.03, exposure=0.016),
+        "light": Flaws(gain_drift=0.5, colour_drift=0.1, vignetting=0.3),
+        "noise": Flaws(noise=5.0, jpeg=60),
+    }
+    return tuple(
+        Cell(f"turning-60-{name}", "turning-60", flaw, frames, *size)
+        for name, flaw in flaws.items()
+    )
+
+
+_QVGA, _LARGER = (320, 240), (400, 300)
+_SMALL_STREET, _STREET = (496, 150), (800, 242)
+
+SMALL: tuple[Cell, ...] = (
+    _cell("handheld", "clean", 75, _QVGA),
+    _cell("handheld", "clean", 75, _QVGA, 0.33),
+    _cell("handheld-5hz", "clean", 45, _QVGA),
+    _cell("slow-handheld", "phone", 75, _QVGA),
+    _cell("walking", "phone", 60, _QVGA),
+    _cell("turning-60", "clean", 75, _QVGA),
+    _cell("turning-60", "kinect", 60, _QVGA),
+    _cell("pure-rotation", "clean", 60, _QVGA),
+    _cell("rest-start", "clean", 90, _QVGA),
+    _cell("jerks", "clean", 75, _QVGA),
+    _cell("still", "kinect", 30, _QVGA),
+    _cell("driving", "clean", 60, _SMALL_STREET),
+)
+"""For two CPU cores."""
+
+FULL: tuple[Cell, ...] = (
+    *(_cell(motion, camera, 120 if motion != "handheld-5hz" else 70, _LARGER)
+      for motion in ROOM_MOTIONS for camera in ("clean", "phone", "kinect")),
+    *_single_flaws(120, _LARGER),
+    _cell("handheld", "action", 120, _LARGER),
+    *(_cell(motion, "clean", 120, _LARGER, moving)
+      for motion in ("handheld", "walking") for moving in (0.15, 0.33)),
+    _cell("handheld", "phone", 120, _LARGER, 0.33),
+    _cell("driving", "clean", 125, _STREET),
+    _cell("driving", "action", 125, _STREET),
+    _cell("driving", "clean", 125, _STREET, 0.15),
+)  # fmt: skip
+"""All motions, all flaws."""
+
+
+def render_cells(
+    cells: Sequence[Cell], folder: Path, names: Sequence[str], say: Callable[[str], None]
+) -> Path:
+    """Renders the cells of the given names (all if there are none) that are not there yet.
+
+    Returns ``folder``, in which each cell has its own.
+
+    Raises:
+        InputError: no cell has one of the names.
+        OutputError: the folder cannot be written.
+    """
+    known = [cell.name for cell in cells]
+    if strangers := [name for name in names if name not in known]:
+        raise InputError(f"there is no cell {strangers[0]}; choose of {', '.join(known)}.")
+    missing = [c for c in cells if (not names or c.name in names) and not _is_there(c, folder)]
+    for on_street in (False, True):
+        some = [cell for cell in missing if cell.on_street == on_street]
+        raycaster = _raycaster(on_street) if some else None
+        for cell in some:
+            say(f"rendering {cell.name}")
+            _render(cell, folder / cell.name, raycaster)
+    return folder
+
+
+def find_motions(root: Path) -> list[BenchmarkScene]:
+    """Every sequence below ``root``, or ``root`` itself if it is one."""
+    return [
+        BenchmarkScene(folder.resolve().name, folder, Truth(poses=TruePoses(folder)), kind="motion")
+        for folder in folders_like(root, _is_sequence)
+    ]
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / "cam_params.json").is_file() and (folder / "traj.txt").is_file()
+
+
+def _is_there(cell: Cell, folder: Path) -> bool:
+    """Written last, so that a cell which was cut off is made again."""
+    return any((folder / cell.name).glob("points_seen_*.ply"))
+
+
+def _raycaster(on_street: bool) -> "Raycaster":
+    from geogs_synth.raycast.raycaster import Raycaster
+    from geogs_synth.sequence.location import make_scene
+
+    return Raycaster(make_scene("driving" if on_street else "handheld", 0), _threads())
+
+
+def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
+    from geogs_synth.sequence.replica_files import write_sequence
+
+    write_sequence(
+        folder, cell.frames, cell.width, cell.height,
+        motion=cell.motion, flaws=cell.flaws, moving=cell.moving,
+        threads=_threads(), raycaster=raycaster,
+    )  # fmt: skip
+
+
+def _threads() -> int:
+    return os.cpu_count() or 2

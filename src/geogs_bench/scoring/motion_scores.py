@@ -1,0 +1,124 @@
+"""How well a camera's motion was followed: fraction of the frames, positions, orientations."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from geogs.errors import InputError
+from geogs.evaluation.trajectory_errors import (
+    associate,
+    best_rotation,
+    evaluate_trajectory,
+    finite_poses,
+    rotation_angle,
+)
+from geogs.types import Trajectory
+from geogs_bench.data.benchmark_scene import BenchmarkScene
+from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.results.record import MotionScore
+from geogs_bench.results.result_folder import ORIENTED, FrameStates, ResultFolder
+
+_LEAST_PATH = 0.05
+"""Metres of way below which positions have nothing to be compared with."""
+_SAME_TIME = 0.005
+"""Seconds."""
+_MOST_OFF = 0.05
+"""ATE of a reliable run, of the extent of the true path (root of the mean squared distance from its
+middle)."""
+_LEAST_FOLLOWED = 80.0
+"""Percent of the frames of which a reliable run knows the pose, or says that it is no more than the
+orientation."""
+
+
+def score_motion(scene: BenchmarkScene, result: ResultFolder) -> MotionScore:
+    """The final trajectory of a result against the scene's true one.
+
+    Raises:
+        InputError: either cannot be read.
+    """
+    reference = read_true_poses(scene)
+    if reference is None:
+        raise InputError(f"{scene.name} has no true poses to compare with.")
+    estimate = result.poses()
+    said = result.summary.get("verdict") or {}
+    if estimate is None:
+        return MotionScore(tracked=0.0, is_called_reliable=said.get("is_reliable"))
+    known = result.uncertainty()
+    if known is None:
+        return compare_motion(reference, _without_lost(estimate, result))
+    score = compare_motion(reference, known.tracked_of(estimate), known.oriented_of(estimate))
+    turned = 100 * float((known.state == ORIENTED).mean())
+    return replace(
+        score,
+        turned=turned,
+        within=_within(reference, known.tracked_of(estimate), known),
+        is_called_reliable=said.get("is_reliable"),
+    )
+
+
+def compare_motion(
+    reference: Trajectory, tracked: Trajectory, oriented: Trajectory | None = None
+) -> MotionScore:
+    """The poses that were tracked against the true ones, frame by frame.
+
+    Positions are aligned by a Sim(3), orientations by the rotation that fits them best, so that a
+    camera that only turns has a rotation error, too. ``oriented`` are the poses whose
+    orientation counts; if they are not given, those that were tracked.
+    """
+    reference, tracked = finite_poses(reference), finite_poses(tracked)
+    i, j = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
+    percentage = 100 * len(i) / len(reference.timestamps)
+    rotation = _rotation(reference, tracked if oriented is None else oriented)
+    if len(i) < 3:
+        return MotionScore(percentage, rotation=rotation)
+    places = reference.T_wc[i, :3, 3]
+    path = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    if path < _LEAST_PATH:
+        return MotionScore(percentage, rotation=rotation)
+    if np.ptp(tracked.T_wc[j, :3, 3], axis=0).max() == 0:  # all estimated positions are one
+        return MotionScore(percentage, rotation=rotation)
+    try:
+        ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
+    except InputError:  # they are on a line
+        return MotionScore(percentage, rotation=rotation)
+    extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
+    turned = 0 if oriented is None else len(finite_poses(oriented).timestamps) - len(i)
+    followed = percentage + 100 * turned / len(reference.timestamps)
+    good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent
+    return MotionScore(percentage, 0.0, rotation, ate, ate / path, is_reliable=good)
+
+
+def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
+    """RMSE of the orientations in degrees; none where there are fewer than three."""
+    oriented = finite_poses(oriented)
+    i, j = associate(reference.timestamps, oriented.timestamps, _SAME_TIME)
+    if len(i) < 3:
+        return None
+    return rotation_error(oriented.T_wc[j, :3, :3], reference.T_wc[i, :3, :3])
+
+
+def _within(reference: Trajectory, tracked: Trajectory, known: FrameStates) -> float | None:
+    """Percent of the positions that are off by no more than three deviations, aligned."""
+    try:
+        errors = evaluate_trajectory(tracked, reference, _SAME_TIME)
+    except InputError:
+        return None
+    claimed = errors.scale * np.interp(errors.timestamps, known.timestamps, known.sigma_position)
+    return 100 * float((errors.position_error <= 3 * claimed).mean())
+
+
+def rotation_error(
+    estimate: Float[np.ndarray, "n 3 3"], truth: Float[np.ndarray, "n 3 3"]
+) -> float:
+    """RMS angle in degrees after the rotation of the world that fits best (chordal mean)."""
+    aligned = best_rotation(estimate, truth) @ estimate
+    return float(np.sqrt((rotation_angle(aligned, truth) ** 2).mean()))
+
+
+def _without_lost(estimate: Trajectory, result: ResultFolder) -> Trajectory:
+    """The poses that are not only interpolated, by the result's own summary."""
+    keep = np.ones(len(estimate.timestamps), bool)
+    for first, last in result.summary.get("lost_spans", []):
+        keep &= (estimate.timestamps < first - 1e-6) | (estimate.timestamps > last + 1e-6)
+    return Trajectory(estimate.timestamps[keep], estimate.T_wc[keep], estimate.tracked[keep])

@@ -1,0 +1,107 @@
+"""Scores of a mesh in metres against the true surface of a room."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from geogs.evaluation.surfaces.reconstruction_errors import (
+    ReconstructionScores,
+    evaluate_reconstruction,
+)
+from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.toolbox import evaluate_vertices
+from geogs.evaluation.surfaces.visibility import cull_mesh
+from geogs.geometry.camera import Camera
+from geogs_bench.data.benchmark_scene import Truth
+from geogs_bench.results.record import SurfaceScore
+from geogs_bench.scoring.tessellation import with_short_edges
+
+_CULLING_POSES = 200
+"""About so many true poses decide what the camera saw."""
+_LONGEST_EDGE = 0.05
+"""Metres; coarser true meshes are cut into smaller triangles."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A mesh in the frame of the truth, and its errors at points on it."""
+
+    mesh: Surface
+    truth: Surface | None
+    """None where the truth is no mesh."""
+    points: Float[np.ndarray, "n 3"]
+    errors_cm: Float[np.ndarray, "n"]
+    limit_cm: float
+    """What pictures show as the worst."""
+
+
+@dataclass(frozen=True)
+class TrueSurface:
+    """What a mesh is compared with."""
+
+    whole: Surface
+    """Answers how accurate a point is where distances are exact."""
+    seen: Surface
+    """What the camera saw, for comparisons of whole meshes."""
+    points: Surface | None
+    """Points that it saw, for completeness; none where ``seen`` serves."""
+
+
+def read_true_surface(
+    truth: Truth, camera: Camera, T_cw: Float64[np.ndarray, "n 4 4"]
+) -> TrueSurface | None:
+    """The surface of a scene, cut to what the camera saw from the true poses (world to camera).
+
+    None where the scene has no surface. Raises InputError if it cannot be read or none was seen.
+    """
+    if truth.surface is None:
+        return None
+    whole = read_surface(truth.surface)
+    points = None if truth.points is None else read_surface(truth.points)
+    if truth.culling == "done" or not whole.is_mesh:
+        return TrueSurface(whole, whole, points)
+    views = T_cw[:: max(1, len(T_cw) // _CULLING_POSES)]
+    # Culling looks at vertices, and a wall of two triangles has hardly any.
+    fine = with_short_edges(whole, _LONGEST_EDGE)
+    seen = cull_mesh(fine, camera, views, truth.culling, whole)
+    return TrueSurface(whole, seen, points)
+
+
+def score_surface(
+    mesh: Surface, truth: TrueSurface, use_icp: bool, seed: int, threshold: float = 0.05
+) -> tuple[tuple[SurfaceScore, ...], Comparison]:
+    """Vertex-weighted and, last, area-weighted scores in cm, and where the mesh is wrong.
+
+    ``use_icp`` moves the mesh rigidly by ICP (0.1 m) before, as the scripts of the SLAM tables do.
+    A truth without triangles has no vertex-weighted score.
+    """
+    area = evaluate_reconstruction(
+        mesh, truth.whole, truth.points or truth.seen,
+        use_icp=use_icp, threshold=threshold, seed=seed,
+    )  # fmt: skip
+    scores = [in_cm("area", area.scores)]
+    if truth.seen.is_mesh:
+        vertices = evaluate_vertices(mesh, truth.seen, use_icp, threshold, seed)
+        scores.insert(0, in_cm("vertices", vertices.scores))
+    shown = truth.whole if truth.whole.is_mesh else None
+    points, errors = area.reconstruction_points, 100 * area.accuracy
+    return tuple(scores), Comparison(mesh, shown, points, errors, 200 * threshold)
+
+
+def in_cm(weighting: Literal["area", "vertices"], scores: ReconstructionScores) -> SurfaceScore:
+    """The record of scores in cm."""
+    return SurfaceScore(
+        weighting=weighting,
+        unit="cm",
+        accuracy=scores.accuracy_cm,
+        completeness=scores.completeness_cm,
+        chamfer=scores.chamfer_cm,
+        ratio=scores.completeness_ratio,
+        precision=scores.precision_ratio,
+        f_score=scores.f_score,
+        threshold=scores.threshold_cm,
+        accuracy_median=scores.accuracy_median_cm,
+        completeness_median=scores.completeness_median_cm,
+    )

@@ -1,0 +1,78 @@
+"""What a benchmark leaves in its folder: results.json, results.md and report/index.html."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from geogs.evaluation.pages.page import (
+    PictureSection,
+    Section,
+    TableSection,
+    TextSection,
+    write_page,
+)
+from geogs.io.writers.atomic import write_text
+from geogs_bench.benchmark import Benchmark
+from geogs_bench.published import PAPER
+from geogs_bench.results.record import Record, write_json
+from geogs_bench.scoring.score_pictures import PICTURES
+from geogs_bench.tables.error_curves import plot_curves
+from geogs_bench.tables.result_tables import Table, published_tables, result_tables
+
+
+def write_report(output: Path, benchmark: Benchmark, records: Sequence[Record]) -> None:
+    """Write all three files from the records.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    write_json(output / "results.json", list(records))
+    write_text(output / "results.md", markdown(benchmark, records))
+    curves = output / "report" / "convergence.png"
+    has_curves = plot_curves(curves, records)
+    _write_page(output, benchmark, records, curves if has_curves else None)
+
+
+def markdown(benchmark: Benchmark, records: Sequence[Record]) -> str:
+    """All tables, ours first, the paper's figures last, and how ours came about."""
+    parts = [f"# {benchmark.title}", *_provenance(records)]
+    if benchmark.published:
+        parts.append(f"Columns marked (paper) hold the published figures of {PAPER}.")
+    parts += [table.markdown() for table in result_tables(benchmark, records)]
+    parts += [f"- {note}" for note in benchmark.notes]
+    parts += [table.markdown() for table in published_tables(benchmark)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _provenance(records: Sequence[Record]) -> list[str]:
+    """One line for each machine, device, commit and seed that took part."""
+    made = dict.fromkeys(
+        f"Measured on {p.machine}; device {p.device or 'unknown'}; geogs {p.commit}; seed {p.seed}."
+        for r in records
+        if (p := r.provenance) and r.cost is not None
+    )
+    mixed = len({r.provenance.commit for r in records if r.cost is not None}) > 1
+    warning = ["The rows were made by different commits of the program."] if mixed else []
+    return [*made, *warning]
+
+
+def _write_page(
+    output: Path, benchmark: Benchmark, records: Sequence[Record], curves: Path | None
+) -> None:
+    sections: list[Section] = [_section(t) for t in result_tables(benchmark, records)]
+    if curves is not None:
+        sections.append(PictureSection("Error over time", curves))
+    if benchmark.notes:
+        sections.append(TextSection("Notes", "\n".join(benchmark.notes)))
+    sections += [_section(table) for table in published_tables(benchmark)]
+    for record in records:
+        name = f"{record.scene} {record.variant}".strip()
+        report = output / record.folder / "report"
+        sections += [
+            PictureSection(f"{name}: {title}", report / file) for file, title in PICTURES.items()
+        ]
+    subtitle = " ".join(_provenance(records))
+    write_page(output / "report" / "index.html", benchmark.title, sections, subtitle)
+
+
+def _section(table: Table) -> TableSection:
+    return TableSection(table.title, table.header, table.rows, table.note)

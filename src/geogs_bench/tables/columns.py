@@ -1,0 +1,249 @@
+"""The columns from which the tables of the benchmarks are made."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from geogs_bench.benchmark import Column, Layout, Published
+from geogs_bench.published import PublishedTable
+from geogs_bench.results.record import Record, StageName, StageScore, Weighting
+
+Value = Callable[[Record], float | None]
+"""What a column shows of a record."""
+
+_MEASURES = (
+    ("Acc", "accuracy", "{unit}"),
+    ("Comp", "completeness", "{unit}"),
+    ("Comp.Rat", "ratio", "%"),
+    ("CD", "chamfer", "{unit}"),
+)
+_FURTHER = (
+    ("median Acc", "accuracy_median", "{unit}"),
+    ("median Comp", "completeness_median", "{unit}"),
+    ("F-score", "f_score", "%"),
+)
+
+
+_STAGES: dict[StageName, str] = {
+    "online": "after the stream",
+    "adjusted": "after final BA and map update",
+    "depth fusion": "depth fusion",
+    "final": "after refinement",
+}
+"""Stages of a run. The paper's online results are the second; it has no third."""
+_RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
+_POSED: tuple[StageName, ...] = ("depth fusion", "final")
+
+
+def trajectory(stage: StageName, name: str) -> Value:
+    """A field of the score of a stage's trajectory."""
+
+    def value(record: Record) -> float | None:
+        scored = record.stage(stage)
+        return getattr(scored.trajectory, name) if scored and scored.trajectory else None
+
+    return value
+
+
+def surface(stage: StageName, weighting: Weighting, measure: str) -> Value:
+    """A field of the score of a stage's surface."""
+
+    def value(record: Record) -> float | None:
+        scored = record.stage(stage)
+        found = scored.surface(weighting) if scored else None
+        return None if found is None else getattr(found, measure)
+
+    return value
+
+
+def figure(part: Literal["cost", "motion", "photo"], name: str, factor: float = 1.0) -> Value:
+    """A field of a part of a record, times ``factor``."""
+
+    def value(record: Record) -> float | None:
+        scored = getattr(record, part)
+        found = None if scored is None else getattr(scored, name)
+        return None if found is None else factor * found
+
+    return value
+
+
+def trajectory_layout(published: PublishedTable | None = None) -> Layout:
+    """ATE of every stage of a run; published figures beside the paper's."""
+    beside = None if published is None else Published(published, "ATE")
+    stages = [stage for stage in _RUN if stage != "depth fusion"]
+    return Layout(
+        "Trajectory, ATE RMSE after Sim(3) alignment (cm)",
+        (
+            *(
+                Column(
+                    _STAGES[stage],
+                    trajectory(stage, "ate"),
+                    3,
+                    beside if stage == "adjusted" else None,
+                )
+                for stage in stages
+            ),
+            *(Column(f"keyframes {_STAGES[s]}", trajectory(s, "keyframes_ate"), 3) for s in stages),
+        ),
+    )
+
+
+def rgbd_layout(
+    variant: str, published: PublishedTable | None = None, methods: Sequence[str] = ()
+) -> Layout:
+    """ATE of results in metres beside published figures of systems that were given depth, too.
+
+    The published stand in the rows of a ``variant``; all methods of the table if none is named.
+    """
+    if published is not None and not methods:
+        methods = [row.method for row in published.rows]
+
+    def printed(method: str) -> Value:
+        def value(record: Record) -> float | None:
+            if published is None or record.variant != variant:
+                return None
+            return published.value(record.scene, "ATE", method)
+
+        return value
+
+    stages = [stage for stage in _RUN if stage != "depth fusion"]
+    beside = (Column(f"{method} (published)", printed(method)) for method in methods)
+    source = "" if published is None else f" Published: {published.source}."
+    return Layout(
+        "Trajectory with the depth of the sensor, ATE RMSE after a rigid alignment (cm)",
+        (*(Column(_STAGES[s], trajectory(s, "rigid_ate"), 3) for s in stages), *beside),
+        f"Of results in metres alone.{source}",
+    )
+
+
+def surface_layout(
+    weighting: Weighting,
+    title: str,
+    published: PublishedTable | None = None,
+    posed: bool = False,
+) -> Layout:
+    """Errors of the surface at each stage; published figures beside those of the paper's stage.
+
+    From known poses (``posed``) there is one stage, the result.
+    """
+    columns = []
+    further = () if weighting == "vertices" else _FURTHER
+    papers: StageName = "final" if posed else "adjusted"
+    for name, measure, unit in (*_MEASURES, *further):
+        stages = _POSED if posed else _RUN
+        if (name, measure, unit) in further:
+            stages = tuple(s for s in stages if s in (papers, "final"))
+        for stage in stages:
+            beside = _beside(published, name) if stage == papers else None
+            shown = name if posed and stage == "final" else f"{name}, {_STAGES[stage]}"
+            value = surface(stage, weighting, measure)
+            columns.append(Column(f"{shown} ({unit})", value, 2, beside))
+    return Layout(title, tuple(columns))
+
+
+def _beside(published: PublishedTable | None, metric: str) -> Published | None:
+    if published is None or all(row.metric != metric for row in published.rows):
+        return None
+    return Published(published, metric)
+
+
+def vertex_layout(published: PublishedTable | None = None, posed: bool = False) -> Layout:
+    """The vertex-weighted measure of the published SLAM tables."""
+    title = "Surface, vertex-weighted (toolbox of Splat-SLAM)"
+    return surface_layout("vertices", title, published, posed)
+
+
+def area_layout(posed: bool = False) -> Layout:
+    """The measure that depends neither on tessellation nor on sampling."""
+    return surface_layout("area", "Surface, area-weighted, exact distances", None, posed)
+
+
+def dtu_layout(published: PublishedTable | None = None) -> Layout:
+    """DTU's protocol."""
+    return surface_layout("points", "Surface, DTU's protocol", published, posed=True)
+
+
+def photo_layout() -> Layout:
+    """Agreement of held-out images."""
+    return Layout(
+        "Photo-consistency of held-out views across the mesh",
+        (
+            Column("agreement, holes count 0 (%)", figure("photo", "score")),
+            Column("mean NCC", figure("photo", "ncc"), 3),
+            Column("median NCC", figure("photo", "ncc_median"), 3),
+            Column("coverage (%)", figure("photo", "coverage")),
+            Column("held-out views", figure("photo", "views"), 0),
+        ),
+        "Not a distance: no true surface was there.",
+    )
+
+
+def motion_layout() -> Layout:
+    """How every motion was followed."""
+    return Layout(
+        "Motions",
+        (
+            Column("frames tracked (%)", figure("motion", "tracked"), 1),
+            Column("orientation only (%)", figure("motion", "turned"), 1),
+            Column("ATE over path (%)", figure("motion", "relative"), 3),
+            Column("ATE (cm)", figure("motion", "ate"), 2),
+            Column("rotation (degrees)", figure("motion", "rotation"), 2),
+            Column("within 3 sigma (%)", figure("motion", "within"), 1),
+            Column("is reliable", figure("motion", "is_reliable"), 0),
+            Column("is called so", figure("motion", "is_called_reliable"), 0),
+        ),
+        "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
+        "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
+        "twentieth of the path's extent and no more than a fifth of the frames lost.",
+    )
+
+
+def result_layout() -> Layout:
+    """The last stage of runs and of reconstructions, in one table."""
+
+    def last(record: Record) -> StageScore | None:
+        return record.stages[-1] if record.stages else None
+
+    def field(measure: str, *weightings: Weighting) -> Value:
+        def value(record: Record) -> float | None:
+            stage = last(record)
+            found = [s for w in weightings if stage and (s := stage.surface(w))]
+            return getattr(found[0], measure) if found else None
+
+        return value
+
+    def last_ate(record: Record) -> float | None:
+        stage = last(record)
+        return stage.trajectory.ate if stage and stage.trajectory else None
+
+    surfaces: tuple[Weighting, Weighting] = ("area", "points")
+    return Layout(
+        "Results",
+        (
+            Column("ATE after the stream (cm)", trajectory("online", "ate"), 3),
+            Column("ATE of the result (cm)", last_ate, 3),
+            Column("Acc ({unit})", field("accuracy", *surfaces)),
+            Column("Comp ({unit})", field("completeness", *surfaces)),
+            Column("Comp.Rat (%)", field("ratio", "area"), 1),
+            Column("CD ({unit})", field("chamfer", *surfaces)),
+            Column("agreement of held-out images (%)", figure("photo", "score"), 1),
+            Column("thousand disks", figure("cost", "disks", 1e-3), 1),
+            Column("seconds", figure("cost", "seconds"), 1),
+        ),
+        "Of the result, whichever stage that is: rooms in cm, area-weighted, objects in mm, DTU by "
+        "its protocol where the official files are there.",
+    )
+
+
+COST = Layout(
+    "Cost",
+    (
+        Column("frames", figure("cost", "frames"), 0),
+        Column("seconds", figure("cost", "seconds"), 1),
+        Column("frames/s", figure("cost", "frames_per_second")),
+        Column("peak memory (GB)", figure("cost", "peak_memory_bytes", 1e-9)),
+        Column("peak GPU memory (GB)", figure("cost", "peak_gpu_memory_bytes", 1e-9)),
+        Column("thousand disks", figure("cost", "disks", 1e-3), 1),
+        Column("map (MB)", figure("cost", "map_bytes", 1e-6)),
+    ),
+    "Seconds are of the whole command; frames/s of SLAM count all up to the last frame.",
+)

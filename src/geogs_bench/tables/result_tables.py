@@ -1,0 +1,174 @@
+"""Tables of results: a row for each scene, their mean, and the published figures beside ours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from geogs_bench.benchmark import Benchmark, Column, Layout
+from geogs_bench.published import PublishedTable
+from geogs_bench.results.record import Record
+
+MISSING = "–"
+"""Cell of a number that is not there."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Text in cells; the first column names a row."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """The table as GitHub's Markdown has it, under its title."""
+        lines = [self.header, ("---", *["---:"] * (len(self.header) - 1)), *self.rows]
+        text = "\n".join(f"| {' | '.join(map(_escape, cells))} |" for cells in lines)
+        return "\n\n".join(part for part in (f"## {self.title}", text, self.note) if part)
+
+
+def result_tables(benchmark: Benchmark, records: Sequence[Record]) -> list[Table]:
+    """All tables of a benchmark that have a number; the first one names also what failed."""
+    made = []
+    scored = [record for record in records if record.cost is not None]
+    for layout in benchmark.layouts:
+        columns = [c for c in layout.columns if any(c.value(r) is not None for r in scored)]
+        if columns:
+            made += _layout_tables(benchmark, layout, _without_strangers(columns, scored), scored)
+    failed = [r for r in records if r.error is not None]
+    if failed:
+        rows = tuple((_name(r), r.error or "") for r in failed)
+        made.insert(0, Table("Not finished", ("scene", "why"), rows))
+    return made
+
+
+def published_tables(benchmark: Benchmark) -> list[Table]:
+    """Papers' tables as printed; nothing in them was measured here."""
+    return [_published_table(table) for table in benchmark.published]
+
+
+def _published_table(table: PublishedTable) -> Table:
+    has_mean = any(row.mean is not None for row in table.rows) and table.columns != ("mean",)
+    header = ("method", "metric", *table.columns, *(("mean",) if has_mean else ()))
+    rows = [
+        (row.method, row.metric, *(f"{v:.2f}" for v in row.values),
+         *((f"{row.mean:.2f}",) if has_mean and row.mean is not None else ()))
+        for row in table.rows
+    ]  # fmt: skip
+    note = f"{table.caption}. Figures of {table.source}, not measured here ({table.label})."
+    return Table(f"Published: {table.label}", header, tuple(rows), note)
+
+
+def _layout_tables(
+    benchmark: Benchmark, layout: Layout, columns: Sequence[Column], records: Sequence[Record]
+) -> list[Table]:
+    title, header = layout.title, _header(columns, records)
+    body = tuple(_row(record, columns) for record in records)
+    variants = list(dict.fromkeys(record.variant for record in records))
+    if len(variants) == 1:
+        mean = (_mean_row(benchmark, "mean", records, columns),) if len(records) > 1 else ()
+        return [Table(title, ("scene", *header), (*body, *mean), layout.note)]
+    detail = Table(f"{title}: every scene", ("scene, variant", *header), body)
+    common = _common_scenes(records, variants)
+    if not common:
+        return [detail]
+    means = tuple(
+        _mean_row(benchmark, variant or "default", rows, columns, variant)
+        for variant in variants
+        if (rows := [r for r in records if r.variant == variant and r.scene in common])
+    )
+    if len(common) == 1 and len(body) == len(variants):
+        return [Table(title, ("variant", *header), means, f"{common[0]}. {layout.note}".strip())]
+    note = f"Means over the scenes that every variant finished: {', '.join(common)}."
+    return [Table(title, ("variant", *header), means, f"{note} {layout.note}".strip()), detail]
+
+
+def _without_strangers(columns: Sequence[Column], records: Sequence[Record]) -> list[Column]:
+    """Columns without published figures that say nothing of these scenes and variants."""
+    rows = {name for record in records for name in (record.scene, record.variant)}
+    return [
+        replace(column, published=None)
+        if column.published
+        and not rows & {*column.published.table.columns}
+        and column.published.table.columns != ("mean",)
+        else column
+        for column in columns
+    ]
+
+
+def _common_scenes(records: Sequence[Record], variants: Sequence[str]) -> list[str]:
+    finished = {(r.scene, r.variant) for r in records if r.error is None}
+    scenes = dict.fromkeys(record.scene for record in records)
+    return [s for s in scenes if all((s, variant) in finished for variant in variants)]
+
+
+def _header(columns: Sequence[Column], records: Sequence[Record]) -> list[str]:
+    units = dict.fromkeys(s.unit for r in records for stage in r.stages for s in stage.surfaces)
+    unit = " or ".join(units) or "cm"
+    titles = []
+    for column in columns:
+        titles.append(column.title.replace("{unit}", unit))
+        if column.published is not None:
+            titles.append(f"{column.published.metric} (paper)")
+    return titles
+
+
+def _row(record: Record, columns: Sequence[Column]) -> tuple[str, ...]:
+    cells = [_name(record)]
+    for column in columns:
+        cells.append(_cell(column.value(record), column.digits))
+        if column.published is not None:
+            table, metric = column.published.table, column.published.metric
+            value = table.value(record.scene, metric)
+            cells.append(_cell(value, 2))
+    return tuple(cells)
+
+
+def _mean_row(
+    benchmark: Benchmark,
+    name: str,
+    records: Sequence[Record],
+    columns: Sequence[Column],
+    variant: str | None = None,
+) -> tuple[str, ...]:
+    """Means over the records that have a number; how many, where some have none."""
+    cells = [name]
+    for column in columns:
+        values = [v for r in records if (v := column.value(r)) is not None]
+        mean = _cell(sum(values) / len(values), column.digits) if values else MISSING
+        cells.append(f"{mean} ({len(values)} of {len(records)})" if 0 < len(values) < len(records)
+                     else mean)  # fmt: skip
+        if column.published is not None:
+            table, metric = column.published.table, column.published.metric
+            scenes = [r.scene for r in records]
+            cells.append(_cell(_published_mean(benchmark, table, metric, scenes, variant), 2))
+    return tuple(cells)
+
+
+def _published_mean(
+    benchmark: Benchmark,
+    table: PublishedTable,
+    metric: str,
+    scenes: Sequence[str],
+    variant: str | None,
+) -> float | None:
+    """Value of a variant where the table has such columns (over all the paper's scenes), else of
+    the scenes; a mean alone only where all the paper's scenes are there."""
+    complete = set(benchmark.scenes) <= set(scenes) and bool(benchmark.scenes)
+    if variant is not None and variant in table.columns:
+        return table.value(variant, metric)
+    if table.columns == ("mean",):
+        return table.value("mean", metric) if complete else None
+    return table.mean(scenes, metric)
+
+
+def _name(record: Record) -> str:
+    return f"{record.scene}, {record.variant}" if record.variant else record.scene
+
+
+def _cell(value: float | int | None, digits: int) -> str:
+    return MISSING if value is None else f"{value:.{digits}f}"
+
+
+def _escape(cell: str) -> str:
+    return cell.replace("|", "\\|").replace("\n", " ")
