@@ -110,7 +110,7 @@ class MetricScale:
     factor: float
     """By which all lengths were multiplied."""
     deviation: float
-    """Of the factor, as a part of it."""
+    """Standard deviation of the factor, as a part of it."""
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]

@@ -27,7 +27,7 @@ from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import check_scale_source, make_metric
-from geogs.application.scale.source import scale_source
+from geogs.application.scale.known_length import scale_source
 from geogs.application.settings import RunSettings
 from geogs.application.slam import go_on_in
 from geogs.application.viewer.observer import RunObserver

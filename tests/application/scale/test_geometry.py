@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.scale.distance import scale_by_distances
-from geogs.application.scale.ground import ground_plane, scale_by_height
-from geogs.application.scale.scene import MeasurableScene, SeenKeyframe
-from geogs.application.scale.source import CameraHeight, KnownDistance, KnownDistances
+from geogs.application.scale.distance import KnownDistance, KnownDistances, scale_by_distances
+from geogs.application.scale.ground import CameraHeight, ground_plane, scale_by_height
+from geogs.application.scale.measurable_scene import MeasurableScene, SeenKeyframe
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from geogs.application.run import run
-from geogs.application.scale.apply import measurable
-from geogs.application.scale.distance import scale_by_distances
-from geogs.application.scale.source import KnownDistances, scale_source
+from geogs.application.scale.apply import measurable_run
+from geogs.application.scale.distance import KnownDistances, scale_by_distances
+from geogs.application.scale.known_length import scale_source
 from geogs.application.settings import RunSettings
 from geogs.config import Config
 from geogs.errors import InputError
@@ -91,7 +91,7 @@ def test_a_known_distance_makes_metres(small_room, tmp_path, no_report):
     source = scale_source(known)
     assert isinstance(source, KnownDistances)
     calibration = open_source(small_room).calibration
-    again = scale_by_distances(measurable(written.result.scene), source, calibration)
+    again = scale_by_distances(measurable_run(written.result.scene), source, calibration)
     assert again.factor == pytest.approx(1, abs=1e-3)
 
 

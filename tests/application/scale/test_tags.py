@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.application.scale.scene import MeasurableScene, SeenKeyframe
-from geogs.application.scale.source import TagSize
-from geogs.application.scale.tags import TagDetector, scale_by_tags, triangulated
+from geogs.application.scale.measurable_scene import MeasurableScene, SeenKeyframe
+from geogs.application.scale.tags import TagDetector, TagSize, scale_by_tags, triangulated
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.types import Trajectory

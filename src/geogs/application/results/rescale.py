@@ -1,19 +1,17 @@
 """A result in metres by what is known of it afterwards, without running again."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from geogs.application.result_settings import RescaleSettings
 from geogs.application.results.report import write_page_anew
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.scale.find import find_scale
-from geogs.application.scale.scene import FoundScale, MeasurableScene, SeenKeyframe
-from geogs.application.scale.source import HOW, SensorScale, scale_source
+from geogs.application.scale.known_length import HOW, SensorScale, find_scale, scale_source
+from geogs.application.scale.measurable_scene import SeenKeyframe, measurable
 from geogs.errors import InputError
 from geogs.evaluation.true_scene import scaled
 from geogs.gpu.installation import require_device
@@ -27,12 +25,14 @@ from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mesh.mesh_file import read_mesh
 from geogs.on_demand import OnDemand
-from geogs.types import MapSnapshot
+from geogs.threads import on_one_torch_thread
+from geogs.types import MapSnapshot, MetricScale
 
 _STAGES = ("", "online/", "adjusted/")
 
 
-def rescale(settings: RescaleSettings) -> FoundScale:
+@on_one_torch_thread
+def rescale(settings: RescaleSettings) -> MetricScale:
     """Find metres to the map unit, and write trajectories, map, meshes and summary in metres.
 
     The summary goes first and comes last, so that no half of a result has one. Exports that were
@@ -52,27 +52,19 @@ def rescale(settings: RescaleSettings) -> FoundScale:
     camera = result.camera
     if calibration.width is None:
         calibration = replace(calibration, width=camera.width, height=camera.height)
-    found = find_scale(_measurable(result), source, calibration)
-    (folder / "summary.json").unlink()
-    _scale_files(result, found.factor)
-    write_text(folder / "summary.json", json.dumps(_scaled_summary(summary, found), indent=2))
-    write_page_anew(folder)
-    return found
-
-
-def _measurable(result: SavedResult) -> MeasurableScene:
     views = result.views
 
     def seen(number: int) -> SeenKeyframe:
         return SeenKeyframe(views.T_cw[number], result.image(number))
 
-    def surface(T_cw: np.ndarray) -> np.ndarray:
-        return result.render(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
-
     keyframes = OnDemand(range(len(views.keyframe_id)), seen)
-    return MeasurableScene(
-        result.camera, result.depth_camera, keyframes, result.trajectory, surface
-    )
+    scene = measurable(camera, result.renderer, keyframes, result.trajectory)
+    found = find_scale(scene, source, calibration)
+    (folder / "summary.json").unlink()
+    _scale_files(result, found.factor)
+    write_text(folder / "summary.json", json.dumps(_scaled_summary(summary, found), indent=2))
+    write_page_anew(folder)
+    return found
 
 
 def _scale_files(result: SavedResult, factor: float) -> None:
@@ -137,11 +129,9 @@ def _scale_table(path: Path, factor: float) -> None:
         write_text(path, "\n".join([HEADER, *moved_rows(path, factor), ""]))
 
 
-def _scaled_summary(summary: dict[str, Any], found: FoundScale) -> dict[str, Any]:
+def _scaled_summary(summary: dict[str, Any], found: MetricScale) -> dict[str, Any]:
     """The summary with the scale; what had multiplied lengths before is multiplied in."""
     before = summary.get("metric_scale")
     factor = float(before["factor"]) if isinstance(before, dict) else 1.0
-    metric = {
-        "origin": found.origin, "factor": factor * found.factor, "deviation": found.deviation
-    }  # fmt: skip
+    metric = asdict(replace(found, factor=factor * found.factor))
     return {**summary, "scale": f"metric ({found.origin})", "metric_scale": metric}

@@ -1,29 +1,28 @@
 """Brings a run's map to metres, at its end."""
 
-import numpy as np
-import torch
-from jaxtyping import Float64
-
 from geogs.application.progress import RunProgress
-from geogs.application.scale.find import find_scale
-from geogs.application.scale.scene import MeasurableScene, SeenKeyframe, said
-from geogs.application.scale.source import ScaleSource, SensorScale
+from geogs.application.scale.known_length import KnownLength, SensorScale, find_scale
+from geogs.application.scale.measurable_scene import (
+    MeasurableScene,
+    SeenKeyframe,
+    measurable,
+    said,
+)
 from geogs.errors import InputError
 from geogs.io.sources.frame_source import Source
 from geogs.on_demand import OnDemand
 from geogs.slam import Slam
 from geogs.tracking.graph.measured_odometry import OdometryAgreement
-from geogs.types import MetricScale
 
 
-def check_scale_source(source: ScaleSource | None, stream: Source) -> None:
+def check_scale_source(source: KnownLength | SensorScale | None, stream: Source) -> None:
     """Raises InputError where a scale is asked for that cannot be had of a source."""
     if isinstance(source, SensorScale) and not stream.uses_depth:
         raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
 
 
 def make_metric(
-    slam: Slam, stream: Source, source: ScaleSource | None, progress: RunProgress
+    slam: Slam, stream: Source, source: KnownLength | SensorScale | None, progress: RunProgress
 ) -> None:
     """Bring the map to metres by what is known; where it does not tell, say so and leave it."""
     if not slam.segments.keyframe_ids:
@@ -38,11 +37,11 @@ def make_metric(
             progress.write("warning: the scale is unknown: the map was not started from depth.")
         return
     try:
-        found = find_scale(measurable(slam), source, stream.calibration)
+        found = find_scale(measurable_run(slam), source, stream.calibration)
     except InputError as why:
         progress.write(f"warning: the scale stays unknown. {why}")
         return
-    slam.rescale(MetricScale(found.origin, found.factor, found.deviation))
+    slam.rescale(found)
     progress.write(said(found))
 
 
@@ -59,18 +58,12 @@ def sentences_on_poses(found: OdometryAgreement) -> list[str]:
     ]
 
 
-def measurable(slam: Slam) -> MeasurableScene:
+def measurable_run(slam: Slam) -> MeasurableScene:
     """The world of a run as a scale is looked for in."""
-    renderer = slam.renderer()
-
-    def surface(T_cw: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "h w"]:
-        return renderer.surface(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
 
     def seen(id: int) -> SeenKeyframe:
         keyframe = slam.world.keyframes[id]
         return SeenKeyframe(keyframe.T_cw.numpy(), keyframe.image)
 
-    return MeasurableScene(
-        slam.camera, renderer.camera, OnDemand(slam.segments.keyframe_ids, seen),
-        slam.trajectory(), surface,
-    )  # fmt: skip
+    keyframes = OnDemand(slam.segments.keyframe_ids, seen)
+    return measurable(slam.camera, slam.renderer(), keyframes, slam.trajectory())

@@ -1,13 +1,15 @@
 """The scale by points whose distance is known: pixels of a frame, lifted by the map's depth."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.application.scale.scene import FoundScale, MeasurableScene
-from geogs.application.scale.source import KnownDistance, KnownDistances
+from geogs.application.scale.measurable_scene import MeasurableScene
 from geogs.errors import InputError
 from geogs.geometry.distortion import undistorted_rays
 from geogs.io.sources.calibration import Calibration
+from geogs.types import MetricScale
 
 CLICK = 1.0
 """Pixels of the image as it came by which a point that somebody gives is off."""
@@ -15,9 +17,28 @@ _AROUND = 2
 """Pixels of the depth map on each side of a point that say how far it is."""
 
 
+@dataclass(frozen=True)
+class KnownDistance:
+    """Two pixels of a frame whose points are so far from each other."""
+
+    frame: int
+    """Number of the frame in the source's selection, from 0."""
+    first: tuple[float, float]
+    """Column and row in the image as it came, upright."""
+    second: tuple[float, float]
+    metres: float
+
+
+@dataclass(frozen=True)
+class KnownDistances:
+    """Some of them, which vote."""
+
+    each: tuple[KnownDistance, ...]
+
+
 def scale_by_distances(
     scene: MeasurableScene, known: KnownDistances, calibration: Calibration
-) -> FoundScale:
+) -> MetricScale:
     """The mean of what the distances say, by their variances.
 
     Args:
@@ -37,7 +58,7 @@ def scale_by_distances(
         chi = float((weight * (factors - factor) ** 2).sum() / (len(each) - 1))
         deviation *= max(1.0, chi) ** 0.5
     count = "a known distance" if len(each) == 1 else f"{len(each)} known distances"
-    return FoundScale(factor, float(deviation / factor), count)
+    return MetricScale(count, factor, float(deviation / factor))
 
 
 def _one(

@@ -1,11 +1,13 @@
 """The scale by the camera's height: the ground is the plane under its path."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.application.scale.scene import FoundScale, MeasurableScene
-from geogs.application.scale.source import CameraHeight
+from geogs.application.scale.measurable_scene import MeasurableScene
 from geogs.errors import InputError
+from geogs.types import MetricScale
 
 VIEWS = 40
 """Keyframes whose surfaces are looked at, at most."""
@@ -24,7 +26,14 @@ _LEAST = 0.03
 """Share of all points that the ground has, at least."""
 
 
-def scale_by_height(scene: MeasurableScene, known: CameraHeight, seed: int = 0) -> FoundScale:
+@dataclass(frozen=True)
+class CameraHeight:
+    """The camera is carried so high over the ground, in the median."""
+
+    metres: float
+
+
+def scale_by_height(scene: MeasurableScene, known: CameraHeight, seed: int = 0) -> MetricScale:
     """The median height of the keyframes over the ground, which is found by RANSAC.
 
     The deviation is the spread of the heights over the path: nobody carries a camera level.
@@ -55,7 +64,7 @@ def scale_by_height(scene: MeasurableScene, known: CameraHeight, seed: int = 0) 
     height = float(np.median(heights))
     spread = 1.4826 * float(np.median(np.abs(heights - height))) / height
     origin = f"a camera height of {known.metres:g} m"
-    return FoundScale(known.metres / height, float(np.hypot(spread, 0.005)), origin)
+    return MetricScale(origin, known.metres / height, float(np.hypot(spread, 0.005)))
 
 
 def ground_plane(

@@ -2,16 +2,17 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from geogs.application.scale.scene import FoundScale, MeasurableScene
-from geogs.application.scale.source import TagSize
+from geogs.application.scale.measurable_scene import MeasurableScene
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.types import MetricScale
 
 ANGLE = np.radians(1.5)
 """Least angle between two rays to a corner."""
@@ -26,7 +27,16 @@ Sighting = tuple[Float64[np.ndarray, "4 4"], Corners]
 """World to camera, and the corners' pixels."""
 
 
-def scale_by_tags(scene: MeasurableScene, known: TagSize) -> FoundScale:
+@dataclass(frozen=True)
+class TagSize:
+    """Square tags of one family, whose black squares have so long a side."""
+
+    family: str
+    """As OpenCV calls its dictionary."""
+    metres: float
+
+
+def scale_by_tags(scene: MeasurableScene, known: TagSize) -> MetricScale:
     """The median of what all sides and diagonals of all tags say.
 
     Raises:
@@ -59,7 +69,7 @@ def scale_by_tags(scene: MeasurableScene, known: TagSize) -> FoundScale:
     spread = 1.4826 * float(np.median(np.abs(np.array(sizes) - middle))) / middle
     deviation = float(np.hypot(spread / max(tags, 1) ** 0.5 / 2, _COMMON_ERROR))
     origin = f"{tags} tag{'s' * (tags > 1)} of {known.metres:g} m in {views} sightings"
-    return FoundScale(known.metres / middle, deviation, origin)
+    return MetricScale(origin, known.metres / middle, deviation)
 
 
 class TagDetector:

@@ -2,14 +2,10 @@
 
 import pytest
 
-from geogs.application.scale.source import (
-    CameraHeight,
-    KnownDistance,
-    KnownDistances,
-    SensorScale,
-    TagSize,
-    scale_source,
-)
+from geogs.application.scale.distance import KnownDistance, KnownDistances
+from geogs.application.scale.ground import CameraHeight
+from geogs.application.scale.known_length import SensorScale, scale_source
+from geogs.application.scale.tags import TagSize
 from geogs.errors import InputError
 
 

@@ -1,9 +1,15 @@
-"""What is known in metres, as ``--scale-from`` says it."""
+"""What is known in metres, as ``--scale-from`` says it, and the scale of a map by that."""
 
 import re
 from dataclasses import dataclass
 
+from geogs.application.scale.distance import KnownDistance, KnownDistances, scale_by_distances
+from geogs.application.scale.ground import CameraHeight, scale_by_height
+from geogs.application.scale.measurable_scene import MeasurableScene
+from geogs.application.scale.tags import TagSize, scale_by_tags
 from geogs.errors import InputError
+from geogs.io.sources.calibration import Calibration
+from geogs.types import MetricScale
 
 _NUMBER = r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 _DISTANCE = re.compile(rf"(\d+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER}m?")
@@ -19,49 +25,29 @@ HOW = (
 
 
 @dataclass(frozen=True)
-class KnownDistance:
-    """Two pixels of a frame whose points are so far from each other."""
-
-    frame: int
-    """Number of the frame in the source's selection, from 0."""
-    first: tuple[float, float]
-    """Column and row in the image as it came, upright."""
-    second: tuple[float, float]
-    metres: float
-
-
-@dataclass(frozen=True)
-class KnownDistances:
-    """Some of them, which vote."""
-
-    each: tuple[KnownDistance, ...]
-
-
-@dataclass(frozen=True)
-class TagSize:
-    """Square tags of one family, whose black squares have so long a side."""
-
-    family: str
-    """As OpenCV calls its dictionary."""
-    metres: float
-
-
-@dataclass(frozen=True)
-class CameraHeight:
-    """The camera is carried so high over the ground, in the median."""
-
-    metres: float
-
-
-@dataclass(frozen=True)
 class SensorScale:
     """A depth sensor says it."""
 
 
-ScaleSource = KnownDistances | TagSize | CameraHeight | SensorScale
+KnownLength = KnownDistances | TagSize | CameraHeight
+"""What a map can be measured against."""
 
 
-def scale_source(text: str) -> ScaleSource | None:
+def find_scale(scene: MeasurableScene, known: KnownLength, calibration: Calibration) -> MetricScale:
+    """Metres to the map unit; ``calibration`` is that of the images as they came.
+
+    Raises InputError where the scene does not tell.
+    """
+    match known:
+        case KnownDistances():
+            return scale_by_distances(scene, known, calibration)
+        case TagSize():
+            return scale_by_tags(scene, known)
+        case CameraHeight():
+            return scale_by_height(scene, known)
+
+
+def scale_source(text: str) -> KnownLength | SensorScale | None:
     """What a text says; none where it is empty. Raises InputError where it cannot be understood."""
     text = text.strip()
     if not text:

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float64, UInt8
 
 from geogs.geometry.camera import Camera
-from geogs.types import Trajectory
+from geogs.mapping.rendered import MapRenderer
+from geogs.types import MetricScale, Trajectory
 
 Surface = Callable[[Float64[np.ndarray, "4 4"]], Float64[np.ndarray, "h w"]]
 """Depth of the map seen from a pose (world to camera), 0 where unknown, map units."""
@@ -46,18 +47,21 @@ class MeasurableScene:
         return (points - T_cw[:3, 3]) @ T_cw[:3, :3], rays
 
 
-@dataclass(frozen=True)
-class FoundScale:
-    """Metres to the map unit."""
+def measurable(
+    camera: Camera,
+    renderer: MapRenderer,
+    keyframes: Sequence[SeenKeyframe],
+    trajectory: Trajectory,
+) -> MeasurableScene:
+    """A map that ``renderer`` shows, and its keyframes, whose images are of ``camera``."""
 
-    factor: float
-    deviation: float
-    """Standard deviation of the factor, as a part of it."""
-    origin: str
-    """By what it was found, in words."""
+    def surface(T_cw: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "h w"]:
+        return renderer.surface(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
+
+    return MeasurableScene(camera, renderer.camera, keyframes, trajectory, surface)
 
 
-def said(found: FoundScale) -> str:
+def said(found: MetricScale) -> str:
     """A found scale in a sentence."""
     metres = f"{found.factor:.5g} metres to the map unit (+- {found.deviation:.1%})"
     return f"Scale: {metres}, by {found.origin}."
