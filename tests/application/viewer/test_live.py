@@ -29,6 +29,9 @@ class FakeWindow(Window):
         self.gate.set()
         self.boxes = {}
         self.disks = None
+        self._frusta = {}
+        self._parts = {"Keyframes": []}
+        self._switches = {"Keyframes": SimpleNamespace(value=True)}
 
     def add_checkbox(self, name, value):
         self.boxes[name] = SimpleNamespace(value=value)
@@ -38,16 +41,13 @@ class FakeWindow(Window):
         self.disks = disks
         self.calls.append("disks")
 
-    def show_keyframe(self, id, T_wc, camera):
-        self.calls.append(f"keyframe {id}")
-        return id
+    def _frustum(self, name, T_wc, *look):
+        self.calls.append(name)
+        return SimpleNamespace(wxyz=None, position=T_wc[:3, 3])
 
     def say(self, words):
         self.gate.wait(5)
         self.calls.append("say")
-
-    def move_keyframe(self, frustum, T_wc):
-        self.calls.append("move_keyframe")
 
     def show_path(self, points):
         self.calls.append("show_path")
@@ -114,9 +114,8 @@ def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
     viewer, slam = LiveViewer(window, max_fraction=1.0), FakeSlam()
     look(viewer, slam)
     wait(viewer)
-    assert [c for c in window.calls if c.startswith("keyframe")] == [
-        "keyframe 0", "keyframe 1", "keyframe 2"
-    ]  # fmt: skip
+    frusta = [c for c in window.calls if c.startswith("/keyframes")]
+    assert frusta == ["/keyframes/0", "/keyframes/1", "/keyframes/2"]
     assert len(window.disks) == MOST_DISKS // 2 + 1  # every second
     for call in ("show_path", "show_camera", "show_picture", "follow", "say"):
         assert call in window.calls
@@ -125,7 +124,9 @@ def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
     window.boxes["Follow"].value = False
     look(viewer, slam)
     wait(viewer)
-    assert window.calls.count("move_keyframe") == 1
+    assert not any(c.startswith("/keyframes") for c in window.calls)
+    moved = [frustum.position.tolist() for frustum in window._parts["Keyframes"]]
+    assert moved == [[0, 0, 0], [-1, 0, -0.5], [-2, 0, 0]]
     assert "disks" not in window.calls  # it is too early for the map again
     assert "follow" not in window.calls
 

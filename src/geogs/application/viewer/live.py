@@ -57,28 +57,22 @@ class LiveViewer(RunObserver):
         self._wake = threading.Condition()
         self._ended = False
         self._start = time.perf_counter()
-        self._used = 0.0
-        """Seconds of looking, of both threads."""
+        self.used = 0.0
+        """Seconds of computing that looking has taken, of both threads."""
         self._last_map = -_MAP_SECONDS
-        self._frusta: dict[int, tuple[object, np.ndarray]] = {}
         self._thread = threading.Thread(target=self._serve, name="viewer", daemon=True)
         self._thread.start()
-
-    @property
-    def used(self) -> float:
-        """Seconds of computing that looking has taken."""
-        return self._used
 
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
         """Take what there is to see, if there is time for it."""
         now = time.perf_counter()
-        if self._next is not None or self._used > self._max_fraction * (now - self._start):
+        if self._next is not None or self.used > self._max_fraction * (now - self._start):
             return
         if self._pause.value or not self._window.clients:
             return
         begin = time.thread_time()
         update = self._look(frame, status, slam, now)
-        self._used += time.thread_time() - begin  # before the other thread adds its own
+        self.used += time.thread_time() - begin  # before the other thread adds its own
         with self._wake:
             self._next = update
             self._wake.notify()
@@ -130,7 +124,7 @@ class LiveViewer(RunObserver):
                     return
             begin = time.thread_time()
             self._show(update)
-            self._used += time.thread_time() - begin
+            self.used += time.thread_time() - begin
             self._next = None
 
     def _show(self, update: Update) -> None:
@@ -140,7 +134,8 @@ class LiveViewer(RunObserver):
             extent = np.ptp(update.keyframes[:, :3, 3], axis=0)
             window.stand_upright(update.keyframes, 2.5 * float(np.linalg.norm(extent)) + 1.0)
             window.show_path(update.keyframes[:, :3, 3])
-        self._show_keyframes(update)
+        for id, T_wc in zip(update.keyframe_ids, update.keyframes, strict=True):
+            window.show_keyframe(id, T_wc, update.camera)
         if update.picture is not None:
             window.show_picture(update.picture)
         if update.T_wc is not None:
@@ -149,16 +144,6 @@ class LiveViewer(RunObserver):
                 window.follow(update.T_wc)
         if update.disks is not None:
             window.show_disks(update.disks)
-
-    def _show_keyframes(self, update: Update) -> None:
-        """New ones, and those that a correction has moved."""
-        for id, T_wc in zip(update.keyframe_ids, update.keyframes, strict=True):
-            if id not in self._frusta:
-                self._frusta[id] = (self._window.show_keyframe(id, T_wc, update.camera), T_wc)
-            elif np.abs(self._frusta[id][1] - T_wc).max() > 1e-3:
-                frustum, _ = self._frusta[id]
-                self._window.move_keyframe(frustum, T_wc)
-                self._frusta[id] = (frustum, T_wc)
 
 
 def thinned(disks: MapSnapshot) -> MapSnapshot:

@@ -21,6 +21,8 @@ from geogs.types import MapSnapshot
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
 _FAREWELL = 0.3
 """Seconds that the server takes to end."""
+_LEAST_MOVE = 1e-3
+"""Change of a number of its pose from which a keyframe is moved."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 """Parts of the scene, by the names of their switches."""
 
@@ -56,9 +58,8 @@ class Window:
                 self._switches[name] = gui.add_checkbox(name, with_disks or name != "Disks")
                 self._switches[name].on_update(lambda _: self._apply_switches())
         self._parts: dict[str, list[Any]] = {name: [] for name in self._switches}
+        self._frusta: dict[int, tuple[Any, np.ndarray]] = {}
         self._size = 1.0
-        self._home: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-        self._server.on_client_connect(self._welcome)
         atexit.register(self.stop)
 
     @property
@@ -112,18 +113,17 @@ class Window:
         up: Float[np.ndarray, "3"],
     ) -> None:
         """Where those who look, and who come later, stand first."""
-        self._home = (eye, target, up)
+        self._server.on_client_connect(lambda client: _look(client, eye, target, up))
         for client in self._server.get_clients().values():
-            self._welcome(client)
+            _look(client, eye, target, up)
 
     def follow(self, T_wc: Float[np.ndarray, "4 4"]) -> None:
         """Bring all who look behind a camera."""
         eye = T_wc[:3, 3] - T_wc[:3, :3] @ np.array([0.0, 0.25, 0.6]) * self._size
+        target = T_wc[:3, 3] + 0.5 * self._size * T_wc[:3, 2]
         for client in self._server.get_clients().values():
             with client.atomic():
-                client.camera.up_direction = -T_wc[:3, 1]
-                client.camera.position = eye
-                client.camera.look_at = T_wc[:3, 3] + 0.5 * self._size * T_wc[:3, 2]
+                _look(client, eye, target, -T_wc[:3, 1])
 
     def show_mesh(self, mesh: Mesh) -> None:
         """A surface in its colours."""
@@ -169,12 +169,18 @@ class Window:
         T_wc: Float[np.ndarray, "4 4"],
         camera: Camera,
         image: UInt8[np.ndarray, "h w 3"] | None = None,
-    ) -> Any:
-        """A frustum; the same id replaces one."""
-        frustum = self._frustum(f"/keyframes/{id}", T_wc, camera, FRUSTUM, 0.035, image)
-        self._parts["Keyframes"].append(frustum)
-        frustum.visible = self._switches["Keyframes"].value
-        return frustum
+    ) -> None:
+        """A frustum; one that is there already follows a correction."""
+        if id not in self._frusta:
+            frustum = self._frustum(f"/keyframes/{id}", T_wc, camera, FRUSTUM, 0.035, image)
+            self._parts["Keyframes"].append(frustum)
+            frustum.visible = self._switches["Keyframes"].value
+        else:
+            frustum, before = self._frusta[id]
+            if np.abs(before - T_wc).max() <= _LEAST_MOVE:
+                return
+            frustum.wxyz, frustum.position = _place(T_wc)
+        self._frusta[id] = frustum, T_wc
 
     def show_camera(
         self,
@@ -184,10 +190,6 @@ class Window:
     ) -> None:
         """Where the camera is now, or the keyframe that was chosen."""
         self._frustum("/camera", T_wc, camera, NOW, 0.07, image)
-
-    def move_keyframe(self, frustum: Any, T_wc: Float[np.ndarray, "4 4"]) -> None:
-        """Let a frustum follow a correction."""
-        frustum.wxyz, frustum.position = _place(T_wc)
 
     def _frustum(
         self,
@@ -224,12 +226,12 @@ class Window:
             for part in parts:
                 part.visible = self._switches[name].value
 
-    def _welcome(self, client: Any) -> None:
-        if self._home is not None:
-            eye, target, up = self._home
-            client.camera.up_direction = up
-            client.camera.position = eye
-            client.camera.look_at = target
+
+def _look(client: Any, eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+    """Move the camera of somebody who looks."""
+    client.camera.up_direction = up
+    client.camera.position = eye
+    client.camera.look_at = target
 
 
 def _place(T_wc: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
