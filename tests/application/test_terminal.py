@@ -73,17 +73,19 @@ def test_a_log_that_cannot_be_written_is_a_sentence(tmp_path):
 
 
 def test_a_terminal_shows_one_line_with_the_time_left(monkeypatch):
-    shown = io.StringIO()
+    shown, now = io.StringIO(), [100.0]
 
     def console(**options) -> Console:
-        return Console(file=shown, force_terminal=True, width=120, highlight=False)
+        return Console(
+            file=shown, force_terminal=True, width=120, highlight=False, get_time=lambda: now[0]
+        )
 
     monkeypatch.setattr(terminal, "Console", console)
     with TerminalProgress() as progress:
-        progress.stage("training", 0.0)
-        forecast = progress._forecast
-        forecast._marks[0] = (0.0, forecast._marks[0][1] - 70)
-        progress.stage("training", 0.5)
+        progress.stage("depth", 0.9)
+        for fraction in (0.0, 0.1, 0.3, 0.5):
+            now[0] += 30.0
+            progress.stage("training", fraction)
         progress._bar.refresh()
         line = shown.getvalue().split("\r")[-1]
         assert "training" in line

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from geogs.application.forecast import StageForecast
 from geogs.application.machine.device import peak_memory
 from geogs.application.progress import RunProgress
 from geogs.application.settings import Verbosity
@@ -26,6 +25,9 @@ _LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
 
 _REDRAWS = 4
 """A second; drawing the line holds the interpreter's lock for milliseconds."""
+
+_PACE_SECONDS = 60.0
+"""The rest of a stage is expected at the pace of this time: first parts often differ."""
 
 
 class TerminalProgress(RunProgress):
@@ -45,13 +47,13 @@ class TerminalProgress(RunProgress):
             TextColumn("{task.fields[left]}", style="cyan"),
             console=self._console,
             refresh_per_second=_REDRAWS,
+            speed_estimate_period=_PACE_SECONDS,
             transient=True,
         )
         self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
-        self._forecast = StageForecast()
         self._frames: int | None = None
         self._printed = self._phase_began = time.perf_counter()
-        self._phase = self._last = ""
+        self._phase = self._stage = self._last = ""
         self._memory, self._measured = "", -math.inf
         self._log: TextIO | None = None
         self._handler: logging.Handler | None = None
@@ -101,15 +103,15 @@ class TerminalProgress(RunProgress):
     def frame(self, status: "PoseEstimate") -> None:
         """Move the line, with what there is to say beside it."""
         done = None if self._frames is None else status.frames / max(self._frames, status.frames)
-        # Frames up to the first keyframes cost other than those after.
-        left = self._forecast.left("frames" if status.keyframes else "first frames", done)
         parts = [f"{status.keyframes} keyframes"]
         if status.disks:  # else the map is made at the end
             parts.append(f"{status.disks / 1000:.1f}k disks")
         info = "  ".join([*parts, self._memory_used()])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"
-        self._show(f"frame {status.frames}/{self._frames or '?'}", info, done, left)
+        # Frames up to the first keyframes cost other than those after.
+        stage = "frames" if status.keyframes else "first frames"
+        self._show(stage, f"frame {status.frames}/{self._frames or '?'}", info, done)
 
     def _memory_used(self) -> str:
         """At the fullest so far; asked no more often than the line is drawn."""
@@ -121,7 +123,7 @@ class TerminalProgress(RunProgress):
     def stage(self, name: str, fraction: float) -> None:
         """Move the line to a stage, or within it."""
         self._enter(name.split(":")[0])
-        self._show(name, "", fraction, self._forecast.left(name, fraction))
+        self._show(name, name, "", fraction)
 
     def _enter(self, phase: str) -> None:
         """Begin another phase, if it is another."""
@@ -142,22 +144,22 @@ class TerminalProgress(RunProgress):
         if not self._console.is_terminal or self._verbosity.verbose:
             self._bar.console.print(text, soft_wrap=True, markup=False)
 
-    def _show(self, what: str, info: str, done: float | None, left: float | None) -> None:
+    def _show(self, stage: str, what: str, info: str, done: float | None) -> None:
         """The line as it is now, or a line of text if it is time for one.
 
-        ``done`` is the finished fraction of the stage, and ``left`` how many seconds it will take.
+        ``done`` is the finished fraction of the stage; none where that is not known.
         """
         now = time.perf_counter()
+        if stage != self._stage:
+            self._stage = stage
+            self._bar.reset(self._task)
         percent = "" if done is None else f"{done:.0%}"
-        ahead = "" if left is None else f"about {duration(left)} left"
         self._last = f", {info}" if info else ""
+        self._bar.update(self._task, completed=done or 0.0)
+        left = self._bar.tasks[0].time_remaining
+        ahead = "" if left is None else f"about {duration(left)} left"
         self._bar.update(
-            self._task,
-            description=f"{what:<20}",
-            completed=done or 0.0,
-            percent=percent,
-            info=info,
-            left=ahead,
+            self._task, description=f"{what:<20}", percent=percent, info=info, left=ahead
         )
         if self._console.is_terminal and not self._bar.live.is_started:
             self._bar.start()
