@@ -41,18 +41,12 @@ class Ending(Enum):
 class Work(ABC):
     """Poses and a map from a source: what differs between the commands."""
 
+    scene: MappedScene
+    """What is written, once the work has ended."""
+    source: Source | PosedSource
+    """What it was made from."""
     stages: Collection[str] = ()
     """Names of folders of the result that it has written on the way."""
-
-    @property
-    @abstractmethod
-    def scene(self) -> MappedScene:
-        """What is written, once the work has ended."""
-
-    @property
-    @abstractmethod
-    def source(self) -> Source | PosedSource:
-        """What it was made from."""
 
     @property
     def stopwatch(self) -> Stopwatch:

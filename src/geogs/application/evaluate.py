@@ -1,6 +1,7 @@
 """Errors of a result against the truth: trajectory and surface, as numbers, files and pictures."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,17 +44,16 @@ def evaluate(settings: EvalSettings) -> Evaluation:
         InputError: the result or the truth cannot be read, or they have too little in common.
         OutputError: a file cannot be written.
     """
-    _check(settings)
+    if not (settings.output / "trajectory.tum").is_file():
+        raise InputError(f"{settings.output} holds no trajectory.tum; give the folder of a result.")
     scene = read_true_scene(settings.gt)
     summary = _summary(settings.output)
     alignment = _alignment(settings, summary)
     trajectory = _trajectory_errors(settings, "trajectory.tum", scene, alignment)
     keyframes = None
     if (settings.output / "keyframes.tum").is_file():
-        try:
+        with suppress(InputError):  # too few of them to align
             keyframes = _trajectory_errors(settings, "keyframes.tum", scene, alignment)
-        except InputError:  # too few of them to align
-            keyframes = None
     mesh_file, points_file = find_surface(settings) if settings.surface else (None, None)
     surface, photo = None, None
     if (settings.output / "mesh.ply").is_file() and (settings.surface or settings.photo):
@@ -84,16 +84,6 @@ def evaluate(settings: EvalSettings) -> Evaluation:
         evaluation, settings.output / "eval.json", page, pictures, run, title, judged, model
     )
     return evaluation
-
-
-def _check(settings: EvalSettings) -> None:
-    counts = (settings.cull_every, settings.photo_every, settings.samples)
-    if any(n is not None and n < 1 for n in counts) or (
-        settings.threshold is not None and not settings.threshold > 0
-    ):
-        raise InputError("cull-every, photo-every, samples and threshold must be positive.")
-    if not (settings.output / "trajectory.tum").is_file():
-        raise InputError(f"{settings.output} holds no trajectory.tum; give the folder of a result.")
 
 
 def _summary(output: Path) -> dict[str, object]:

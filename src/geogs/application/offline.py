@@ -27,24 +27,17 @@ class PlacedOffline(Work):
     default settings; of the run's, input, mesh and seed count.
     """
 
+    scene: "OfflineScene"
+    """The map and all poses, once there are any."""
+    source: Source
+    """The video, calibrated as soon as its sharp frames have been placed."""
+
     def __init__(self, config: Config, video: Source) -> None:
         self._config = replace(
             ReconstructConfig(), seed=config.seed, input=config.input, mesh=config.mesh
         )
-        self._source = video
+        self.source = video
         self._stopwatch = Stopwatch()
-        self._scene: OfflineScene | None = None
-
-    @property
-    def scene(self) -> "OfflineScene":
-        """The map and all poses, once there are any."""
-        assert self._scene is not None, "the sharp frames have been placed"
-        return self._scene
-
-    @property
-    def source(self) -> Source:
-        """The video, calibrated as soon as its sharp frames have been placed."""
-        return self._source
 
     @property
     def stopwatch(self) -> Stopwatch:
@@ -59,18 +52,18 @@ class PlacedOffline(Work):
             KeyboardInterrupt: it was stopped before there was a map.
         """
         config = self._config
-        placed = place_video(self._source, config.seed, job.report, self._stopwatch)
+        placed = place_video(self.source, config.seed, job.report, self._stopwatch)
         job.progress.write(
             f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "
             f"{placed.error:.2f} pixels from where they were seen."
         )
-        if self._source.is_calibration_open:
-            self._source = self._source.with_calibration(_of_source(self._source, placed))
-        scene = OfflineScene(placed, self._source.camera, config, str(job.device))
+        if self.source.is_calibration_open:
+            self.source = self.source.with_calibration(_of_source(self.source, placed))
+        scene = OfflineScene(placed, self.source.camera, config, str(job.device))
         scene.stopwatch = self._stopwatch
-        self._scene = scene
+        self.scene = scene
         with self._stopwatch("placing frames"):
-            T_cw = _place_all(self._source, scene, placed, config, job.report)
+            T_cw = _place_all(self.source, scene, placed, config, job.report)
         points = placed.all_points()
         ending = job.map_known(scene, lambda: scene.finish(points, job.report), checkpoint)
         # Not before, as it would say of which frames the map is to be made.

@@ -124,38 +124,30 @@ def reconstruct_to_folder(
 class MappedImages(Work):
     """Images whose poses are known, mapped with checkpoints and snapshots on the way."""
 
+    scene: Reconstruction
+    source: PosedSource
     way_on = "The same command with --resume goes on from the last checkpoint."
 
     def __init__(
         self, scene: Reconstruction, source: PosedSource, settings: ReconstructSettings
     ) -> None:
-        self._scene = scene
-        self._source = source
+        self.scene = scene
+        self.source = source
         self._settings = settings
         names = [Path(source.label(i)).name for i in range(len(source))]
         self._made_from = fingerprint(settings.config, settings.hold_out, names)
         self._snapshots = Snapshots(settings.snapshots)
         self._has_depths = False
 
-    @property
-    def scene(self) -> Reconstruction:
-        """The map."""
-        return self._scene
-
-    @property
-    def source(self) -> PosedSource:
-        """The images."""
-        return self._source
-
     def state(self) -> ReconstructState | None:
         """What a checkpoint holds; nothing before the depths are done."""
         if not self._has_depths:
             return None
-        return ReconstructState(self._made_from, self._scene.settle())
+        return ReconstructState(self._made_from, self.scene.settle())
 
     def write_more(self, job: Job) -> None:
         """Write the snapshots."""
-        self._snapshots.write(job.output, self._scene, job.progress)
+        self._snapshots.write(job.output, self.scene, job.progress)
 
     def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
         """Search the depths, grow and train the map; or go on from a checkpoint.
@@ -164,7 +156,7 @@ class MappedImages(Work):
             InputError: nothing can be gone on with, or the images show no scene.
             KeyboardInterrupt: it was stopped before there was a map.
         """
-        settings, scene, progress = self._settings, self._scene, job.progress
+        settings, scene, progress = self._settings, self.scene, job.progress
         resumed = None
         if settings.resume:
             resumed = read_work(job.output, self._made_from)
@@ -186,7 +178,7 @@ class MappedImages(Work):
             job.stop.check()
 
         def work() -> None:
-            _complete(scene, self._source, resumed, report, settings.budget is not None, checks)
+            _complete(scene, self.source, resumed, report, settings.budget is not None, checks)
 
         return job.map_known(scene, work, checkpoint)
 

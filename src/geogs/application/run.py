@@ -129,7 +129,7 @@ def _begun(
             f"Starting anew; geogs run --resume {job.output} would go on with the unfinished run "
             "there, until the first checkpoint of this one."
         )
-    return TrackedVideo(slam, source, iter(source), settings, metadata, job.output)
+    return TrackedVideo(slam, source, iter(source), metadata, job.output)
 
 
 @on_one_torch_thread
@@ -167,7 +167,7 @@ def resume(
         progress.write(f"Going on after {slam.frames} frames.")
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = source.frames_after(saved.metadata.place)
-        work = TrackedVideo(slam, source, frames, settings, metadata, folder)
+        work = TrackedVideo(slam, source, frames, metadata, folder)
         return Job(settings, folder, device, progress, stop, observer).complete(work)
 
 
@@ -194,25 +194,14 @@ def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSet
 class TrackedVideo(Work):
     """A video whose frames are tracked one by one, by a system that has been made ready."""
 
-    slam: Slam
-    video: Source
+    scene: Slam
+    source: Source
     """Calibrated."""
     frames: Generator[Frame, None, None]
     """That are left."""
-    settings: RunSettings
     metadata: RunMetadata
     output: Path
     stages: list[str] = field(default_factory=list)
-
-    @property
-    def scene(self) -> Slam:
-        """The system."""
-        return self.slam
-
-    @property
-    def source(self) -> Source:
-        """The video."""
-        return self.video
 
     @property
     def way_on(self) -> str:
@@ -222,14 +211,14 @@ class TrackedVideo(Work):
 
     def state(self) -> RunState | None:
         """What a checkpoint holds; nothing of what cannot be gone on with."""
-        if self.settings.map is not None or self.video.is_live:
+        if self.metadata.settings.map is not None or self.source.is_live:
             return None
-        return run_state(self.metadata, self.slam, self.video)
+        return run_state(self.metadata, self.scene, self.source)
 
     def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
         """The frames that are left, then the final stages."""
-        slam, video, progress = self.slam, self.video, job.progress
-        progress.expect(video.length, slam.frames)
+        slam, source, progress = self.scene, self.source, job.progress
+        progress.expect(source.length, slam.frames)
         with closing(self.frames):
             ending = self._track(job, checkpoint)
         if ending is not Ending.MEMORY_FULL and ending is not Ending.FINISHED:
@@ -239,14 +228,14 @@ class TrackedVideo(Work):
             checkpoint.write()
         self._write_stage("online", job)
         ending = self._finish(job, ending)
-        make_metric(slam, video, scale_source(self.settings.scale_from), progress)
+        make_metric(slam, source, scale_source(self.metadata.settings.scale_from), progress)
         return ending
 
     def _track(self, job: Job, checkpoint: Checkpoint) -> Ending:
         """All frames through the system, until a request to stop."""
         stop = job.stop
         try:
-            if self.slam.world.is_ended:
+            if self.scene.world.is_ended:
                 next(self.frames, None)  # only what the source says of itself at its end
             else:
                 self._track_each(job, checkpoint)
@@ -254,7 +243,7 @@ class TrackedVideo(Work):
             torch.cuda.empty_cache()
             job.stop_early("The GPU has no memory left")
             return Ending.MEMORY_FULL
-        if self.video.is_live and stop.requested:  # the usual end of what has none
+        if self.source.is_live and stop.requested:  # the usual end of what has none
             stop.requested = False
             job.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
         if not stop.requested:
@@ -263,7 +252,7 @@ class TrackedVideo(Work):
         return Ending.STOPPED
 
     def _track_each(self, job: Job, checkpoint: Checkpoint) -> None:
-        slam = self.slam
+        slam = self.scene
         for frame in _timed(self.frames, slam.stopwatch):
             status = slam.process(frame)
             job.progress.frame(status)
@@ -278,7 +267,7 @@ class TrackedVideo(Work):
         try:
             if ending is Ending.FINISHED and job.stop.lets_finish(lambda: self._adjust(job)):
                 return ending
-            self.slam.refine(job.progress.stage, BRIEFLY)
+            self.scene.refine(job.progress.stage, BRIEFLY)
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
             job.progress.write(
@@ -287,15 +276,15 @@ class TrackedVideo(Work):
         return Ending.STOPPED if ending is Ending.FINISHED else ending
 
     def _adjust(self, job: Job) -> None:
-        self.slam.adjust(job.report)
-        if self.slam.will_refine:
+        self.scene.adjust(job.report)
+        if self.scene.will_refine:
             self._write_stage("adjusted", job)
-        self.slam.refine(job.report)
+        self.scene.refine(job.report)
 
     def _write_stage(self, name: Literal["online", "adjusted"], job: Job) -> None:
         """What there is by now, if it is asked for, and if there is a map."""
-        if self.settings.online_results and not self.slam.world.maps_at_end:
-            write_stage(self.output, self.slam, job.progress, name)
+        if self.metadata.settings.online_results and not self.scene.world.maps_at_end:
+            write_stage(self.output, self.scene, job.progress, name)
             self.stages.append(name)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from geogs.application.settings import Verbosity
-from geogs.cli.options import record
 
 if TYPE_CHECKING:
     from geogs.application.progress import RunProgress
@@ -31,7 +30,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
         for handler in logging.getLogger("geogs").handlers:
             handler.setLevel(logging.INFO)
             handler.setFormatter(logging.Formatter("%(message)s"))
-    with TerminalProgress(record(Verbosity, options)) as progress:
+    with TerminalProgress(options) as progress:
         written = work(progress)
         progress.end_phase()
         words = closing_message(written, time.perf_counter() - begin)
