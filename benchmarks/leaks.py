@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from geogs.application.run import run
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.config import preset
 
 MOST_LEAKED = 1024.0

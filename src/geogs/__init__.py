@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
     from geogs.application.results.saved_result import load_result
-    from geogs.application.slam import load_slam, save_slam, slam_mesh, track
+    from geogs.application.slam_in_python import load_slam, save_slam, slam_mesh, track
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
     from geogs.io.sources.sniff import open_posed_source, open_source
@@ -53,14 +53,14 @@ _HOMES = {
     "Slam": "geogs.slam",
     "load_map": "geogs.io.writers.map_file",
     "load_result": "geogs.application.results.saved_result",
-    "load_slam": "geogs.application.slam",
+    "load_slam": "geogs.application.slam_in_python",
     "open_posed_source": "geogs.io.sources.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
-    "save_slam": "geogs.application.slam",
-    "slam_mesh": "geogs.application.slam",
-    "track": "geogs.application.slam",
+    "save_slam": "geogs.application.slam_in_python",
+    "slam_mesh": "geogs.application.slam_in_python",
+    "track": "geogs.application.slam_in_python",
 }
 
 find_kernel_folder()

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.errors import DeviceError, GeogsError, InputError, OutputError
 
 PATIENCE = 60.0
@@ -50,7 +50,7 @@ def compute(settings: RunSettings) -> None:
         InputError, TrackingLost, OutputError, DeviceError: as of a run.
     """
     from geogs.application.run import resume, run
-    from geogs.application.terminal import TerminalProgress
+    from geogs.application.terminal_progress import TerminalProgress
 
     output = settings.output
     assert output is not None, "a fleet gives every source a folder"

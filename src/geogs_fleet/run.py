@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 
 from geogs.application.results.output_folder import only_writer
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs_fleet.attempt import CHILD, Job

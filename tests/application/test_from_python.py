@@ -13,7 +13,7 @@ import pytest
 import geogs
 from geogs.application.interrupt import Interruption
 from geogs.application.run import run
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli
 from geogs.cli.speech import NOT_JUDGED, closing_message
 from geogs.io.pose_files import read_tum_trajectory

@@ -12,7 +12,7 @@ from geogs.application.checkpoints.run_state import RunMetadata
 from geogs.application.interrupt import Interruption
 from geogs.application.machine.device import full_memory_in_a_sentence
 from geogs.application.run import continued
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.errors import DeviceError, InputError
 
 WAY = " geogs run --resume out goes on."

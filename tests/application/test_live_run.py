@@ -9,7 +9,7 @@ import pytest
 
 from geogs.application.interrupt import Stop
 from geogs.application.run import run
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config
 from geogs.errors import InputError

@@ -10,8 +10,8 @@ from geogs.application.output_cost import (
     COARSER,
     MAX_MESH_TIME,
     ONE_VIEW,
+    MeshTimes,
     OutputForecast,
-    StageTimes,
 )
 from geogs.errors import InputError
 from geogs.mapping.time_budget import TimeBudget
@@ -31,7 +31,7 @@ class FakeClock:
 
 def test_what_comes_before_the_first_view_of_a_stage_is_of_the_surface():
     clock = FakeClock()
-    times = StageTimes(clock)
+    times = MeshTimes(clock)
     reports = [
         (2.0, "fuse", 1), (0.5, "fuse", 2), (0.5, "fuse", 3), (3.0, "colour", 1),
         (0.25, "colour", 2), (0.25, "colour", 3), (1.0, "merge", 0), (4.0, "merge", 1),
@@ -73,7 +73,7 @@ def rehearsal(monkeypatch, rehearsed) -> FakeClock:
     def write(folder: object, scene: object, camera: object, renders: list, images: bool) -> None:
         clock.now += 0.2 * len(renders)
 
-    def extract(views: list, config: object, progress: StageTimes | None = None) -> None:
+    def extract(views: list, config: object, progress: MeshTimes | None = None) -> None:
         assert config.min_weight == ONE_VIEW
         rehearsed.append(len(views))
         for number in range(len(views)):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory

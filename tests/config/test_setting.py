@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from geogs import config
 from geogs.application.result_settings import EvalSettings
-from geogs.application.settings import ReconstructSettings, RunSettings
+from geogs.application.run_settings import ReconstructSettings, RunSettings
 from geogs.cli.demo import DemoOptions
 from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from geogs.application.checkpoints import folder as checkpoint_folder
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs_fleet import work_folder
 from geogs_fleet.attempt import Job, attempt, judged
 from geogs_fleet.places import Place

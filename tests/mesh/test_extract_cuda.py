@@ -8,7 +8,7 @@ import torch
 
 from cuda_emulator import use_emulator
 from geogs.application.machine.device import device_summary
-from geogs.application.results.report import write_report
+from geogs.application.results.result_page import write_report
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera

@@ -13,7 +13,7 @@ from geogs.application.export.image_sets import write_colmap_set, write_nerfstud
 from geogs.application.result_settings import EvalSettings
 from geogs.application.results.output_folder import free_folder
 from geogs.application.results.remesh import mesh_settings
-from geogs.application.results.report import shown_model, shown_views, write_page_anew
+from geogs.application.results.result_page import shown_model, shown_views, write_page_anew
 from geogs.application.results.saved_result import load_result
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source

@@ -16,7 +16,7 @@ from geogs.application.checkpoints.checkpoint import (
     write_checkpoint,
 )
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, SavedRun
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.slam import Slam

@@ -12,12 +12,12 @@ import torch
 from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
-from geogs.application.progress import RunProgress
+from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result, Written
-from geogs.application.results.scene import MappedScene
 from geogs.application.results.surfaces import write_depth_mesh
 from geogs.application.results.write import write_results
-from geogs.application.settings import ReconstructSettings, RunSettings
+from geogs.application.run_progress import RunProgress
+from geogs.application.run_settings import ReconstructSettings, RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.errors import DeviceError
 from geogs.io.sources.frame_source import Source
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from geogs.reconstruction import Reconstruction
 
 
-class Ending(Enum):
+class Outcome(Enum):
     """How work came to its end."""
 
     FINISHED = auto()
@@ -63,18 +63,18 @@ class Work(ABC):
         return None
 
     @abstractmethod
-    def complete(self, job: "Job", checkpoint: Checkpoint) -> Ending:
+    def complete(self, driver: "Driver", checkpoint: Checkpoint) -> Outcome:
         """All of it up to the trained map, with checkpoints on the way.
 
         Raises KeyboardInterrupt where it was stopped before there was anything to keep.
         """
 
-    def write_more(self, job: "Job") -> None:  # noqa: B027  # most have none
+    def write_more(self, driver: "Driver") -> None:  # noqa: B027  # most have none
         """Write files besides those of every result."""
 
 
 @dataclass(frozen=True)
-class Job:
+class Driver:
     """Where a command computes and writes, who follows it, and who may stop it."""
 
     settings: RunSettings | ReconstructSettings
@@ -95,18 +95,18 @@ class Job:
 
     def map_known(
         self, scene: "Reconstruction", work: Callable[[], None], checkpoint: Checkpoint
-    ) -> Ending:
+    ) -> Outcome:
         """Do what maps a scene of known poses; where that is stopped, keep the map so far.
 
         Raises KeyboardInterrupt where it is stopped before there is any.
         """
         if self.stop.lets_finish(work):
-            return Ending.FINISHED
+            return Outcome.FINISHED
         if not len(scene.snapshot()):
             raise KeyboardInterrupt
         self.stop_early()
         checkpoint.write()
-        return Ending.STOPPED
+        return Outcome.STOPPED
 
     def complete(self, work: Work) -> Written:
         """The work to its end, or until it is stopped, then the files of what there is by then.
@@ -124,8 +124,8 @@ class Job:
             return f" {work.way_on}" if work.way_on and has_checkpoint(output) else ""
 
         with full_memory_in_a_sentence(way_on), self.stop:
-            ending = work.complete(self, checkpoint)
-            finished, scene = ending is Ending.FINISHED, work.scene
+            outcome = work.complete(self, checkpoint)
+            finished, scene = outcome is Outcome.FINISHED, work.scene
             result = Result(scene, work.source, not finished, progress)
 
             def write_more() -> None:
@@ -136,7 +136,7 @@ class Job:
             write_results(output, result, write_more, settings.keyframe_images, work.stages)
             if self.observer is not None:
                 self.observer.result(result)
-        if ending is Ending.MEMORY_FULL:
+        if outcome is Outcome.MEMORY_FULL:
             raise DeviceError(
                 f"The memory of the GPU was full after {scene.frames} frames, whose results are in "
                 f"{output}/; {REMEDY}.{way_on()}"

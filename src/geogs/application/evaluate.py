@@ -13,7 +13,7 @@ from geogs.application.evaluate_surface import (
     photoconsistency,
 )
 from geogs.application.result_settings import EvalSettings
-from geogs.application.results.report import shown_model, shown_views
+from geogs.application.results.result_page import shown_model, shown_views
 from geogs.application.results.saved_result import load_result
 from geogs.documents import read_json
 from geogs.errors import InputError

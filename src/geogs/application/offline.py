@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
-from geogs.application.driver import Ending, Job, Work
+from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.photos import PlacedVideo, localiser, place_video
 from geogs.config import Config, ReconstructConfig
 from geogs.geometry.camera import Camera
@@ -44,7 +44,7 @@ class PlacedOffline(Work):
         """Seconds of placing and mapping."""
         return self._stopwatch
 
-    def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
+    def complete(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
         """Place the frames, then map the sharp ones.
 
         Raises:
@@ -52,24 +52,24 @@ class PlacedOffline(Work):
             KeyboardInterrupt: it was stopped before there was a map.
         """
         config = self._config
-        placed = place_video(self.source, config.seed, job.report, self._stopwatch)
-        job.progress.write(
+        placed = place_video(self.source, config.seed, driver.report, self._stopwatch)
+        driver.progress.write(
             f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "
             f"{placed.error:.2f} pixels from where they were seen."
         )
         if self.source.is_calibration_open:
             self.source = self.source.with_calibration(_of_source(self.source, placed))
-        scene = OfflineScene(placed, self.source.camera, config, str(job.device))
+        scene = OfflineScene(placed, self.source.camera, config, str(driver.device))
         scene.stopwatch = self._stopwatch
         self.scene = scene
         with self._stopwatch("placing frames"):
-            T_cw = _place_all(self.source, scene, placed, config, job.report)
+            T_cw = _place_all(self.source, scene, placed, config, driver.report)
         points = placed.all_points()
-        ending = job.map_known(scene, lambda: scene.finish(points, job.report), checkpoint)
+        outcome = driver.map_known(scene, lambda: scene.finish(points, driver.report), checkpoint)
         # Not before, as it would say of which frames the map is to be made.
         times = placed.timestamps[: len(T_cw)]
         scene.know(bridged(times, T_cw, [None] * len(T_cw)))
-        return ending
+        return outcome
 
 
 class OfflineScene(Reconstruction):

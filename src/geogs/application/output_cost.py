@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
-from geogs.application.results.report import write_report
+from geogs.application.results.result_page import write_report
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.errors import InputError
@@ -45,7 +45,7 @@ MIN_TRIANGLES = 0.25
 """Fraction of its triangles that it keeps in any case, and not fewer than a thousand."""
 
 
-class StageTimes:
+class MeshTimes:
     """How long the stages of a mesh take, from the reports of its progress."""
 
     def __init__(self, clock: Clock) -> None:
@@ -152,7 +152,7 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
         renders = scene.depth_maps(of=views)
         write_keyframes(Path(folder), scene, scene.camera, renders, True)
-        of_views, times = clock() - start, StageTimes(clock)
+        of_views, times = clock() - start, MeshTimes(clock)
         try:
             plan = plan_volume(fusion_views(renders), scene.config.mesh)
             blocks, triangles = plan.blocks, plan.triangles

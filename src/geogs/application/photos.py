@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from geogs.application.interrupt import Stop
-from geogs.application.progress import RunProgress
+from geogs.application.run_progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

@@ -1,6 +1,6 @@
 """The images of a source that make the map: chosen by where they were taken, then read."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 
 import numpy as np
@@ -20,10 +20,8 @@ from geogs.mapping.coverage import (
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
 from geogs.reconstruction import Reconstruction
+from geogs.stopwatch import StageProgress
 from geogs.types import Trajectory
-
-Report = Callable[[str, float], None]
-"""Called with the name of a stage and its finished fraction in [0, 1]."""
 
 # Points of the scene by which the usual depth of each image is found, at most.
 _MAX_DEPTH_POINTS = 4000
@@ -35,7 +33,7 @@ class PosedViews:
     An image is read when it is given, the next one meanwhile; none is kept here.
     """
 
-    def __init__(self, scene: Reconstruction, source: PosedSource, report: Report) -> None:
+    def __init__(self, scene: Reconstruction, source: PosedSource, report: StageProgress) -> None:
         self._scene = scene
         self._source = source
         self._report = report

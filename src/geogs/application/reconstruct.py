@@ -9,17 +9,17 @@ from typing import Literal
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
-from geogs.application.driver import Ending, Job, Work
+from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.photos import open_photographs
-from geogs.application.posed_views import PosedViews, Report
-from geogs.application.progress import RunProgress
+from geogs.application.posed_views import PosedViews
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result, Written
 from geogs.application.results.surfaces import Snapshots
-from geogs.application.settings import ReconstructSettings
+from geogs.application.run_progress import RunProgress
+from geogs.application.run_settings import ReconstructSettings
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded
@@ -29,6 +29,7 @@ from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
 from geogs.reconstruction import Reconstruction, ReconstructionTable
+from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
 
 FIRST_BATCH = 24
@@ -117,8 +118,8 @@ def reconstruct_to_folder(
                 )  # fmt: skip
         clock.excuse(compiled_kernels(device))
         scene = Reconstruction(source.camera, config, str(device), clock.left())
-        job = Job(settings, output, device, progress, stop)
-        return job.complete(MappedImages(scene, source, settings))
+        driver = Driver(settings, output, device, progress, stop)
+        return driver.complete(MappedImages(scene, source, settings))
 
 
 class MappedImages(Work):
@@ -145,21 +146,21 @@ class MappedImages(Work):
             return None
         return ReconstructState(self._made_from, self.scene.settle())
 
-    def write_more(self, job: Job) -> None:
+    def write_more(self, driver: Driver) -> None:
         """Write the snapshots."""
-        self._snapshots.write(job.output, self.scene, job.progress)
+        self._snapshots.write(driver.output, self.scene, driver.progress)
 
-    def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
+    def complete(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
         """Search the depths, grow and train the map; or go on from a checkpoint.
 
         Raises:
             InputError: nothing can be gone on with, or the images show no scene.
             KeyboardInterrupt: it was stopped before there was a map.
         """
-        settings, scene, progress = self._settings, self.scene, job.progress
+        settings, scene, progress = self._settings, self.scene, driver.progress
         resumed = None
         if settings.resume:
-            resumed = read_work(job.output, self._made_from)
+            resumed = read_work(driver.output, self._made_from)
             place = resumed.map.place
             done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
             progress.write(f"Going on after {done}, {resumed.seconds:.0f} s into the work.")
@@ -175,12 +176,12 @@ class MappedImages(Work):
                 checkpoint.write()
             elif self._has_depths:
                 checkpoint.write_if_due()
-            job.stop.check()
+            driver.stop.check()
 
         def work() -> None:
             _complete(scene, self.source, resumed, report, settings.budget is not None, checks)
 
-        return job.map_known(scene, work, checkpoint)
+        return driver.map_known(scene, work, checkpoint)
 
 
 def _say_whether_poses_fit(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
@@ -194,7 +195,7 @@ def _complete(
     scene: Reconstruction,
     source: PosedSource,
     resumed: ReconstructionTable | None,
-    report: Report,
+    report: StageProgress,
     budgeted: bool,
     checks: RunProgress | None,
 ) -> None:

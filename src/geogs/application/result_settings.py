@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from geogs.config import MeshConfig, Seed
-from geogs.config.setting import Basic, Count, Positional, Positive, Range, Settings
+from geogs.config.setting import Basic, Count, Port, Positional, Positive, Range, Settings
 
 Format = Literal[
     "colmap", "nerfstudio", "gsplat", "cloud", "depth", "normals", "kitti", "euroc", "tum", "glb",
     "obj", "splats",
 ]  # fmt: skip
+
+HERE = "127.0.0.1"
+"""Address that only this machine sees."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,22 @@ class RescaleSettings(Settings):
     over the ground)."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+@dataclass(frozen=True)
+class ViewSettings(Settings):
+    """Look at a result in the browser: mesh, disks, path, keyframes with depth and normals.
+
+    Needs pip install 'geogs[viewer]'; without it, open report/index.html of the result. Over ssh:
+    ssh -L 8080:localhost:8080 MACHINE, then http://localhost:8080 on your own machine.
+    """
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    port: Annotated[Port, Basic("-p")] = 8080
+    """Where the page is served; if it is taken, the next that is free."""
+    host: str = HERE
+    """Address at which it is served; 0.0.0.0 lets other machines look, too."""
 
 
 @dataclass(frozen=True)

@@ -17,19 +17,19 @@ from geogs.application.checkpoints.run_state import (
     SavedRun,
     run_state,
 )
-from geogs.application.driver import Ending, Job, Work
+from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
-from geogs.application.priors import open_prior
-from geogs.application.progress import RunProgress
+from geogs.application.prior_choice import open_prior
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import write_stage
+from geogs.application.run_progress import RunProgress
+from geogs.application.run_settings import RunSettings
 from geogs.application.scale.apply import check_scale_source, make_metric
 from geogs.application.scale.known_length import scale_source
-from geogs.application.settings import RunSettings
-from geogs.application.slam import go_on_in
+from geogs.application.slam_in_python import go_on_in
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
@@ -80,12 +80,12 @@ def run(
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
     with claimed(wanted) as output:
         compiled_kernels(device)
-        job = Job(settings, output, device, progress, stop, observer)
+        driver = Driver(settings, output, device, progress, stop, observer)
         if settings.offline:
             from geogs.application.offline import PlacedOffline
 
-            return job.complete(PlacedOffline(config, opened))
-        return job.complete(_begun(settings, job, opened, base))
+            return driver.complete(PlacedOffline(config, opened))
+        return driver.complete(_begun(settings, driver, opened, base))
 
 
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
@@ -104,17 +104,17 @@ def seen_by(base: SavedResult, config: Config) -> InputConfig:
 
 
 def _begun(
-    settings: RunSettings, job: Job, opened: Source, base: SavedResult | None
+    settings: RunSettings, driver: Driver, opened: Source, base: SavedResult | None
 ) -> "TrackedVideo":
     """A system for an opened source, calibrated; in the map of ``base`` if that is given."""
-    config, progress, stop = settings.config, job.progress, job.stop
-    calibrated = self_calibrated(opened, config, job.device, progress, stop)
-    prior = open_prior(config.prior, calibrated.camera, job.device)
+    config, progress, stop = settings.config, driver.progress, driver.stop
+    calibrated = self_calibrated(opened, config, driver.device, progress, stop)
+    prior = open_prior(config.prior, calibrated.camera, driver.device)
     # A system loads much; meanwhile the images tell of the shutter, which does not concern it.
     with ThreadPoolExecutor(1, thread_name_prefix="system") as thread:
         made = thread.submit(
-            Slam, calibrated.camera, config, str(job.device), prior, calibrated.is_live,
-            calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, job.observer),
+            Slam, calibrated.camera, config, str(driver.device), prior, calibrated.is_live,
+            calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, driver.observer),
         )  # fmt: skip
         source = with_shutter_found(calibrated, progress, stop)
         slam = made.result()
@@ -122,14 +122,14 @@ def _begun(
         go_on_in(slam, base)
     found = None if calibrated is opened else calibrated.calibration
     metadata = RunMetadata(
-        settings.absolute(), job.device.type, source.fingerprint(), found, shutter=source.shutter
+        settings.absolute(), driver.device.type, source.fingerprint(), found, shutter=source.shutter
     )
-    if has_checkpoint(job.output):
+    if has_checkpoint(driver.output):
         progress.write(
-            f"Starting anew; geogs run --resume {job.output} would go on with the unfinished run "
-            "there, until the first checkpoint of this one."
+            f"Starting anew; geogs run --resume {driver.output} would go on with the unfinished "
+            "run there, until the first checkpoint of this one."
         )
-    return TrackedVideo(slam, source, iter(source), metadata, job.output)
+    return TrackedVideo(slam, source, iter(source), metadata, driver.output)
 
 
 @on_one_torch_thread
@@ -168,7 +168,7 @@ def resume(
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, metadata, folder)
-        return Job(settings, folder, device, progress, stop, observer).complete(work)
+        return Driver(settings, folder, device, progress, stop, observer).complete(work)
 
 
 def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:
@@ -215,76 +215,77 @@ class TrackedVideo(Work):
             return None
         return run_state(self.metadata, self.scene, self.source)
 
-    def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
+    def complete(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
         """The frames that are left, then the final stages."""
-        slam, source, progress = self.scene, self.source, job.progress
+        slam, source, progress = self.scene, self.source, driver.progress
         progress.expect(source.length, slam.frames)
         with closing(self.frames):
-            ending = self._track(job, checkpoint)
-        if ending is not Ending.MEMORY_FULL and ending is not Ending.FINISHED:
+            outcome = self._track(driver, checkpoint)
+        if outcome is not Outcome.MEMORY_FULL and outcome is not Outcome.FINISHED:
             checkpoint.write()
         slam.end_stream()
-        if ending is Ending.FINISHED:
+        if outcome is Outcome.FINISHED:
             checkpoint.write()
-        self._write_stage("online", job)
-        ending = self._finish(job, ending)
+        self._write_stage("online", driver)
+        outcome = self._finish(driver, outcome)
         make_metric(slam, source, scale_source(self.metadata.settings.scale_from), progress)
-        return ending
+        return outcome
 
-    def _track(self, job: Job, checkpoint: Checkpoint) -> Ending:
+    def _track(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
         """All frames through the system, until a request to stop."""
-        stop = job.stop
+        stop = driver.stop
         try:
             if self.scene.world.is_ended:
                 next(self.frames, None)  # only what the source says of itself at its end
             else:
-                self._track_each(job, checkpoint)
+                self._track_each(driver, checkpoint)
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
-            job.stop_early("The GPU has no memory left")
-            return Ending.MEMORY_FULL
+            driver.stop_early("The GPU has no memory left")
+            return Outcome.MEMORY_FULL
         if self.source.is_live and stop.requested:  # the usual end of what has none
             stop.requested = False
-            job.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
+            driver.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
         if not stop.requested:
-            return Ending.FINISHED
-        job.stop_early()
-        return Ending.STOPPED
+            return Outcome.FINISHED
+        driver.stop_early()
+        return Outcome.STOPPED
 
-    def _track_each(self, job: Job, checkpoint: Checkpoint) -> None:
+    def _track_each(self, driver: Driver, checkpoint: Checkpoint) -> None:
         slam = self.scene
         for frame in _timed(self.frames, slam.stopwatch):
             status = slam.process(frame)
-            job.progress.frame(status)
-            if job.observer is not None:
-                job.observer.frame(frame, status, slam)
-            if job.stop.requested:
+            driver.progress.frame(status)
+            if driver.observer is not None:
+                driver.observer.frame(frame, status, slam)
+            if driver.stop.requested:
                 return
             checkpoint.write_if_due()
 
-    def _finish(self, job: Job, ending: Ending) -> Ending:
+    def _finish(self, driver: Driver, outcome: Outcome) -> Outcome:
         """The final stages; where these or the frames were cut short, a map in little time."""
+        stop = driver.stop
         try:
-            if ending is Ending.FINISHED and job.stop.lets_finish(lambda: self._adjust(job)):
-                return ending
-            self.scene.refine(job.progress.stage, BRIEFLY)
+            if outcome is Outcome.FINISHED and stop.lets_finish(lambda: self._adjust(driver)):
+                return outcome
+            self.scene.refine(driver.progress.stage, BRIEFLY)
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
-            job.progress.write(
+            driver.progress.write(
                 "The GPU has no memory left for the final stages; keeping what there is."
             )
-        return Ending.STOPPED if ending is Ending.FINISHED else ending
+        return Outcome.STOPPED if outcome is Outcome.FINISHED else outcome
 
-    def _adjust(self, job: Job) -> None:
-        self.scene.adjust(job.report)
+    def _adjust(self, driver: Driver) -> None:
+        self.scene.adjust(driver.report)
         if self.scene.will_refine:
-            self._write_stage("adjusted", job)
-        self.scene.refine(job.report)
+            self._write_stage("adjusted", driver)
+        self.scene.refine(driver.report)
 
-    def _write_stage(self, name: Literal["online", "adjusted"], job: Job) -> None:
+    def _write_stage(self, name: Literal["online", "adjusted"], driver: Driver) -> None:
         """What there is by now, if it is asked for, and if there is a map."""
         if self.metadata.settings.online_results and not self.scene.world.maps_at_end:
-            write_stage(self.output, self.scene, job.progress, name)
+            write_stage(self.output, self.scene, driver.progress, name)
             self.stages.append(name)
 
 

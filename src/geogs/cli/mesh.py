@@ -12,7 +12,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse_options(RemeshSettings, argv, "mesh", _defaults)
 
     from geogs.application.results.remesh import remesh
-    from geogs.application.terminal import TerminalProgress
+    from geogs.application.terminal_progress import TerminalProgress
 
     with TerminalProgress() as progress:
         path = remesh(options, progress)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
-from geogs.application.settings import ReconstructSettings, Verbosity
+from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, reconstruct_preset

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from geogs.application.ros.settings import NodeSettings
+from geogs.application.ros.node_settings import NodeSettings
 from geogs.cli.options import parse_options
 
 

@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from geogs.application.settings import RunSettings, Verbosity
-from geogs.application.viewer.settings import HERE, LiveSettings
+from geogs.application.result_settings import HERE
+from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, preset
@@ -81,8 +81,8 @@ def _observer(options: LiveSettings) -> "RunObserver | None":
 
         several.append(Recorder(options.record))
     if options.viewer:
-        from geogs.application.viewer.live import LiveViewer
-        from geogs.application.viewer.window import Window
+        from geogs.application.viewer.browser_window import Window
+        from geogs.application.viewer.live_viewer import LiveViewer
 
         window = Window("geogs", HERE, options.viewer_port, with_disks=True)
         print(f"Open {window.address} in a browser to look on.", file=sys.stderr)

@@ -5,11 +5,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from geogs.application.settings import Verbosity
+from geogs.application.run_settings import Verbosity
 
 if TYPE_CHECKING:
-    from geogs.application.progress import RunProgress
     from geogs.application.results.result import Written
+    from geogs.application.run_progress import RunProgress
 
 
 NOT_JUDGED = (
@@ -22,7 +22,7 @@ NOT_JUDGED = (
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> "Written":
     """Do the work of a command, with a line of progress on the standard error, and say at its end
     on the standard output what came of it."""
-    from geogs.application.terminal import TerminalProgress
+    from geogs.application.terminal_progress import TerminalProgress
 
     begin = time.perf_counter()
     if options.verbose:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Sequence
 
-from geogs.application.viewer.settings import ViewSettings
+from geogs.application.result_settings import ViewSettings
 from geogs.cli.options import parse_options
 
 

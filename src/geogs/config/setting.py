@@ -118,6 +118,7 @@ Angle = Annotated[float, Range(0, 180)]
 Weight = Annotated[float, Range(0, 1e6)]
 Positive = Annotated[float, Range(above=0, most=1e6)]
 Count = Annotated[int, Range(1, 1_000_000)]
+Port = Annotated[int, Range(1, 65535)]
 CountOrZero = Annotated[int, Range(0, 1_000_000)]
 """0 does without."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from geogs.application.calibrate import with_shutter_found
 from geogs.application.results.summary import lost_spans
 from geogs.application.results.verdict import verdict
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.errors import TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source

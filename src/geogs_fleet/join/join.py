@@ -12,7 +12,7 @@ import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
 from geogs.application.results.output_folder import remove_previous_output
-from geogs.application.results.report import write_report
+from geogs.application.results.result_page import write_report
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import lost_spans
 from geogs.config import Config

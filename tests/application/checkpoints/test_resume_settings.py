@@ -8,7 +8,7 @@ import pytest
 from geogs.application.checkpoints import run_state
 from geogs.application.checkpoints.run_state import RunMetadata
 from geogs.application.run import continued
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.cli.run import parse
 from geogs.config import Config, InputConfig, MeshConfig
 from geogs.errors import InputError

@@ -6,7 +6,7 @@ import torch
 
 from box_room import box, circle
 from browser import open_tab
-from geogs.application.results.report import ShownView, first_view, shown_model
+from geogs.application.results.result_page import ShownView, first_view, shown_model
 from geogs.evaluation.model_view.shown_model import Colouring, Legend
 from geogs.evaluation.pages.run_page import write_run_page
 from geogs.geometry.camera import Camera

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.ros.messages import Messages
 from geogs.application.ros.node import CameraNode, run_node
-from geogs.application.ros.settings import NodeSettings
+from geogs.application.ros.node_settings import NodeSettings
+from geogs.application.ros.published_messages import Messages
 from geogs.errors import InputError
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.viewer.live import MOST_DISKS, LiveViewer
-from geogs.application.viewer.window import Window
+from geogs.application.viewer.browser_window import Window
+from geogs.application.viewer.live_viewer import MOST_DISKS, LiveViewer
 from geogs.geometry.camera import Camera
 from geogs.pose_estimate import PoseEstimate
 from geogs.types import Frame, MapSnapshot
@@ -110,7 +110,7 @@ def wait(viewer: LiveViewer) -> None:
 
 
 def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
-    monkeypatch.setattr("geogs.application.viewer.live._MAP_SECONDS", 1e6)
+    monkeypatch.setattr("geogs.application.viewer.live_viewer._MAP_SECONDS", 1e6)
     viewer, slam = LiveViewer(window, max_fraction=1.0), FakeSlam()
     look(viewer, slam)
     wait(viewer)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
+from geogs.documents import UNUSABLE
 from geogs.errors import InputError, OutputError
 from geogs.version import __version__
 from geogs.world.pack import pack, unpack
@@ -27,10 +28,6 @@ _UNFINISHED = ".manifest.json.part"
 _PLAIN_NAME = re.compile(r"[a-z0-9.][a-z0-9.-]*[a-z0-9]")
 _LARGEST_MANIFEST = 1 << 24
 """Bytes; it has about a hundred for every file."""
-_UNREADABLE = (
-    InputError, ValueError, LookupError, AttributeError, TypeError, RecursionError,
-)  # fmt: skip
-"""What a manifest that somebody made up may lead to."""
 _MODES = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}
 
 
@@ -91,7 +88,7 @@ class CheckpointFolder:
             given = json.loads(data)
             checksum = given.pop("checksum")
             manifest = unpack(Manifest, given, {}, {})
-        except _UNREADABLE as error:
+        except (InputError, *UNUSABLE) as error:
             raise InputError(f"{MANIFEST} is damaged, or none of geogs") from error
         if checksum != Sum.of(_json(pack(Manifest, manifest).values)).sha256:
             raise InputError(f"{MANIFEST} has changed")

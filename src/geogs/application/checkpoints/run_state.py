@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from geogs.application.checkpoints.checkpoint import SavedState
-from geogs.application.settings import RunSettings
+from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import ReadingPlace, Source

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.application.results.scene import MappedScene
+from geogs.application.results.mapped_scene import MappedScene
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_folder import (
     image_path,

@@ -3,11 +3,11 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
-from geogs.application.progress import RunProgress
 from geogs.application.result_settings import RemeshSettings
-from geogs.application.results.report import write_page_anew
+from geogs.application.results.result_page import write_page_anew
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views
+from geogs.application.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.config.old_names import present_values
 from geogs.documents import UNUSABLE, read_yaml

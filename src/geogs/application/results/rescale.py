@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from geogs.application.result_settings import RescaleSettings
-from geogs.application.results.report import write_page_anew
+from geogs.application.results.result_page import write_page_anew
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.scale.known_length import HOW, SensorScale, find_scale, scale_source
 from geogs.application.scale.measurable_scene import SeenKeyframe, measurable

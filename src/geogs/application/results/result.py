@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from geogs.application.progress import RunProgress
-from geogs.application.results.scene import MappedScene
+from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.verdict import Verdict, verdict
+from geogs.application.run_progress import RunProgress
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.mesh.triangle_mesh import Mesh

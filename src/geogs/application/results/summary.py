@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
+from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result
-from geogs.application.results.scene import MappedScene
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.stopwatch import Stopwatch

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.output_folder import remove_previous_output
-from geogs.application.results.report import write_report
 from geogs.application.results.result import Result
+from geogs.application.results.result_page import write_report
 from geogs.application.results.summary import summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import Config, ReconstructConfig

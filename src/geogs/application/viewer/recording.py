@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geogs.application.viewer.live import thinned
+from geogs.application.viewer.live_viewer import thinned
 from geogs.application.viewer.observer import RunObserver
 from geogs.errors import InputError, OutputError
 from geogs.types import Frame

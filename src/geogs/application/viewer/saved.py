@@ -4,9 +4,9 @@ import threading
 
 import numpy as np
 
-from geogs.application.results.report import first_view
+from geogs.application.results.result_page import first_view
 from geogs.application.results.saved_result import SavedResult
-from geogs.application.viewer.window import Window
+from geogs.application.viewer.browser_window import Window
 from geogs.errors import InputError
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 

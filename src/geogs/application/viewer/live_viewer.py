@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from geogs.application.viewer.browser_window import Window
 from geogs.application.viewer.observer import RunObserver
-from geogs.application.viewer.window import Window
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 from geogs.geometry.camera import Camera
 from geogs.types import Frame, MapSnapshot

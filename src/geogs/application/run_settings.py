@@ -8,7 +8,17 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from geogs.config import Config, MeshConfig, ReconstructConfig
-from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
+from geogs.config.setting import (
+    Basic,
+    Port,
+    Positional,
+    Positive,
+    Range,
+    Settings,
+    Time,
+    Unnamed,
+    Weight,
+)
 from geogs.documents import expanded
 from geogs.io.sources.address import live_address
 
@@ -77,8 +87,8 @@ class RunSettings(Settings):
 
         Two runs on the same kind of device that differ elsewhere compute the same.
         """
-        config = replace(self.absolute().config, mesh=MeshConfig())
-        return RunSettings(self.absolute().source, config, map=self.absolute().map)
+        own = self.absolute()
+        return RunSettings(own.source, replace(own.config, mesh=MeshConfig()), map=own.map)
 
 
 @dataclass(frozen=True)
@@ -114,6 +124,19 @@ class ReconstructSettings(Settings):
     none."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
+
+
+@dataclass(frozen=True)
+class LiveSettings(Settings):
+    """Settings of a viewer of a run."""
+
+    viewer: bool = False
+    """Show the run in the browser while it goes on; needs pip install 'geogs[viewer]'."""
+    viewer_port: Port = 8080
+    """Where that page is served, to this machine alone; if it is taken, the next that is free."""
+    record: Path | None = None
+    """Also record the run in this file, .rrd, for the rerun viewer; needs pip install
+    'geogs[record]'."""
 
 
 @dataclass(frozen=True)

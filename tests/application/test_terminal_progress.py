@@ -7,9 +7,9 @@ import re
 import pytest
 from rich.console import Console
 
-from geogs.application import terminal
-from geogs.application.settings import Verbosity
-from geogs.application.terminal import TerminalProgress
+from geogs.application import terminal_progress
+from geogs.application.run_settings import Verbosity
+from geogs.application.terminal_progress import TerminalProgress
 from geogs.errors import OutputError
 from geogs.pose_estimate import PoseEstimate
 from geogs.world.segments import TrackState
@@ -80,7 +80,7 @@ def test_a_terminal_shows_one_line_with_the_time_left(monkeypatch):
             file=shown, force_terminal=True, width=120, highlight=False, get_time=lambda: now[0]
         )
 
-    monkeypatch.setattr(terminal, "Console", console)
+    monkeypatch.setattr(terminal_progress, "Console", console)
     with TerminalProgress() as progress:
         progress.stage("depth", 0.9)
         for fraction in (0.0, 0.1, 0.3, 0.5):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.priors import open_prior
+from geogs.application.prior_choice import open_prior
 from geogs.config import PriorConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
