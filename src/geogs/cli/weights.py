@@ -8,6 +8,15 @@ from typing import Annotated, Literal
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional
 from geogs.errors import InputError
+from geogs.networks.weights_files import (
+    CATALOGUE,
+    KnownWeights,
+    checksum,
+    known_as,
+    locate,
+    require_intact,
+    weights_folders,
+)
 
 
 @dataclass(frozen=True)
@@ -28,8 +37,6 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns 0, or raises InputError for a file that cannot be used."""
     options = parse_options(WeightsOptions, argv, "weights")
 
-    from geogs.application.machine.weights import listing, verification
-
     if options.action == "list":
         if options.file is not None:
             raise InputError(
@@ -41,3 +48,56 @@ def main(argv: Sequence[str]) -> int:
             raise InputError("geogs weights verify needs a file.")
         print(verification(options.file))
     return 0
+
+
+def listing() -> str:
+    """What is known of every file, and where those are that were found."""
+
+    def entry(known: KnownWeights) -> list[str]:
+        path = locate(known)
+        state = "not here" if path is None else f"{path} ({checksum(path).verdict})"
+        return [
+            f"  {known.name}",
+            f"      {known.what}",
+            f"      file     {state}",
+            f"      from     {known.origin}",
+            f"      licence  {known.licence}",
+        ]
+
+    lines = ["looked for in " + ", ".join(map(str, weights_folders()))]
+    titles = {
+        "own": "--tracking.operator own",
+        "droid": "--tracking.operator droid",
+        "depth": "--mapping.depth.engine network",
+        "prior": "monocular priors",
+    }
+    for purpose, title in titles.items():
+        lines += ["", title]
+        for known in CATALOGUE:
+            if known.purpose == purpose:
+                lines += entry(known)
+    return "\n".join(lines)
+
+
+def verification(path: Path) -> str:
+    """What a file holds, and whether it is the published one of its name.
+
+    Raises InputError if it is missing, damaged or another.
+    """
+    found = require_intact(path)
+    known = known_as(path.name)
+    lines = [
+        f"file     {path}, {path.stat().st_size / 2**20:.1f} MiB",
+        f"sha256   {found.actual}",
+        f"known    {f'{known.name}, {known.what}' if known else 'no file of this name is known'}",
+        f"verdict  {found.verdict}",
+    ]
+    if path.suffix != ".onnx":
+        from geogs.networks.tensor_files import read_tensors  # loads PyTorch
+
+        tensors = read_tensors(path)
+        numbers = sum(t.numel() for t in tensors.values())
+        lines.append(
+            f"content  {len(tensors)} tensors, {numbers:,} numbers, read without running code"
+        )
+    return "\n".join(lines)

@@ -87,7 +87,7 @@ class CheckpointFolder:
         try:
             given = json.loads(data)
             checksum = given.pop("checksum")
-            manifest = unpack(Manifest, given, {}, {})
+            manifest: Manifest = unpack(Manifest, given, {}, {})
         except (InputError, *UNUSABLE) as error:
             raise InputError(f"{MANIFEST} is damaged, or none of geogs") from error
         if checksum != Sum.of(_json(pack(Manifest, manifest).values)).sha256:

@@ -38,4 +38,5 @@ def read_work(output: Path, made_from: str) -> ReconstructionTable:
     with saved.in_a_sentence():
         if saved.plain("made_from") != made_from:
             raise InputError("it was made with other settings or images; give the same ones")
-    return saved.work("work")
+    work: ReconstructionTable = saved.work("work")
+    return work

@@ -1,1 +1,1 @@
-"""The machine: what a run computes on, whether it works, which weights are there."""
+"""The machine: what a run computes on, and whether it works."""

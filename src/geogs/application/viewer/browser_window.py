@@ -70,7 +70,8 @@ class Window:
     @property
     def layer(self) -> Layer:
         """The layer that was asked for."""
-        return self._layer.value
+        layer: Layer = self._layer.value
+        return layer
 
     def on_layer(self, act: Callable[[], None]) -> None:
         """Do something whenever another layer is asked for."""
