@@ -1,8 +1,10 @@
 """What a command says: one line on a terminal, lines of text without, and a log."""
 
 import io
+import logging
 import os
 import re
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -70,6 +72,13 @@ def test_log_holds_everything_with_the_time_of_day(capsys, tmp_path):
 def test_a_log_that_cannot_be_written_is_a_sentence(tmp_path):
     with pytest.raises(OutputError, match="cannot be written"):
         TerminalProgress(Verbosity(log=tmp_path)).__enter__()
+
+
+def test_a_log_on_a_full_disk_ends_nothing(capsys, monkeypatch):
+    monkeypatch.setattr(logging, "raiseExceptions", False)  # as the command has it
+    with TerminalProgress(Verbosity(quiet=True, log=Path("/dev/full"))) as progress:
+        a_run(progress)
+    assert capsys.readouterr().err == "warning: too dark.\n"
 
 
 def test_a_terminal_shows_one_line_with_the_time_left(monkeypatch):

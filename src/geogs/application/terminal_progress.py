@@ -3,10 +3,10 @@
 import logging
 import math
 import time
-from datetime import datetime
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -38,14 +38,13 @@ class TerminalProgress(RunProgress):
 
     def __init__(self, verbosity: Verbosity | None = None) -> None:
         self._verbosity = verbosity or Verbosity()
-        self._console = Console(stderr=True, quiet=self._verbosity.quiet, highlight=False)
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.fields[percent]:>4}"),
             TextColumn("{task.fields[info]}"),
             TextColumn("{task.fields[left]}", style="cyan"),
-            console=self._console,
+            console=Console(stderr=True, quiet=self._verbosity.quiet, highlight=False),
             refresh_per_second=_REDRAWS,
             speed_estimate_period=_PACE_SECONDS,
             transient=True,
@@ -55,19 +54,14 @@ class TerminalProgress(RunProgress):
         self._printed = self._phase_began = time.perf_counter()
         self._phase = self._stage = self._last = ""
         self._memory, self._measured = "", -math.inf
-        self._log: TextIO | None = None
-        self._handler: logging.Handler | None = None
+        self._log: logging.Handler | None = None
 
     def __enter__(self) -> "TerminalProgress":
         if self._verbosity.log is not None:
             self._log = _opened(self._verbosity.log)
-            self._handler = logging.StreamHandler(self._log)
-            self._handler.setLevel(logging.INFO)
-            form = logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S")
-            self._handler.setFormatter(form)
-            log = logging.getLogger("geogs")
-            log.addHandler(self._handler)
-            log.setLevel(min(log.level or logging.INFO, logging.INFO))
+            logger = logging.getLogger("geogs")
+            logger.addHandler(self._log)
+            logger.setLevel(min(logger.level or logging.INFO, logging.INFO))
         return self
 
     def __exit__(
@@ -81,10 +75,10 @@ class TerminalProgress(RunProgress):
             self._bar.stop()
         if error is not None:
             self.note(f"ended by {kind.__name__ if kind else ''}: {error}")
-        if self._handler is not None:
-            logging.getLogger("geogs").removeHandler(self._handler)
         if self._log is not None:
-            self._log.close()
+            logging.getLogger("geogs").removeHandler(self._log)
+            with suppress(OSError):  # the disk is full
+                self._log.close()
 
     def write(self, text: str) -> None:
         """A line above the other, if there is something to say; warnings with ``-q``, too."""
@@ -141,7 +135,7 @@ class TerminalProgress(RunProgress):
         text = f"{self._phase}: {duration(seconds)}{self._last}"
         self._phase = self._last = ""
         self.note(text)
-        if not self._console.is_terminal or self._verbosity.verbose:
+        if not self._bar.console.is_terminal or self._verbosity.verbose:
             self._bar.console.print(text, soft_wrap=True, markup=False)
 
     def _show(self, stage: str, what: str, info: str, done: float | None) -> None:
@@ -161,7 +155,7 @@ class TerminalProgress(RunProgress):
         self._bar.update(
             self._task, description=f"{what:<20}", percent=percent, info=info, left=ahead
         )
-        if self._console.is_terminal and not self._bar.live.is_started:
+        if self._bar.console.is_terminal and not self._bar.live.is_started:
             self._bar.start()
         every = _VERBOSE_SECONDS if self._verbosity.verbose else _LOG_SECONDS
         if now - self._printed < every:
@@ -169,21 +163,23 @@ class TerminalProgress(RunProgress):
         self._printed = now
         text = "  ".join(filter(None, (what, percent, info, ahead)))
         self.note(text)
-        if not self._console.is_terminal:
-            self._console.print(text, soft_wrap=True, markup=False)
+        if not self._bar.console.is_terminal:
+            self._bar.console.print(text, soft_wrap=True, markup=False)
 
     def note(self, text: str) -> None:
         """Lines for the log alone, if there is one."""
         if self._log is not None:
             for line in text.splitlines():
-                self._log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {line}\n")
-            self._log.flush()
+                self._log.handle(logging.makeLogRecord({"msg": line}))
 
 
-def _opened(path: Path) -> TextIO:
+def _opened(path: Path) -> logging.Handler:
     """A log to add to. Raises OutputError if it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return path.open("a", encoding="utf-8")
+        log = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path} cannot be written ({error.strerror}).") from None
+    log.setLevel(logging.INFO)
+    log.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S"))
+    return log

@@ -31,7 +31,11 @@ def take_over() -> None:
 
 
 def show_warnings() -> None:
-    """Let the library's warnings appear on the standard error, one line each."""
+    """Let the library's warnings appear on the standard error, one line each.
+
+    A log that can no longer be written, as on a full disk, ends nothing and says nothing.
+    """
+    logging.raiseExceptions = False
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("warning: %(message)s"))
     handler.setLevel(logging.WARNING)
