@@ -37,21 +37,21 @@ def test_scale_is_that_of_most_motions(wrong):
     assert vote.scale == pytest.approx(2.3, rel=0.005)
     assert abs(vote.scale / 2.3 - 1) < 4 * vote.deviation
     assert vote.deviation < 0.01
-    assert vote.share > (0.95 if wrong == 0 else 0.45)
+    assert vote.fraction > (0.95 if wrong == 0 else 0.45)
 
 
 def test_long_paths_try_some_scales_alone():
     path = sideways(600, 0.08)
     vote = vote_on_scale(seen(path, 2.3), told(path, seed=2, wrong=0.3), CONFIG)
     assert vote.scale == pytest.approx(2.3, rel=0.002)
-    assert vote.share > 0.35
+    assert vote.fraction > 0.35
 
 
 def test_poses_of_another_video_do_not_fit():
     path = sideways(30, 0.08)
     other = [pose(0.05 * np.cos(0.4 * k), 0.02 * k, 0.06 * k, 0.09 * k) for k in range(30)]
     vote = vote_on_scale(seen(path, 2.3), told(other), CONFIG)
-    assert vote.share < 0.2
+    assert vote.fraction < 0.2
 
 
 def test_a_camera_that_stays_tells_no_scale():

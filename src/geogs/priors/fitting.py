@@ -4,16 +4,21 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.priors.card import PriorCard, Resize
+from geogs.priors.base import DepthKind, PriorMaps
+from geogs.priors.card import PriorCard
 
 _INTERPOLATION = {
     "linear": cv2.INTER_LINEAR,
     "cubic": cv2.INTER_CUBIC,
     "area": cv2.INTER_AREA,
 }
+MIN_NORMAL = 0.2
+"""Shorter normals than this mean that the network does not know."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +75,58 @@ def fit_image(image: UInt8[np.ndarray, "h w 3"], card: PriorCard) -> FittedImage
     return FittedImage(pixels, (height, width), inner, top, left)
 
 
+def prior_maps(
+    depth: np.ndarray | None, normal: np.ndarray | None, fitted: FittedImage, card: PriorCard
+) -> PriorMaps:
+    """A network's outputs as depth and normals at the size of the image, on the CPU.
+
+    Raises InputError where one does not have the shape that it must.
+    """
+    return PriorMaps(
+        card.kind or DepthKind.SCALE_FREE,
+        None if depth is None else torch.from_numpy(_depth_map(depth, fitted, card)),
+        None if normal is None else torch.from_numpy(_normal_map(normal, fitted, card)),
+    )
+
+
+def _depth_map(
+    output: np.ndarray, fitted: FittedImage, card: PriorCard
+) -> Float[np.ndarray, "h w"]:
+    """A network's depth, (1, 1, h, w) or fewer leading ones, at the size of the image."""
+    values = np.asarray(output, np.float32)
+    if values.ndim < 2 or values.size != values.shape[-1] * values.shape[-2]:
+        raise InputError(f"Depth of {card.name} has shape {values.shape}, not (1, 1, h, w).")
+    values = values.reshape(values.shape[-2:])
+    if card.depth_range:
+        values = values.clip(card.depth_range[0], card.depth_range[1])
+    return fitted.back(values)
+
+
+def _normal_map(
+    output: np.ndarray, fitted: FittedImage, card: PriorCard
+) -> Float[np.ndarray, "h w 3"]:
+    """A network's normals, (1, 3 or more, h, w), in our axes and of unit length; zero if short."""
+    values = np.asarray(output, np.float32)
+    if values.ndim != 4 or values.shape[0] != 1 or values.shape[1] < 3:
+        raise InputError(f"Normals of {card.name} have shape {values.shape}, not (1, 3, h, w).")
+    scaled = card.normal_scale * values[0, :3] + card.normal_offset
+    scaled = scaled.transpose(1, 2, 0) * np.array(card.axes, np.float32)
+    normal = fitted.back(np.ascontiguousarray(scaled, np.float32))
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.where(length < MIN_NORMAL, 0, normal / np.maximum(length, 1e-6)).astype(np.float32)
+
+
 def _sizes(height: int, width: int, card: PriorCard) -> tuple[tuple[int, int], tuple[int, int]]:
     """Height and width of the image within the network's, and those of the latter."""
-    if card.resize is Resize.STRETCH:
+    if card.resize == "stretch":
         inner = outer = (card.height, card.width)
-    elif card.resize is Resize.AT_LEAST:
+    elif card.resize == "at_least":
         scale = max(card.height / height, card.width / width)
         inner = outer = (
             _multiple_at_least(height * scale, card.height, card.multiple),
             _multiple_at_least(width * scale, card.width, card.multiple),
         )
-    elif card.resize is Resize.PAD:
+    elif card.resize == "pad":
         scale = min(card.height / height, card.width / width)
         inner = (max(int(height * scale), 1), max(int(width * scale), 1))
         outer = (card.height, card.width)

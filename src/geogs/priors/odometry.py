@@ -32,8 +32,8 @@ class ScaleVote:
     """Which motions fit at that scale."""
 
     @property
-    def share(self) -> float:
-        """Of the motions, those that fit."""
+    def fraction(self) -> float:
+        """Fraction of the motions that fit."""
         return float(self.fits.double().mean()) if len(self.fits) else 0.0
 
 

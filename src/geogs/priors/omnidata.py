@@ -9,11 +9,10 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.priors.base import DepthKind, PriorMaps
+from geogs.priors.base import PriorMaps
 from geogs.priors.card import PriorCard
 from geogs.priors.dpt import MULTIPLE, DptHybrid
-from geogs.priors.fitting import fit_image
-from geogs.priors.outputs import depth_map, normal_map
+from geogs.priors.fitting import fit_image, prior_maps
 
 PREFIX = "model."
 """Before every name of the checkpoints, which hold more than the network."""
@@ -41,10 +40,8 @@ class OmnidataPrior:
         """Depth or normals at the size of the image, on the CPU."""
         fitted = fit_image(image, self.card)
         output = self.network(torch.from_numpy(fitted.pixels).to(self.device)).cpu().numpy()
-        if self.card.axes is not None:
-            return PriorMaps(normal=torch.from_numpy(normal_map(output, fitted, self.card)))
-        depth = torch.from_numpy(depth_map(output, fitted, self.card))
-        return PriorMaps(self.card.depth_kind or DepthKind.AFFINE_DEPTH, depth)
+        both = (output, None) if self.card.axes is None else (None, output)
+        return prior_maps(*both, fitted, self.card)
 
 
 def load_checkpoint(network: DptHybrid, path: Path) -> None:

@@ -10,10 +10,9 @@ from jaxtyping import UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.priors.base import DepthKind, PriorMaps
+from geogs.priors.base import PriorMaps
 from geogs.priors.card import PriorCard
-from geogs.priors.fitting import fit_image
-from geogs.priors.outputs import depth_map, normal_map
+from geogs.priors.fitting import fit_image, prior_maps
 from geogs.threads import worker_count
 
 MISSING = "Monocular networks in ONNX files need onnxruntime: pip install 'geogs[priors]'."
@@ -39,8 +38,11 @@ class OnnxPrior:
         outputs = [o.name for o in self._session.get_outputs()]
         named = [n for n in (card.depth_output, card.normal_output) if n]
         free = [n for n in outputs if n not in named]
-        self._depth = card.depth_kind and (card.depth_output or _only(free, "depth_output", model))
-        self._normal = card.axes and (card.normal_output or _only(free, "normal_output", model))
+        self._depth = self._normal = ""
+        if card.depth_kind is not None:
+            self._depth = card.depth_output or _only(free, "depth_output", model)
+        if card.axes is not None:
+            self._normal = card.normal_output or _only(free, "normal_output", model)
         _require(inputs, [self._image, card.camera_input], "input", model)
         _require(outputs, [self._depth, self._normal], "output", model)
 
@@ -57,12 +59,7 @@ class OnnxPrior:
             raise InputError(
                 f"The monocular network {self.card.name} fails{_said(error)}."
             ) from error
-        depth = normal = None
-        if self._depth:
-            depth = torch.from_numpy(depth_map(found[self._depth], fitted, self.card))
-        if self._normal:
-            normal = torch.from_numpy(normal_map(found[self._normal], fitted, self.card))
-        return PriorMaps(self.card.depth_kind or DepthKind.SCALE_FREE, depth, normal)
+        return prior_maps(found.get(self._depth), found.get(self._normal), fitted, self.card)
 
 
 def _open(model: Path, device: torch.device) -> Any:
@@ -97,7 +94,7 @@ def _only(names: Sequence[str], setting: str, model: Path) -> str:
     raise InputError(f"{model} leaves open which is the {setting} of its card: {listed}.")
 
 
-def _require(there: Sequence[str], names: Sequence[str | None], what: str, model: Path) -> None:
+def _require(there: Sequence[str], names: Sequence[str], what: str, model: Path) -> None:
     missing = [n for n in names if n and n not in there]
     if missing:
         raise InputError(

@@ -72,7 +72,7 @@ class Odometry:
         """How far all motions fit, at the present poses."""
         vote = self._vote(self.keyframes.ids)
         return OdometryAgreement(
-            len(vote.fits), vote.share, vote.deviation, self.found.scale is not None
+            len(vote.fits), vote.fraction, vote.deviation, self.found.scale is not None
         )
 
     def between(self, ids: Sequence[int]) -> MeasuredMotions | None:
@@ -114,7 +114,7 @@ class Odometry:
         return vote_on_scale(torch.stack(seen), torch.stack(measured), self.config)
 
     def _take(self, vote: ScaleVote) -> None:
-        enough = int(vote.fits.sum()) >= MIN_MOTIONS and vote.share >= MIN_AGREEMENT
+        enough = int(vote.fits.sum()) >= MIN_MOTIONS and vote.fraction >= MIN_AGREEMENT
         if enough and vote.deviation <= MAX_DEVIATION:
             self.found.scale, self.found.deviation = vote.scale, vote.deviation
 
