@@ -29,6 +29,7 @@ from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense_check import dense_check
 from geogs.loop.detect import LoopDetector
+from geogs.loop.features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.classical_flow import ClassicalFlow
@@ -155,7 +156,7 @@ def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int
     reasons: Counter[str] = Counter()
     queries = alike = 0
     for k in store.ids:
-        features[k] = clock("extract", lambda k=k: index.describe(store[k].image))
+        features[k] = clock("extract", lambda k=k: orb_features(store[k].image))
         old = [i for i in store.ids if i < k - gap]
         exclude = set(store.ids) - set(old)
         found = clock("query", lambda k=k, e=exclude: index.query(features[k], e))
@@ -239,10 +240,10 @@ def together(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int
     )
     for k in store.ids:
         clock("update", lambda k=k: detector.update([k], is_last=True))
-    right = [truth.right(o.first, o.second, o.T_ji) for o in detector.loops]
-    closed = {o.second for o, ok in zip(detector.loops, right, strict=True) if ok}
+    right = [truth.right(o.first, o.second, o.T_ji) for o in detector.table.loops]
+    closed = {o.second for o, ok in zip(detector.table.loops, right, strict=True) if ok}
     can = {k for k in store.ids for i in store.ids if i < k - gap and truth.overlap[i, k] > OVERLAP}
-    looks = sum(o.cause == "appearance" for o in detector.loops)
+    looks = sum(o.cause == "appearance" for o in detector.table.loops)
     print(
         f"  detector: {len(right)} loops ({looks} by looks), precision "
         f"{np.mean(right) if right else 1.0:.3f}, {len(closed & can)} of {len(can)} keyframes that "

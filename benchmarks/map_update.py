@@ -45,7 +45,7 @@ from geogs.geometry.lie import (
 )
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
-from geogs.loop.closure import close_loops
+from geogs.loop.closure import ClosingQuestion, close_loops
 from geogs.mapping.map_update import MapUpdate, covisible_keyframe, plan_update
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
@@ -190,7 +190,7 @@ def close(walk: Walk) -> PoseCorrection:
         1 / deviation.square(),
         torch.arange(len(G)) >= len(i),
     )
-    closure = close_loops(list(range(KEYFRAMES)), T, relative)
+    closure = close_loops(ClosingQuestion(range(KEYFRAMES), T, relative))
     assert closure is not None, "no loop was believed"
     return closure.correction
 

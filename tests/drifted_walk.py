@@ -73,6 +73,7 @@ def closer_of(tracker: Tracker, loop: Loop, config: LoopConfig, waits: bool = Tr
     segments = Segments(table, keyframes, tracker.map.operator, Config())
     segments.main.map.graph.retire = lambda keep, least: {}
     closer = LoopCloser(segments, config, waits)
-    closer.detector = SimpleNamespace(loops=(loop,), update=lambda ids, is_last: ())
+    closer.table.loops.append(loop)
+    closer.detector = SimpleNamespace(update=lambda ids, is_last: ())
     closer._take(loop)
     return closer

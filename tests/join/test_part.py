@@ -6,7 +6,7 @@ import pytest
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.loop.features import FeatureExtractor
+from geogs.loop.features import orb_features
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features
 from geogs_fleet.join.links import candidates
@@ -39,7 +39,7 @@ def test_a_part_is_described_by_the_depths_that_its_map_shows(tmp_path):
         assert known.mean() > 0.8
         ratio = views.inverse_depth[n] * depth[y.numpy(), x.numpy()]
         assert np.median(np.abs(ratio[known] - 1)) < 0.01
-    features = FeatureExtractor()(image(pose(0.0), walls(0)))
+    features = orb_features(image(pose(0.0), walls(0)))
     assert len(views.features[0]) == pytest.approx(len(features), rel=0.2)  # JPEG
     assert views.features[1].descriptors.shape == (len(views.features[1]), 32)
     assert views.outline().median_depth == pytest.approx(views.median_depth)

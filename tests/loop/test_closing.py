@@ -7,7 +7,7 @@ import torch
 from drifted_walk import NOTHING, closer_of, true_pose, world
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp
-from geogs.loop.closing import brought_forward
+from geogs.loop.closure import brought_forward
 from geogs.types import PoseCorrection
 from keyframe_samples import Sample, add
 

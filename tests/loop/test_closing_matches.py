@@ -5,7 +5,8 @@ import torch
 from drifted_walk import CAMERA, COUNT, NOTHING, closer_of, true_pose, world
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.loop.closing_matches import closing_matches, take_over_depths
+from geogs.loop.closure import take_over_depths
+from geogs.loop.constraints import closing_matches
 from geogs.types import FlowMatch
 from geogs.world.edges import MeasuredEdge
 from geogs.world.loops import Loop

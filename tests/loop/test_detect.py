@@ -1,6 +1,7 @@
 """Loops are verified by features, depth and flow; look-alikes of another shape are refused."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop import detect, search
 from geogs.loop.dense_check import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.loop.features import FeatureExtractor
+from geogs.loop.features import orb_features
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import Features
@@ -63,8 +64,7 @@ def _scale_depth(store: KeyframeSet, id: int, factor: float) -> None:
 
 
 def _views_of(store: KeyframeSet, *ids: int) -> list[DepthView]:
-    extract = FeatureExtractor()
-    return [_depth_view(store, k, extract(store[k].image)) for k in ids]
+    return [_depth_view(store, k, orb_features(store[k].image)) for k in ids]
 
 
 def _depth_view(store: KeyframeSet, id: int, features: Features) -> DepthView:
@@ -150,10 +150,10 @@ def test_looks_close_a_loop_that_drift_hides(walk, monkeypatch):
             assert float((loop.T_ji - true[loop.second])[:3, 3].norm()) < 0.01
 
 
-def test_poses_close_a_loop_without_features(walk):
+def test_poses_close_a_loop_without_features(walk, monkeypatch):
     store, operator = walk
     detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
-    detector._search.index._extract.count = 8
+    monkeypatch.setattr(search, "orb_features", partial(orb_features, most=8))
     loops = detector.update(store.ids, is_last=True)
     assert loops
     assert all(loop.cause == "geometry" and loop.inliers == 0 for loop in loops)
@@ -168,7 +168,7 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk, monkeypatch):
     _scale_depth(store, LAP, 1.2)
     detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     detector.update(store.ids[: LAP + 1], is_last=True)
-    loop = next(x for x in detector.loops if x.second == LAP)
+    loop = next(x for x in detector.table.loops if x.second == LAP)
     assert loop.scale == pytest.approx(1.2, rel=0.02)
     # The points before the first camera lie at 1.2 times their depth before the second.
     there = loop.S_ji[:3, :3] @ torch.tensor([0.0, 0, 2], dtype=torch.float64) + loop.S_ji[:3, 3]
@@ -181,7 +181,7 @@ def test_close_pairs_suppress_each_other(walk):
     store, operator = walk
     detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     detector.update(store.ids, is_last=True)
-    pairs = [(loop.first, loop.second) for loop in detector.loops]
+    pairs = [(loop.first, loop.second) for loop in detector.table.loops]
     assert pairs
     for n, (a, b) in enumerate(pairs):
         assert b - a > 10

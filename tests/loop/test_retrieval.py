@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geogs.loop.features import FeatureExtractor
+from geogs.loop.features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
 from lit_rooms import lit_room
 from loop_scenes import orbit, room_views
@@ -28,13 +28,12 @@ def index(lap: list[np.ndarray]) -> AppearanceIndex:
     """All of the lap."""
     index = AppearanceIndex()
     for n, image in enumerate(lap):
-        index.add(100 + n, image)
+        index.add(100 + n, orb_features(image))
     return index
 
 
 def test_features_are_spread_and_strongest_first(lap):
-    extract = FeatureExtractor(count=240)
-    features = extract(lap[0])
+    features = orb_features(lap[0], most=240)
     assert len(features) == len(features.descriptors) <= 240
     cells = (features.pixels // [48, 48]).astype(int) @ [1, 8]
     # The first of every cell come before the second of any.
@@ -43,18 +42,18 @@ def test_features_are_spread_and_strongest_first(lap):
 
 def test_finds_the_place_that_is_seen_again(index, again):
     for n, image in enumerate(again):
-        found = index.query(image, count=3)
+        found = index.query(orb_features(image), count=3)
         assert found[0].keyframe == 100 + 5 * n
 
 
 def test_excluded_keyframes_are_never_returned(index, again):
-    found = index.query(again[0], exclude={100, 101}, count=50)
+    found = index.query(orb_features(again[0]), exclude={100, 101}, count=50)
     assert found
     assert not {100, 101} & {c.keyframe for c in found}
 
 
 def test_an_image_is_most_like_itself(index, lap):
-    best = index.query(lap[7], count=1)[0]
+    best = index.query(orb_features(lap[7]), count=1)[0]
     assert best.keyframe == 107
     assert best.score > 0.9
 
@@ -63,15 +62,15 @@ def test_an_image_is_most_like_itself(index, lap):
 def test_exposure_does_not_matter(index, again, gain):
     for n, image in enumerate(again):
         exposed = np.clip(gain * image.astype(float), 0, 255).astype(np.uint8)
-        best = {c.keyframe for c in index.query(exposed, count=2)}
+        best = {c.keyframe for c in index.query(orb_features(exposed), count=2)}
         assert 100 + 5 * n in best
 
 
 @pytest.mark.long
 def test_other_rooms_score_far_less(index, again):
-    here = min(index.query(image, count=1)[0].score for image in again)
+    here = min(index.query(orb_features(image), count=1)[0].score for image in again)
     for view in room_views(5, orbit(lit_room(5).scene, 4)):
-        there = index.query(view.image, count=1)
+        there = index.query(orb_features(view.image), count=1)
         assert not there or there[0].score < 0.3 * here
 
 
@@ -79,34 +78,34 @@ def test_same_order_gives_same_scores(lap, again):
     def run() -> list[tuple[int, float]]:
         index = AppearanceIndex()
         for n, image in enumerate(lap):
-            index.add(n, image)
-        return [(c.keyframe, c.score) for image in again for c in index.query(image)]
+            index.add(n, orb_features(image))
+        return [(c.keyframe, c.score) for image in again for c in index.query(orb_features(image))]
 
     assert run() == run()
 
 
 def test_featureless_images_find_nothing(lap):
     index = AppearanceIndex()
-    grey = np.full_like(lap[0], 90)
+    grey = orb_features(np.full_like(lap[0], 90))
     assert index.query(grey) == []
     index.add(0, grey)
-    index.add(1, lap[0])
+    index.add(1, orb_features(lap[0]))
     assert index.query(grey) == []
-    assert index.query(lap[1], exclude={1}) == []
+    assert index.query(orb_features(lap[1]), exclude={1}) == []
     assert len(index) == 2
 
 
 def test_a_full_vocabulary_still_finds_places(lap, again):
     index = AppearanceIndex(most_words=2500)
     for n, image in enumerate(lap):
-        index.add(n, image)
-    hits = [index.query(image, count=3) for image in again]
+        index.add(n, orb_features(image))
+    hits = [index.query(orb_features(image), count=3) for image in again]
     assert all(5 * n in {c.keyframe for c in found} for n, found in enumerate(hits))
 
 
 def test_scores_are_those_of_comparing_word_by_word(index, lap, again):
     """Shared mass of words, each as often as it is in both, over the image's own mass."""
-    features = index.describe(again[0])
+    features = orb_features(again[0])
     words, distance = index._nearest(features)
     known = words[distance <= index._radius].tolist()
     rows = len(index)

@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import retract, sim3_inverse, sim3_log
-from geogs.loop.matched_edges import MatchedEdges, MatchOptions
+from geogs.loop import matched_edges
+from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import PoseGraph
 from geogs.world.loops import RelativePoses
 
@@ -40,7 +41,7 @@ def match_residuals(
 
 
 def gauss_newton_step(
-    graph: PoseGraph, options: MatchOptions, damping: float
+    graph: PoseGraph, damping: float
 ) -> tuple[Float[Tensor, "n 7"], Float[Tensor, "n p"]]:
     """The first step of a graph without loops, from the full normal equations.
 
@@ -57,7 +58,8 @@ def gauss_newton_step(
     r = match_residuals(m, S, *zero)
     w = m.weight.double()
     norm = (w * r * r).sum(-1, keepdim=True).sqrt()
-    w = (options.factor * w * (options.huber / norm.clamp(min=options.huber))).reshape(-1, 1)
+    huber = matched_edges.HUBER
+    w = (matched_edges.FACTOR * w * (huber / norm.clamp(min=huber))).reshape(-1, 1)
     free = (~graph.fixed).repeat_interleave(7)
     seen = torch.zeros(n, dtype=torch.bool).index_fill_(0, m.source, True).repeat_interleave(p)
     Je, Jx, Jd = (
@@ -68,7 +70,8 @@ def gauss_newton_step(
     r, W = r.reshape(-1), W.reshape(-1, 1)
     H = Je.mT @ (W * Je) + Jx.mT @ (w * Jx)
     E, C = Jx.mT @ (w * Jd), (Jd.mT @ (w * Jd)).diagonal()
-    C = C * (1 + damping) + options.depth_damping * C.reshape(-1, p).mean(1).repeat_interleave(p)
+    own = C.reshape(-1, p).mean(1).repeat_interleave(p)
+    C = C * (1 + damping) + matched_edges.DEPTH_DAMPING * own
     C = torch.diag(C + 1e-12)
     reduced = H - E @ torch.linalg.inv(C) @ E.mT
     H = H + torch.diag(damping * reduced.diagonal())

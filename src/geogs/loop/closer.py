@@ -11,13 +11,18 @@ from torch import Tensor
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_scale
-from geogs.loop.closing import ClosingQuestion, brought_forward
-from geogs.loop.closing_matches import closing_matches, take_over_depths
-from geogs.loop.closure import LoopClosure
+from geogs.loop.closure import (
+    ClosingQuestion,
+    LoopClosure,
+    brought_forward,
+    close_loops,
+    take_over_depths,
+)
 from geogs.loop.constraints import (
     AGREEING_LOOPS,
     JOIN_TOLERANCE,
     between_positions,
+    closing_matches,
     disagreement,
     joined,
     of_edges,
@@ -245,9 +250,9 @@ class LoopCloser:
         if question is None:
             return
         if self._thread is None or is_last:
-            self._correct(question, question.answer())
+            self._correct(question, close_loops(question))
         else:
-            answer = self._thread.submit(question.answer)
+            answer = self._thread.submit(close_loops, question)
             self._asked = _Asked(question, answer, world, self._age)
 
     def _question(self, known: SegmentConstraints) -> ClosingQuestion | None:
@@ -263,11 +268,15 @@ class LoopCloser:
             return None
         matches = None
         if config.matches:
-            matches = closing_matches(keyframes, edges, self.detector.loops)
-        depths = {k: keyframes[k].inverse_depth for k in ids}
-        held = max(len(world.segment.fixed), 1)
+            matches = closing_matches(keyframes, edges, self.table.loops)
         return ClosingQuestion(
-            ids, keyframes.poses(ids), depths, relative, matches, held, world.segment.is_metric
+            ids,
+            keyframes.poses(ids),
+            relative,
+            matches,
+            max(len(world.segment.fixed), 1),
+            world.segment.is_metric,
+            {k: keyframes[k].inverse_depth for k in ids},
         )
 
     def _take_answer(self) -> None:
@@ -297,7 +306,7 @@ class LoopCloser:
                 if k in keyframes and keyframes[k].inverse_depth is question.inverse_depths[k]
             }
             fixed = set(world.segment.fixed)
-            edges = {e: v for e, v in world.map.graph.edges.items() if e[0] not in fixed}
+            edges = [e for e in world.map.graph.edges if e[0] not in fixed]
             take_over_depths(keyframes, edges, same)
         keyframes.correct(correction)
         _rescale(self._of(world), correction)

@@ -17,23 +17,15 @@ from torch import Tensor
 
 from geogs.errors import GeogsError
 from geogs.geometry.lie import se3_inverse, sim3_adjoint, sim3_inverse, sim3_log
+from geogs.loop.pose_graph import DRIFT
 from geogs.world.loops import RelativePoses
 
-
-@dataclass(frozen=True)
-class ConsistencyOptions:
-    """When loops agree."""
-
-    threshold: float = 35.3
-    """Squared error, in squared standard deviations, up to which two loops agree; exceeded once in
-    100 000 times by chi^2 with seven degrees of freedom, as many loops have very many pairs."""
-    drift: float = 9.0
-    """Factor of the odometry's covariance, as in the adjustment."""
-    bias: float = 0.5
-    """Part of a step's deviation that may be the same at every step of the camera, as a drift in
-    scale is; it adds up along a chain, where the rest partly cancels."""
-    support: int = 1
-    """Pairs of keyframes that have to agree before any loop is believed."""
+AGREEMENT = 35.3
+"""Squared error, in squared standard deviations, up to which two loops agree; exceeded once in
+100 000 times by chi^2 with seven degrees of freedom, as many loops have very many pairs."""
+BIAS = 0.5
+"""Part of a step's deviation that may be the same at every step of the camera, as a drift in scale
+is; it adds up along a chain, where the rest partly cancels."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +44,7 @@ class Drift:
         return self.covariance[last] - self.covariance[first] + constant @ constant.mT
 
 
-def odometry_drift(
-    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, options: ConsistencyOptions
-) -> Drift:
+def odometry_drift(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Drift:
     """Drift along the steps between consecutive keyframes, each by its surest trusted edge.
 
     A step that no edge covers is as unsure as the worst that is covered. Raises GeogsError if no
@@ -71,14 +61,14 @@ def odometry_drift(
     for e in order.tolist():  # the surest comes last and stays
         chosen[step[e]] = variance[e]
     carry = sim3_adjoint(se3_inverse(T_cw[1:]))
-    steps = options.drift * (carry * chosen[:, None]) @ carry.mT
-    bias = options.bias * carry * chosen.sqrt()[:, None]
+    steps = DRIFT * (carry * chosen[:, None]) @ carry.mT
+    bias = BIAS * carry * chosen.sqrt()[:, None]
     none = steps.new_zeros(1, 7, 7)
     return Drift(torch.cat([none, steps.cumsum(0)]), torch.cat([none, bias.cumsum(0)]))
 
 
 def cycle_errors(
-    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, options: ConsistencyOptions
+    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses
 ) -> tuple[Float[Tensor, "l l"], Float[Tensor, "l"]]:
     """Squared errors, in squared standard deviations, of the loops of a graph among themselves.
 
@@ -86,7 +76,7 @@ def cycle_errors(
     between its ends.
     """
     loops = relative.select(relative.is_loop)
-    drift = odometry_drift(T_cw, relative, options)
+    drift = odometry_drift(T_cw, relative)
     back = se3_inverse(T_cw[loops.target])
     D = back @ loops.G @ T_cw[loops.source]
     carry = sim3_adjoint(back)
@@ -106,24 +96,19 @@ def cycle_errors(
     return torch.maximum(pairs, pairs.mT), alone
 
 
-def consistent_loops(
-    T_cw: Float[Tensor, "n 4 4"],
-    relative: RelativePoses,
-    options: ConsistencyOptions | None = None,
-) -> Bool[Tensor, "e"]:
+def consistent_loops(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Bool[Tensor, "e"]:
     """Marks the trusted edges and the largest party of loops of which every two agree.
 
     Loops that contradict the odometry stand outside. A party is grown from each loop, taking those
     first that agree with most; the one with most pairs of keyframes wins, then the one whose errors
     are least. Loops in both directions between two keyframes count once.
     """
-    options = options or ConsistencyOptions()
     keep = ~relative.is_loop
     if not bool(relative.is_loop.any()):
         return keep
-    pairs, alone = cycle_errors(T_cw, relative, options)
-    plausible = alone <= options.threshold
-    agree = (pairs <= options.threshold) & plausible & plausible[:, None]
+    pairs, alone = cycle_errors(T_cw, relative)
+    plausible = alone <= AGREEMENT
+    agree = (pairs <= AGREEMENT) & plausible & plausible[:, None]
     loops = relative.select(relative.is_loop)
     ends = torch.stack([loops.source, loops.target], 1).sort(1).values.tolist()
     agreeing = agree.numpy()
@@ -137,7 +122,7 @@ def consistent_loops(
             best, winner = score, party
         if len(party) == int(plausible.sum()):
             break  # all agree, so that all others grow to the same party
-    if best[0] >= options.support:
+    if winner:
         keep[torch.nonzero(relative.is_loop)[:, 0][winner]] = True
     return keep
 

@@ -1,4 +1,5 @@
-"""What is known of the keyframes of one tracker relative to each other, by id."""
+"""What is known of the keyframes of one tracker relative to each other: relative poses by id, and
+the matches that close loops."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
+from geogs.loop.relative_pose import LEAST_ROTATION, LEAST_SCALE, relative_poses
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
@@ -21,8 +22,6 @@ AGREEING_LOOPS = 2
 JOIN_TOLERANCE = 0.12
 """Within which they agree: radians, parts of the median depth, or of the scale; what segments drift
 by within themselves."""
-FITTED = RelativePoseOptions(iterations=0)
-"""For edges that a bundle adjustment has fitted, with more than they tell alone."""
 
 
 def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
@@ -39,20 +38,57 @@ def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge]) -> RelativePoses:
     pairs = sorted(e for e in edges if e[0] < e[1])
     if not pairs:
         return RelativePoses.none()
-    ids = sorted({k for p in pairs for k in p})
-    slot = {k: n for n, k in enumerate(ids)}
-    grid = segment.grid
-    pixels, weight = edge_matches(grid, [edges[p] for p in pairs])
-    matched = MatchedEdges(
+    ids, grid = sorted({k for p in pairs for k in p}), segment.grid
+    matched = _matched(segment, grid, ids, pairs, *edge_matches(grid, [edges[p] for p in pairs]))
+    # A bundle adjustment has fitted them, with more than they tell alone.
+    return _named(relative_poses(grid, matched, segment.poses(ids), False, steps=0), ids)
+
+
+def closing_matches(
+    segment: KeyframeSet, edges: Mapping[Pair, Edge], loops: Sequence[Loop]
+) -> MatchedEdges | None:
+    """Matches between places in the segment's order, on the CPU; none where there are none.
+
+    Both directions of the frame graph's edges and of the loops within the segment; where a pair is
+    in both, the frame graph's.
+    """
+    found: dict[Pair, tuple[Tensor, Tensor]] = {}
+    for loop in loops:
+        if loop.first in segment and loop.second in segment:
+            pairs = (loop.first, loop.second), (loop.second, loop.first)
+            for pair, flow in zip(pairs, loop.flows, strict=True):
+                found[pair] = flow.pixels[0], flow.weight[0]
+    for pair, edge in edges.items():
+        (pixels,), (weight,) = edge_matches(segment.grid, [edge])
+        found[pair] = pixels, weight
+    if not found:
+        return None
+    directed = sorted(found)
+    each = (torch.stack([found[p][k] for p in directed]) for k in (0, 1))
+    return _matched(segment, _on_cpu(segment.grid), segment.ids, directed, *each)
+
+
+def _matched(
+    segment: KeyframeSet,
+    grid: SampleGrid,
+    ids: Sequence[int],
+    directed: Sequence[Pair],
+    pixels: Float[Tensor, "e p 2"],
+    weight: Float[Tensor, "e p 2"],
+) -> MatchedEdges:
+    """Matches of pairs of ids as those of places in ``ids``, where the grid is; none of dynamic
+    cells."""
+    slot, there = {k: n for n, k in enumerate(ids)}, grid.rays.device
+    weight = static_weight(segment, directed, pixels, weight)
+    return MatchedEdges(
         grid.camera,
         grid.rays,
-        segment.inverse_depths(ids),
-        torch.tensor([slot[i] for i, _ in pairs]),
-        torch.tensor([slot[j] for _, j in pairs]),
-        pixels.float(),
-        static_weight(segment, pairs, pixels, weight).float(),
+        segment.inverse_depths(ids).to(there),
+        torch.tensor([slot[i] for i, _ in directed]),
+        torch.tensor([slot[j] for _, j in directed]),
+        pixels.to(there).float(),
+        weight.to(there).float(),
     )
-    return _named(relative_poses(grid, matched, segment.poses(ids), False, FITTED), ids)
 
 
 def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
@@ -61,7 +97,7 @@ def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
         return RelativePoses.none()
     T_cw = segment.poses(ids)
     depth = 1 / segment.inverse_depths(ids[1:]).median(1).values.cpu().double()
-    most = 1 / torch.tensor([FITTED.least_rotation] * 6 + [FITTED.least_scale]).double().square()
+    most = 1 / torch.tensor([LEAST_ROTATION] * 6 + [LEAST_SCALE]).double().square()
     information = most.repeat(len(ids) - 1, 1)
     information[:, :3] /= depth[:, None].square()
     slots = torch.arange(len(ids))

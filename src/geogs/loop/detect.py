@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import islice, takewhile
 
 import numpy as np
@@ -18,7 +17,7 @@ from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.proximity import frame_distances
 from geogs.tracking.locate.frame_locator import Recognition
 from geogs.world.keyframes import KeyframeTable
-from geogs.world.loops import Loop, LoopCandidate, LoopTable, VerifiedCandidate
+from geogs.world.loops import Loop, LoopTable, VerifiedCandidate
 
 MAX_FLOW_DISTANCE = 0.29
 """Flow distance below which the present poses make a pair a candidate, of the long edge (22 cells
@@ -39,14 +38,6 @@ MAX_LOOPS = 2
 """Most loops per keyframe: more of one place say the same."""
 LAG = 2
 """Keyframes for which a search may run beside tracking before it is waited for."""
-
-
-@dataclass(frozen=True)
-class RejectedCandidate:
-    """A candidate that is no loop."""
-
-    candidate: LoopCandidate
-    reason: str
 
 
 class LoopDetector:
@@ -75,8 +66,6 @@ class LoopDetector:
         self.grid = keyframes.grid
         self.operator = operator
         self.config = config or LoopConfig()
-        self.rejected: list[RejectedCandidate] = []
-        """Of the last update."""
         self._waits = waits
         # What the search reads was written in the stream of whoever made the detector.
         stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
@@ -92,32 +81,29 @@ class LoopDetector:
         for id in self.table.keyframes:
             self._rank(id)
         self._search = PlaceRecognition(self.grid, self.config, self._order, mask, self.table)
-        self._pending = deque(map(_done, self.table.found))
+        self._pending: deque[Future[None] | None] = deque(None for _ in self.table.found)
+        """The search for each keyframe that is not decided yet; none where it was done before."""
 
     def settle(self) -> None:
         """Finish the searches that are under way, so that the table holds what they found."""
-        self.table.found = [future.result() for future in self._pending]
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """All that were found, earliest first."""
-        return tuple(self.table.loops)
+        for search in self._pending:
+            _finish(search)
 
     def update(self, ids: Sequence[int], is_last: bool = False) -> tuple[Loop, ...]:
         """Take keyframes that became final, earliest first, and return loops that were found.
 
         They are those of the keyframes ``lag`` earlier, and at the end of all.
         """
-        self.rejected = []
         found: list[Loop] = []
         for id in ids:
             self._enter(id)
             self._pending.append(self._thread.submit(self._search.find, self._query(id)))
-            due = len(self._pending) > LAG
-            if due and (self._waits or self._pending[0].done()):
-                found += self._decide(self._pending.popleft().result())
+            first = self._pending[0]
+            is_there = self._waits or first is None or first.done()
+            if len(self._pending) > LAG and is_there:
+                found += self._decide()
         while is_last and self._pending:
-            found += self._decide(self._pending.popleft().result())
+            found += self._decide()
         return tuple(found)
 
     def remember(self, ids: Sequence[int]) -> None:
@@ -185,16 +171,16 @@ class LoopDetector:
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
         return list(islice((k for k in around.tolist() if k in store), MEASURED))
 
-    def _decide(self, views: Sequence[VerifiedCandidate]) -> list[Loop]:
-        """The loops among the candidates of one keyframe."""
+    def _decide(self) -> list[Loop]:
+        """The loops among the candidates of the keyframe whose turn it is."""
+        _finish(self._pending.popleft())
         found: list[Loop] = []
-        for view in views:
+        for view in self.table.found.pop(0):
             pair = view.candidate.first, view.candidate.second
             if self._search.is_suppressed(pair, self._found_near(view.candidate.second)):
                 continue
             loop = self._verify(view)
-            if isinstance(loop, RejectedCandidate):
-                self.rejected.append(loop)
+            if loop is None:
                 continue
             found.append(loop)
             # Of a long video the flows of all loops would fill the memory.
@@ -203,9 +189,10 @@ class LoopDetector:
                 break
         return found
 
-    def _verify(self, verified: VerifiedCandidate) -> Loop | RejectedCandidate:
-        """Features found the pose, the flow confirms it; where they failed, present poses may do.
+    def _verify(self, verified: VerifiedCandidate) -> Loop | None:
+        """The loop that a candidate is, if it is one.
 
+        Features found the pose, the flow confirms it; where they failed, present poses may do.
         Plain surfaces have few corners, but when the drift is small the flow needs none.
         """
         p, view = verified.candidate, verified.view
@@ -215,21 +202,19 @@ class LoopDetector:
         elif p.cause == "geometry":
             T, scale, inliers = second.T_cw @ se3_inverse(first.T_cw), 1.0, 0
         else:
-            return RejectedCandidate(p, view.reason or "too little depth is known")
+            return None
         check = dense_check(grid, self.operator, first, second, T, scale)
         if not inliers and check.matched < MIN_MATCHED_ALONE:
-            reason = f"without features, {check.matched:.0%} matched is too little"
-            return RejectedCandidate(p, check.reason or reason)
-        if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
-            return RejectedCandidate(p, check.reason)
+            return None
+        if not check.accepted or check.T_ji is None:
+            return None
         return Loop(
             p.first, p.second, p.cause, check.T_ji, check.scale, inliers, check.matched,
             check.there, check.back,
         )  # fmt: skip
 
 
-def _done(found: list[VerifiedCandidate]) -> Future[list[VerifiedCandidate]]:
-    """A search whose result is known."""
-    future: Future[list[VerifiedCandidate]] = Future()
-    future.set_result(found)
-    return future
+def _finish(search: Future[None] | None) -> None:
+    """Wait for a search that may be under way; raises what it has raised."""
+    if search is not None:
+        search.result()

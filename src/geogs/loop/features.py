@@ -16,35 +16,32 @@ SURPLUS = 1.5
 """Features detected for each that is kept, so that poor cells find theirs."""
 
 
-class FeatureExtractor:
-    """Finds oriented FAST corners at eight scales and describes them by ORB."""
+def orb_features(
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"] | None = None,
+    most: int = FEATURES,
+) -> Features:
+    """Oriented FAST corners at eight scales, described by ORB; empty where nothing stands out.
 
-    def __init__(self, mask: Bool[np.ndarray, "h w"] | None = None, count: int = FEATURES) -> None:
-        """At most ``count``; outside a ``mask`` of the size of the images nothing is found."""
-        self._mask = None if mask is None else mask.astype(np.uint8)
-        self.count = count
-
-    def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
-        """Features of an RGB image; none where nothing stands out. For any thread."""
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        orb = cv2.ORB.create(nfeatures=round(SURPLUS * self.count), fastThreshold=FAST_THRESHOLD)
-        points = orb.detect(grey, self._mask)
-        if not points:
-            return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+    Outside a ``mask`` of the size of the image nothing is found. For any thread.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    orb = cv2.ORB.create(nfeatures=round(SURPLUS * most), fastThreshold=FAST_THRESHOLD)
+    points = orb.detect(grey, None if mask is None else mask.astype(np.uint8))
+    kept: list[cv2.KeyPoint] = []
+    if points:
         pixels = np.array([p.pt for p in points], np.float32)
         strength = np.array([p.response for p in points])
-        order = _spread(pixels, strength, grey.shape)[: self.count]
-        # Descriptors come back in another order: OpenCV sorts by scale.
-        kept: list[cv2.KeyPoint] = []
-        for n in order:
+        for n in _spread(pixels, strength, grey.shape)[:most]:
             points[n].class_id = len(kept)
             kept.append(points[n])
-        described, descriptors = orb.compute(grey, kept)
-        if descriptors is None:
-            return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
-        back = np.argsort([p.class_id for p in described], kind="stable")
-        pixels = np.array([p.pt for p in described], np.float32)
-        return Features(pixels[back], descriptors[back])
+    described, descriptors = orb.compute(grey, kept)
+    if descriptors is None:
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+    # Descriptors come back in another order: OpenCV sorts by scale.
+    back = np.argsort([p.class_id for p in described], kind="stable")
+    pixels = np.array([p.pt for p in described], np.float32)
+    return Features(pixels[back], descriptors[back])
 
 
 def _spread(pixels: np.ndarray, strength: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -22,6 +22,16 @@ from geogs.geometry.lie import sim3_adjoint, sim3_inverse
 from geogs.geometry.robust import huber_cost
 from geogs.loop.graph_terms import BlockEquations, GraphState
 
+HUBER = 3.0
+"""Standard deviations beyond which a residual counts linearly."""
+FACTOR = 1e-3
+"""Of the cost. The cells of an edge err together, so that an edge of a thousand cells says little
+more than one of them; relative poses are weighed in the same way."""
+DEPTH_DAMPING = 1e-3
+"""Damping of inverse depth relative to the mean curvature of its keyframe."""
+CHUNK = 24
+"""Edges linearised at a time; bounds memory."""
+
 
 @dataclass(frozen=True)
 class MatchedEdges:
@@ -41,23 +51,6 @@ class MatchedEdges:
     """Inverse variance of x and y, 1 / pixel^2; 0 where nothing was matched."""
 
 
-@dataclass(frozen=True)
-class MatchOptions:
-    """How matches count."""
-
-    huber: float = 3.0
-    """Standard deviations beyond which a residual counts linearly."""
-    factor: float = 1e-3
-    """Of the cost. The cells of an edge err together, so that an edge of a thousand cells
-    says little more than one of them; relative poses are weighed in the same way."""
-    depth_damping: float = 1e-3
-    """Damping of inverse depth relative to the mean curvature of its keyframe."""
-    min_inverse_depth: float = 1e-3
-    max_inverse_depth: float = 1e2
-    chunk: int = 24
-    """Edges linearised at a time; bounds memory."""
-
-
 def relative_similarity(
     S: Float[Tensor, "n 4 4"], source: Int[Tensor, "e"], target: Int[Tensor, "e"]
 ) -> Float[Tensor, "e 4 4"]:
@@ -65,25 +58,25 @@ def relative_similarity(
     return S[target] @ sim3_inverse(S[source])
 
 
+@dataclass(frozen=True)
 class MatchTerm:
     """The term of matched edges in a pose graph."""
 
-    def __init__(self, edges: MatchedEdges, options: MatchOptions) -> None:
-        self.edges, self.options = edges, options
+    edges: MatchedEdges
 
     def linearise(self, state: GraphState) -> "LinearMatches":
         """As in the protocol."""
-        edges, options, d = self.edges, self.options, state.inverse_depth
+        edges, d = self.edges, state.inverse_depth
         assert d is not None
         sources: list[LinearSource] = []
         valid = [torch.zeros(0, edges.weight.shape[1], dtype=torch.bool)]
-        for chunk in source_chunks(edges.source, options.chunk):
+        for chunk in source_chunks(edges.source, CHUNK):
             i, j = edges.source[chunk], edges.target[chunk]
             S_ji = relative_similarity(state.S, i, j)
             p = linearise(edges.camera, edges.rays, S_ji, d[i])
             valid.append(p.valid)
-            r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], options.huber)
-            w = options.factor * w
+            r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], HUBER)
+            w = FACTOR * w
             J, D = p.pose_jacobian, p.depth_jacobian
             wJ = J * w.mT[:, None]
             H = (wJ.flatten(2) @ J.flatten(2).mT).double()
@@ -95,7 +88,7 @@ class MatchTerm:
                 c = curvature[e].sum(0)
                 depth = DepthEquations(coupling[e].flatten(0, 1), c, b[e].sum(0), c)
                 sources.append(LinearSource(frame, j[e], adjoint[e], H[e], v[e], depth))
-        return LinearMatches(self, len(state.S), sources, torch.cat(valid))
+        return LinearMatches(edges, len(state.S), sources, torch.cat(valid))
 
 
 @dataclass(frozen=True)
@@ -111,12 +104,10 @@ class LinearSource:
     depth: DepthEquations
     """Undamped."""
 
-    def damped_depth(self, damping: float, options: MatchOptions) -> DepthEquations:
+    def damped_depth(self, damping: float) -> DepthEquations:
         """With what resists a change."""
         c = self.depth.curvature
-        return replace(
-            self.depth, curvature=c * (1 + damping) + options.depth_damping * c.mean() + 1e-12
-        )
+        return replace(self.depth, curvature=c * (1 + damping) + DEPTH_DAMPING * c.mean() + 1e-12)
 
     def reduced(
         self, depth: DepthEquations
@@ -135,7 +126,7 @@ class LinearSource:
 class LinearMatches:
     """All matched edges at one state."""
 
-    term: MatchTerm
+    edges: MatchedEdges
     keyframes: int
     sources: list[LinearSource]
     valid: Bool[Tensor, "e p"]
@@ -147,7 +138,7 @@ class LinearMatches:
         gradient = torch.zeros(self.keyframes, 7, dtype=torch.float64)
         rows, columns, blocks = [index], [index], [gradient.new_zeros(0, 7, 7)]
         for source in self.sources:
-            depth = source.damped_depth(damping, self.term.options)
+            depth = source.damped_depth(damping)
             at, block, g = source.reduced(depth)
             gradient.index_add_(0, at, g)
             rows.append(at.repeat_interleave(len(at)))
@@ -160,23 +151,23 @@ class LinearMatches:
 
         The cells are given, so that a step cannot lower the cost by losing some from sight.
         """
-        edges, options, d = self.term.edges, self.term.options, state.inverse_depth
+        edges, d = self.edges, state.inverse_depth
         assert d is not None
         total = 0.0
-        for start in range(0, len(edges.source), options.chunk):
-            chunk = slice(start, start + options.chunk)
+        for start in range(0, len(edges.source), CHUNK):
+            chunk = slice(start, start + CHUNK)
             i, j = edges.source[chunk], edges.target[chunk]
             p = project(edges.camera, edges.rays, relative_similarity(state.S, i, j), d[i])
             square = (edges.weight[chunk] * (edges.pixels[chunk] - p.pixels).square()).sum(-1)
-            cost = huber_cost(square, options.huber)
+            cost = huber_cost(square, HUBER)
             total += float((cost * self.valid[chunk]).double().sum())
-        return options.factor * total
+        return FACTOR * total
 
     def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> Float[Tensor, "n p"]:
         """As in the protocol."""
-        delta = torch.zeros_like(self.term.edges.inverse_depth)
+        delta = torch.zeros_like(self.edges.inverse_depth)
         for source in self.sources:
             relative = xi[source.targets, :6] - source.adjoint @ xi[source.source]
-            depth = source.damped_depth(damping, self.term.options)
+            depth = source.damped_depth(damping)
             delta[source.source] = depth.after(relative.reshape(-1)).solution
         return delta

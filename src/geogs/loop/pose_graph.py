@@ -10,7 +10,7 @@ memory is linear in edges. Source: the Sim(3) pose graph of HI-SLAM2, with exact
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,9 +28,28 @@ from geogs.geometry.lie import (
 )
 from geogs.loop.block_system import BlockSystem
 from geogs.loop.graph_terms import BlockEquations, GraphState, GraphTerm, LinearTerm
-from geogs.loop.matched_edges import MatchedEdges, MatchOptions, MatchTerm
+from geogs.loop.matched_edges import MatchedEdges, MatchTerm
 from geogs.types import PoseCorrection
 from geogs.world.loops import RelativePoses
+
+LOOP_THRESHOLD = 37.0
+"""Squared error, in squared standard deviations, at which a loop's influence fades: twice the 99th
+percentile of chi^2 with seven degrees of freedom, so that most true loops keep most."""
+DRIFT = 9.0
+"""Factor of the covariance of trusted edges when there are loops. Odometry errs alike from step to
+step, and what a whole chain errs is more than its steps tell; a true loop would lose to it."""
+CONVEXITY_STEP = 4.0
+"""Factor by which the kernel is sharpened from stage to stage."""
+STEPS, STAGE_STEPS = 20, 2
+"""Most steps of the last stage, and of every other."""
+TOLERANCE = 1e-6
+"""A stage ends when a step lowers the cost by no more than this fraction of it, or when less than
+this is left, in squared standard deviations."""
+DAMPING, MAX_DAMPING = 1e-8, 1e4
+"""Levenberg damping at the start, relative to the diagonal; a stage ends when even the second
+brings no decrease."""
+INVERSE_DEPTHS = 1e-3, 1e2
+"""Least and largest that is given to a cell."""
 
 
 @dataclass(frozen=True)
@@ -50,33 +69,6 @@ class PoseGraph:
 
 
 @dataclass(frozen=True)
-class PoseGraphOptions:
-    """How a graph is adjusted."""
-
-    loop_threshold: float = 37.0
-    """Squared error, in squared standard deviations, at which a loop's influence fades: twice the
-    99th percentile of chi^2 with seven degrees of freedom, so that most true loops keep most."""
-    drift: float = 9.0
-    """Factor of the covariance of trusted edges when there are loops. Odometry errs alike from step
-    to step, and what a whole chain errs is more than its steps tell; a true loop would lose to
-    it."""
-    convexity_step: float = 4.0
-    """Factor by which the kernel is sharpened from stage to stage."""
-    stage_iterations: int = 2
-    """Most steps of every other stage."""
-    iterations: int = 20
-    """Most steps of the last stage."""
-    tolerance: float = 1e-6
-    """A stage ends when a step lowers the cost by no more than this fraction of it, or when less
-    than this is left, in squared standard deviations."""
-    damping: float = 1e-8
-    """Levenberg damping at the start, relative to the diagonal."""
-    max_damping: float = 1e4
-    """A stage ends when even this damping brings no decrease."""
-    matches: MatchOptions = field(default_factory=MatchOptions)
-
-
-@dataclass(frozen=True)
 class PoseGraphResult:
     """The adjusted graph."""
 
@@ -86,11 +78,6 @@ class PoseGraphResult:
     """In the keyframe's unit of before; None without matches."""
     loop_weight: Float[Tensor, "e"]
     """Share of each relative pose that the kernel left in force, in [0, 1]; 1 for trusted ones."""
-    cost_before: float
-    """With the kernel of the last stage."""
-    cost_after: float
-    steps: int
-    """Steps taken."""
 
     @property
     def scale(self) -> Float[Tensor, "n"]:
@@ -115,43 +102,34 @@ def relative_jacobians(
     return inverse @ sim3_adjoint(relative.G), -(inverse + sim3_small_adjoint(error))
 
 
-def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGraphResult:
+def solve(graph: PoseGraph) -> PoseGraphResult:
     """Adjust all similarities; inverse depths of matched edges with them.
 
     The kernel starts so wide that it is convex over the errors of all loops at the given poses.
     Every step lowers the cost at its stage; the result is deterministic.
     """
-    options, matches = options or PoseGraphOptions(), graph.matches
-    relative = RelativeTerm.of(graph.relative, options)
-    others: list[GraphTerm] = [
-        *([] if matches is None else [MatchTerm(matches, options.matches)]),
-        *graph.terms,
-    ]
+    matches, relative = graph.matches, RelativeTerm.of(graph.relative)
+    others = [*([] if matches is None else [MatchTerm(matches)]), *graph.terms]
     depth = None if matches is None else matches.inverse_depth
-    start = state = GraphState(graph.start.double(), depth)
-    problem = _Problem(graph, options)
-    steps = 0
-    for width in relative.widths(start, options.convexity_step):
-        is_last = width == 1.0
+    state = GraphState(graph.start.double(), depth)
+    problem = _Problem(graph)
+    for width in relative.widths(state):
         problem.terms = [relative.widened(width), *others]
         policy = Policy(
-            max_steps=options.iterations if is_last else options.stage_iterations,
-            damping=options.damping,
-            max_damping=options.max_damping,
-            least_damping=options.damping,
+            max_steps=STEPS if width == 1.0 else STAGE_STEPS,
+            damping=DAMPING,
+            max_damping=MAX_DAMPING,
+            least_damping=DAMPING,
             retries_unsolvable=True,
-            least_decrease=options.tolerance,
+            least_decrease=TOLERANCE,
             is_of_new_cost=True,
             costs_anew=matches is not None,
-            enough=options.tolerance,
+            enough=TOLERANCE,
             stall=1e-12,
         )
-        found = minimise(state, problem.linearise, problem.step, policy, cost)
-        state, steps = found.state, steps + found.steps
-    linear = problem.linearise(state)
+        state = minimise(state, problem.linearise, problem.step, policy, _cost).state
     weights = relative.robust_weights(relative_errors(state.S, graph.relative))
-    before, after = cost(start, linear), cost(state, linear)
-    return PoseGraphResult(state.S, state.inverse_depth, weights, before, after, steps)
+    return PoseGraphResult(state.S, state.inverse_depth, weights)
 
 
 def pose_correction(
@@ -160,7 +138,7 @@ def pose_correction(
     """What the rest of the system needs to know: T' = (R, t / s) and s of each keyframe.
 
     Lengths around a keyframe are divided by s, so inverse depth is multiplied by it, as
-    ``Tracker.correct`` does; the map follows by T'^-1 (1 / s) T = S^-1 T.
+    ``KeyframeSet.correct`` does; the map follows by T'^-1 (1 / s) T = S^-1 T.
     """
     scale = sim3_scale(S)
     after = S / scale[:, None, None]
@@ -182,26 +160,26 @@ class RelativeTerm:
     """Squared error at which a loop's influence fades."""
 
     @staticmethod
-    def of(relative: RelativePoses, options: PoseGraphOptions) -> "RelativeTerm":
+    def of(relative: RelativePoses) -> "RelativeTerm":
         """With the kernel of the last stage."""
-        trust = 1 / options.drift if bool(relative.is_loop.any()) else 1.0
+        trust = 1 / DRIFT if bool(relative.is_loop.any()) else 1.0
         information = torch.where(
             relative.is_loop[:, None], relative.information, trust * relative.information
         )
-        return RelativeTerm(relative, information, options.loop_threshold)
+        return RelativeTerm(relative, information, LOOP_THRESHOLD)
 
     def widened(self, width: float) -> "RelativeTerm":
         """With a kernel so many times as wide."""
         return replace(self, limit=width * self.limit)
 
-    def widths(self, state: GraphState, step: float) -> list[float]:
+    def widths(self, state: GraphState) -> list[float]:
         """Widening of the kernel's limit from stage to stage; the last is 1."""
         widths = [1.0]
         square = self.squares(relative_errors(state.S, self.relative))[self.relative.is_loop]
         # Geman-McClure is convex up to a third of its squared threshold.
         widest = 3 * float(square.max()) / self.limit if len(square) else 0.0
         while widths[0] < widest:
-            widths.insert(0, widths[0] * step)
+            widths.insert(0, widths[0] * CONVEXITY_STEP)
         return widths
 
     def squares(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
@@ -251,7 +229,7 @@ class LinearRelative:
         """None."""
 
 
-def cost(state: GraphState, linear: Sequence[LinearTerm]) -> float:
+def _cost(state: GraphState, linear: Sequence[LinearTerm]) -> float:
     """Sum over the terms."""
     return sum(term.cost(state) for term in linear)
 
@@ -259,8 +237,8 @@ def cost(state: GraphState, linear: Sequence[LinearTerm]) -> float:
 class _Problem:
     """One graph as the least-squares loop sees it; its terms change from stage to stage."""
 
-    def __init__(self, graph: PoseGraph, options: PoseGraphOptions) -> None:
-        self.graph, self.options = graph, options
+    def __init__(self, graph: PoseGraph) -> None:
+        self.graph = graph
         self.terms: list[GraphTerm] = []
         self._system: BlockSystem | None = None
         """Of the last step; the next has the same blocks."""
@@ -280,11 +258,11 @@ class _Problem:
         if xi is None:
             return None
         S = torch.where(self.graph.fixed[:, None, None], state.S, retract(xi, state.S))
-        d, limits = state.inverse_depth, self.options.matches
+        d = state.inverse_depth
         if d is not None:
             steps = (term.depth_step(xi, damping) for term in linear)
             d = sum((step for step in steps if step is not None), d)
-            d = d.clamp(limits.min_inverse_depth, limits.max_inverse_depth)
+            d = d.clamp(*INVERSE_DEPTHS)
         return Step(GraphState(S, d))
 
     def _solve(

@@ -18,37 +18,28 @@ from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import LinearProjection, linearise
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import move, se3_inverse
-from geogs.loop.matched_edges import MatchedEdges
+from geogs.loop.matched_edges import CHUNK, HUBER, MatchedEdges
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import RelativePoses
 
-
-@dataclass(frozen=True)
-class RelativePoseOptions:
-    """How edges are solved, and which are kept."""
-
-    iterations: int = 8
-    """At most."""
-    converged: float = 1e-6
-    """A step in which no number of a motion changes by more is the last."""
-    huber: float = 3.0
-    """Standard deviations beyond which a residual counts linearly."""
-    min_weight: float = 0.1
-    """1 / pixel^2: from which a cell counts as matched."""
-    min_matched: float = 0.01
-    """Fraction of all cells that must be matched and in front of the target."""
-    independent: float = 10.0
-    """Measurements that the cells of an edge amount to, as neighbours err together; the source
-    has 1. Measured: 30 or more on a rendered room."""
-    damping: float = 1e-4
-    """Added to the curvature of the six numbers of the motion, relative to its diagonal."""
-    least_rotation: float = 2e-4
-    """Radians: least deviation of a motion, however well it fits; of a translation in the same
-    proportion to the source's median depth."""
-    least_scale: float = 2e-3
-    """Least deviation of a ratio of units."""
-    chunk: int = 24
-    """Edges solved at a time; bounds memory."""
+STEPS = 8
+"""At most."""
+CONVERGED = 1e-6
+"""A step in which no number of a motion changes by more is the last."""
+MIN_WEIGHT = 0.1
+"""1 / pixel^2: from which a cell counts as matched."""
+MIN_MATCHED = 0.01
+"""Fraction of all cells that must be matched and in front of the target."""
+INDEPENDENT = 10.0
+"""Measurements that the cells of an edge amount to, as neighbours err together; the source has 1.
+Measured: 30 or more on a rendered room."""
+DAMPING = 1e-4
+"""Added to the curvature of the six numbers of the motion, relative to its diagonal."""
+LEAST_ROTATION = 2e-4
+"""Radians: least deviation of a motion, however well it fits; of a translation in the same
+proportion to the source's median depth."""
+LEAST_SCALE = 2e-3
+"""Least deviation of a ratio of units."""
 
 
 def relative_poses(
@@ -56,27 +47,27 @@ def relative_poses(
     edges: MatchedEdges,
     T_cw: Float[Tensor, "n 4 4"],
     is_loop: bool,
-    options: RelativePoseOptions | None = None,
+    steps: int = STEPS,
     start: Float[Tensor, "e 4 4"] | None = None,
 ) -> RelativePoses:
     """Solve every edge; those with too few matched cells are left out.
 
     Matches and depths may be on a GPU; poses are on the CPU, and so is the result.
 
-    From the present poses on, or from ``start``, the motion of each edge in its source's unit.
+    From the present poses on, or from ``start``, the motion of each edge in its source's unit;
+    with no ``steps`` that stays, where an adjustment has fitted it with more than it tells alone.
 
     Covariance is ``sigma^2 diag(H^-1)`` with ``sigma^2 = sum w r^2`` divided not by the number of
-    cells, but by ``options.independent``. A loop's scale is the median ratio of the depths at
+    cells, but by ``INDEPENDENT``. A loop's scale is the median ratio of the depths at
     matched cells; any other edge has scale 1, with the deviation of its worst angle or of its
     worst translation relative to depth, whichever is larger.
     """
-    options = options or RelativePoseOptions()
     G, information, kept = [], [], []
     if start is None:
         start = T_cw[edges.target] @ se3_inverse(T_cw[edges.source])
-    for first in range(0, len(edges.source), options.chunk):
-        chunk = slice(first, first + options.chunk)
-        solved, known, keep = _solve_edges(grid, edges, chunk, start[chunk], is_loop, options)
+    for first in range(0, len(edges.source), CHUNK):
+        chunk = slice(first, first + CHUNK)
+        solved, known, keep = _solve_edges(grid, edges, chunk, start[chunk], is_loop, steps)
         G.append(solved)
         information.append(known)
         kept.append(keep)
@@ -96,37 +87,35 @@ def _solve_edges(
     chunk: slice,
     T: Float[Tensor, "e 4 4"],
     is_loop: bool,
-    options: RelativePoseOptions,
+    steps: int,
 ) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, "e 7"], Bool[Tensor, "e"]]:
     """Similarity, information and whether it is worth keeping, of each edge of a chunk."""
     j, weight = edges.target[chunk], edges.weight[chunk]
     d = edges.inverse_depth[edges.source[chunk]]
-    linearised = partial(_linearised, edges, chunk, d, options.huber)
-    policy = Policy(options.iterations, options.damping, options.converged)
+    linearised = partial(_linearised, edges, chunk, d)
+    policy = Policy(steps, DAMPING, CONVERGED)
     T = minimise(T, linearised, _step, policy).state
     at = linearised(T)
-    p, H, square = at.projection, at.damped(options.damping), at.square
-    variance = (
-        square[:, None] / options.independent * torch.linalg.inv(H).diagonal(dim1=-2, dim2=-1)
-    )
+    p, H, square = at.projection, at.damped(DAMPING), at.square
+    variance = square[:, None] / INDEPENDENT * torch.linalg.inv(H).diagonal(dim1=-2, dim2=-1)
     depth = 1 / d.median(1).values.cpu().double()
-    least = options.least_rotation**2 * torch.ones_like(variance)
+    least = LEAST_ROTATION**2 * torch.ones_like(variance)
     least[:, :3] *= depth[:, None] ** 2
     variance = torch.maximum(variance, least)
     relative = torch.cat([variance[:, :3] / depth[:, None] ** 2, variance[:, 3:]], 1)
     scale_variance = relative.amax(1)
-    matched = (weight.mean(-1) > options.min_weight) & p.valid
+    matched = (weight.mean(-1) > MIN_WEIGHT) & p.valid
     if is_loop:
         log_scale, measured = _depth_ratio(grid, edges, j, p, d, matched)
         known = torch.isfinite(log_scale)
         scale_variance = torch.where(known, measured, scale_variance)
-        scale_variance = scale_variance.clamp(min=options.least_scale**2)
+        scale_variance = scale_variance.clamp(min=LEAST_SCALE**2)
         scale = torch.where(known, log_scale, torch.zeros_like(log_scale)).exp()
         T = T.clone()
         T[:, :3] *= scale[:, None, None]
         variance[:, :3] *= scale[:, None] ** 2
     information = 1 / torch.cat([variance, scale_variance[:, None]], 1)
-    keep = matched.double().mean(1).cpu() > options.min_matched
+    keep = matched.double().mean(1).cpu() > MIN_MATCHED
     keep = keep & torch.isfinite(information).all(1) & torch.isfinite(T).flatten(1).all(1)
     return T, information.nan_to_num(0.0, 0.0, 0.0), keep
 
@@ -151,11 +140,10 @@ def _linearised(
     edges: MatchedEdges,
     chunk: slice,
     inverse_depth: Float[Tensor, "e p"],
-    huber: float,
     T: Float[Tensor, "e 4 4"],
 ) -> _LinearEdges:
     p = linearise(edges.camera, edges.rays, T, inverse_depth)
-    r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], huber)
+    r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], HUBER)
     wJ = (p.pose_jacobian * w.mT[:, None]).flatten(2)
     H = (wJ @ p.pose_jacobian.flatten(2).mT).cpu().double()
     g = (wJ @ r.mT.flatten(1)[..., None])[..., 0].cpu().double()

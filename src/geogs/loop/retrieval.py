@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 
-from geogs.loop.features import FeatureExtractor
 from geogs.world.loops import Features, Vocabulary
 
 INDEXED = 300
@@ -60,15 +59,8 @@ class AppearanceIndex:
     merging of words). Words that many keyframes share count little (inverse document frequency).
     """
 
-    def __init__(
-        self,
-        mask: Bool[np.ndarray, "h w"] | None = None,
-        most_words: int = WORDS,
-        vocabulary: Vocabulary | None = None,
-    ) -> None:
-        """Outside a ``mask`` of the size of the images nothing is looked at; goes on with what a
-        ``vocabulary`` has."""
-        self._extract = FeatureExtractor(mask)
+    def __init__(self, vocabulary: Vocabulary | None = None, most_words: int = WORDS) -> None:
+        """Goes on with what a ``vocabulary`` has."""
         self._most_words = most_words
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         self._vocabulary = v = vocabulary or Vocabulary()
@@ -83,13 +75,8 @@ class AppearanceIndex:
     def __len__(self) -> int:
         return len(self._vocabulary.keyframes)
 
-    def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
-        """Features of an image, to be given to :meth:`add` and :meth:`query` in its stead."""
-        return self._extract(image)
-
-    def add(self, keyframe: int, image: UInt8[np.ndarray, "h w 3"] | Features) -> None:
+    def add(self, keyframe: int, features: Features) -> None:
         """Enter a keyframe; what is new in it becomes words."""
-        features = self._features(image)
         descriptors = features.descriptors[:INDEXED]
         words, distance = self._nearest(features)
         v = self._vocabulary
@@ -108,13 +95,10 @@ class AppearanceIndex:
         self._post(row, v.counts[-1])
 
     def query(
-        self,
-        image: UInt8[np.ndarray, "h w 3"] | Features,
-        exclude: Collection[int] = (),
-        count: int = 5,
+        self, features: Features, exclude: Collection[int] = (), count: int = 5
     ) -> list[SimilarKeyframe]:
-        """The ``count`` most similar keyframes that are not excluded, best first."""
-        score = self._scores(self._features(image))
+        """The ``count`` keyframes most similar to an image that are not excluded, best first."""
+        score = self._scores(features)
         score[[self._row[k] for k in exclude if k in self._row]] = 0.0
         best = np.argsort(-score, kind="stable")[:count]
         return [
@@ -148,9 +132,6 @@ class AppearanceIndex:
     def _radius(self) -> int:
         full = len(self._vocabulary.words) >= self._most_words
         return WORD_RADIUS + LOOSE * full
-
-    def _features(self, image: UInt8[np.ndarray, "h w 3"] | Features) -> Features:
-        return image if isinstance(image, Features) else self.describe(image)
 
     def _nearest(self, features: Features) -> tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]:
         """Nearest word of each indexed descriptor and its distance in bits; 256 without a word."""

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
+from geogs.loop.features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.threads import worker_count
@@ -60,7 +61,8 @@ class PlaceRecognition:
         self.table = table or LoopTable()
         self.grid = grid
         self.config = config
-        self.index = AppearanceIndex(mask, vocabulary=self.table.vocabulary)
+        self.index = AppearanceIndex(self.table.vocabulary)
+        self._mask = mask
         self._verifier = TwoViewVerifier(grid.camera)
         self._order = order
         self._helpers = ThreadPoolExecutor(
@@ -70,15 +72,15 @@ class PlaceRecognition:
 
     def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Future[Features]:
         """What a keyframe is remembered by, as soon as somebody has the time to find it."""
-        return self._helpers.submit(self.index.describe, image)
+        return self._helpers.submit(orb_features, image, self._mask)
 
     def remember(self, id: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Remember a keyframe, whatever it may show again."""
-        self.table.features[id] = self.index.describe(image)
+        self.table.features[id] = orb_features(image, self._mask)
         self.index.add(id, self.table.features[id])
 
-    def find(self, query: Query) -> list[VerifiedCandidate]:
-        """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""
+    def find(self, query: Query) -> None:
+        """Remember a keyframe, and the pairs it makes with earlier ones, most promising first."""
         id = query.id
         self.table.features[id] = query.features.result()
         candidates = self._candidates(query)
@@ -86,11 +88,11 @@ class PlaceRecognition:
         seen = self._helpers.map(lambda both: self._verifier.verify(*both), views)
         verified = [VerifiedCandidate(p, view) for p, view in zip(candidates, seen, strict=True)]
         self.index.add(id, self.table.features[id])
-        return verified
+        self.table.found.append(verified)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"], depths: Depths) -> list[Recognition]:
         """Keyframes that show what an image shows, with its pose; most alike first."""
-        features, found = self.index.describe(image), []
+        features, found = orb_features(image, self._mask), []
         for id in self._similar(features, frozenset()):
             known = DepthView.of(self.grid, *depths[id], self.table.features[id])
             view = self._verifier.verify(known, DepthView(features))

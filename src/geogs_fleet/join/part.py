@@ -12,7 +12,7 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_folder import image_path, read_image
-from geogs.loop.features import FeatureExtractor
+from geogs.loop.features import orb_features
 from geogs.threads import on_one_torch_thread
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features
@@ -68,10 +68,10 @@ def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int
     Raises InputError if the result has no images, or is damaged.
     """
     result = opened(part, device)
-    grid, extract = SampleGrid(camera), FeatureExtractor()
+    grid = SampleGrid(camera)
     depths, known, features = [], [], []
     for number, T_cw in enumerate(torch.from_numpy(result.views.T_cw)):
-        features.append(extract(image_of(result, number, camera)))
+        features.append(orb_features(image_of(result, number, camera)))
         inverse, information = _on_grid(result, T_cw, grid)
         depths.append(inverse)
         known.append(information)

@@ -7,7 +7,7 @@ import torch
 
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
-from geogs.loop.features import FeatureExtractor
+from geogs.loop.features import orb_features
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.world.grid import STRIDE, SampleGrid
@@ -57,7 +57,7 @@ def test_a_mask_has_the_size_of_the_images_and_shows_something():
 
 def test_no_features_are_found_where_the_mask_hides():
     image = with_bonnet(render(pose(0.0))[0])
-    everywhere, shown = (FeatureExtractor(m)(image) for m in (None, MASK))
+    everywhere, shown = (orb_features(image, m) for m in (None, MASK))
     assert (everywhere.pixels[:, 1] > 106).any()
     assert len(shown) > 20
     assert shown.pixels[:, 1].max() < 106
