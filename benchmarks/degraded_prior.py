@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
-from geogs.priors.base import DepthKind, PriorMaps
+from geogs.priors.monocular_prior import DepthKind, PriorMaps
 from geogs_synth.raycast.raycaster import RenderedView
 from geogs_synth.scene.scene import Scene
 from geogs_synth.scene.solids import BOX

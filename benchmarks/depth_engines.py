@@ -22,7 +22,7 @@ from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, depth_imag
 from geogs.depth.engine_choice import depth_engine
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth_maps import normals_from_depth
 from geogs.geometry.lie import se3_exp
 from geogs.threads import worker_count
 from geogs.world.grid import OFFSET, STRIDE

@@ -29,9 +29,9 @@ from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense_check import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.loop.features import orb_features
+from geogs.loop.orb_features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
-from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
@@ -174,10 +174,12 @@ def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int
         for c in found:
             i = c.keyframe
             views = [
-                DepthView.of(store.grid, store[n].inverse_depth, store[n].information, features[n])
+                FeatureView.of(
+                    store.grid, store[n].inverse_depth, store[n].information, features[n]
+                )
                 for n in (i, k)
             ]
-            bare = [DepthView(v.features) for v in views]
+            bare = [FeatureView(v.features) for v in views]
             plain = clock("essential", lambda v=bare: verifier.verify(*v))
             if plain.accepted:
                 true = truth.T_cw[k] @ se3_inverse(truth.T_cw[i])

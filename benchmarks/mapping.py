@@ -14,7 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -172,7 +172,7 @@ class Scorer:
             f"Prec {s.precision_ratio:.1f}  ({len(mesh.faces)} faces)",
             flush=True,
         )
-        self.rows.append({"name": name, **s.as_dict()})
+        self.rows.append({"name": name, **asdict(s)})
         self.last: Mesh = mesh
 
 

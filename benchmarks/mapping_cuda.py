@@ -24,7 +24,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from geogs.config import LossAblation, LossConfig, MappingConfig
 from geogs.depth.depth_view import DenseDepth
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth_maps import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss
 from geogs.losses.single_view import MIN_ALPHA

@@ -25,7 +25,7 @@ from geogs.config import Config, MappingConfig, PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
-from geogs.priors.base import DepthKind, MonocularPrior
+from geogs.priors.monocular_prior import DepthKind, MonocularPrior
 from geogs.slam import Slam
 from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
 from geogs.tracking.tracker import Tracker, lone_tracker

@@ -100,7 +100,7 @@ def yaml_value(text: str, name: str) -> Any:
     """The value of a YAML text, as of ``read_yaml``; ``name`` is what to call it in a sentence."""
     import yaml
 
-    class Reader(yaml.SafeLoader):
+    class PlainLoader(yaml.SafeLoader):
         """Refuses aliases, by which a few lines can mean billions of values, and deep nesting.
 
         Time would go with the square of the depth.
@@ -117,7 +117,7 @@ def yaml_value(text: str, name: str) -> Any:
             return super().compose_node(parent, index)
 
     try:
-        return yaml.load(text, Reader)  # a safe loader
+        return yaml.load(text, PlainLoader)  # a safe loader
     except (yaml.YAMLError, *UNUSABLE) as error:
         mark = getattr(error, "problem_mark", None)
         at = f" at line {mark.line + 1}" if mark is not None else ""

@@ -19,7 +19,7 @@ from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.metric_scale import rescale, scale_by_odometry
 from geogs.pose_estimate import PoseEstimate
-from geogs.priors.base import MonocularPrior
+from geogs.priors.monocular_prior import MonocularPrior
 from geogs.scene_mask import SceneMask
 from geogs.slam_output import SlamOutput
 from geogs.stopwatch import StageProgress, Stopwatch, unwatched

@@ -58,7 +58,7 @@ class FlowMatch:
     """What resists a change of the first image's inverse depth, in the units of its inverse
     variance; equal for all edges of a call that share the first image. None for nothing."""
     memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
-    """Of each edge, what the operator wants to be given when it measures that edge again."""
+    """What the operator wants to be given when it measures an edge again, of each."""
 
     def sure(self) -> Bool[Tensor, "e p"]:
         """Cells that a geometry may be guessed from: matched with no less than a hundredth of the
@@ -81,7 +81,7 @@ class Frame:
     follows_cut: bool = False
     """Whether it begins another video, so that no motion links it to the frame before."""
     depth: MeasuredDepth | None = None
-    """Of the pixels of the image, where a sensor measured it and it is to be used."""
+    """Depth of the image's pixels, where a sensor measured it and it is to be used."""
     pose: MeasuredPose | None = None
     """By another tracker, where there is one and it is to be used as a prior."""
     rows: SeenRows | None = None
@@ -147,12 +147,12 @@ class Uncertainty:
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
     position: Float[np.ndarray, "n"]
-    """Of the camera's centre, map units, all axes together; relative to the first keyframe, and to
-    the length of the path."""
+    """That of the camera's centre, map units, all axes together; relative to the first keyframe,
+    and to the length of the path."""
     rotation: Float[np.ndarray, "n"]
-    """Of its orientation, radians."""
+    """That of its orientation, radians."""
     depth: Float[np.ndarray, "n"]
-    """Of its depths, as a part of them: the median."""
+    """That of its depths, as a part of them: the median."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +189,7 @@ class RenderedKeyframe:
 
     keyframe_id: int
     camera: Camera
-    """Of the maps."""
+    """Camera of the maps."""
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
     depth: Float[Tensor, "h w"]

@@ -13,7 +13,7 @@ from geogs.application.prior_choice import open_prior
 from geogs.config import PriorConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.priors.base import CombinedPrior, DepthKind, PriorMaps
+from geogs.priors.monocular_prior import CombinedPrior, DepthKind, PriorMaps
 
 CAMERA = Camera(60.0, 61.0, 31.0, 23.5, 64, 48)
 CPU = torch.device("cpu")

@@ -6,7 +6,7 @@ import pytest
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.loop.features import orb_features
+from geogs.loop.orb_features import orb_features
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features
 from geogs_fleet.join.links import candidates

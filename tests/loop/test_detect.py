@@ -12,8 +12,8 @@ from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop import detect, search
 from geogs.loop.dense_check import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.loop.features import orb_features
-from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.loop.orb_features import orb_features
+from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import Features
 from geogs_synth.raycast.raycaster import RenderedView
@@ -63,13 +63,13 @@ def _scale_depth(store: KeyframeSet, id: int, factor: float) -> None:
     store[id].inverse_depth = store[id].inverse_depth / factor
 
 
-def _views_of(store: KeyframeSet, *ids: int) -> list[DepthView]:
+def _views_of(store: KeyframeSet, *ids: int) -> list[FeatureView]:
     return [_depth_view(store, k, orb_features(store[k].image)) for k in ids]
 
 
-def _depth_view(store: KeyframeSet, id: int, features: Features) -> DepthView:
+def _depth_view(store: KeyframeSet, id: int, features: Features) -> FeatureView:
     state = store[id]
-    return DepthView.of(store.grid, state.inverse_depth, state.information, features)
+    return FeatureView.of(store.grid, state.inverse_depth, state.information, features)
 
 
 def test_features_give_pose_and_scale(walk):
@@ -86,7 +86,7 @@ def test_features_give_pose_and_scale(walk):
 
 def test_without_depth_the_pose_has_no_scale(walk):
     store, _ = walk
-    first, second = (DepthView(v.features) for v in _views_of(store, 0, 1))
+    first, second = (FeatureView(v.features) for v in _views_of(store, 0, 1))
     view = TwoViewVerifier(CAMERA).verify(first, second)
     assert view.accepted, view.reason
     assert not view.is_metric
@@ -112,7 +112,7 @@ def test_one_picture_in_both_views_is_not_enough(walk):
     a = first.features
     inside = (a.pixels[:, 0] > 96) & (a.pixels[:, 0] < 180) & (a.pixels[:, 1] < 140)
     keep = type(a)(a.pixels[inside], a.descriptors[inside])
-    view = TwoViewVerifier(CAMERA).verify(DepthView(keep, first.depth[inside]), second)
+    view = TwoViewVerifier(CAMERA).verify(FeatureView(keep, first.depth[inside]), second)
     assert not view.accepted
 
 

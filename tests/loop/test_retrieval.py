@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geogs.loop.features import orb_features
+from geogs.loop.orb_features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
 from lit_rooms import lit_room
 from loop_scenes import orbit, room_views

@@ -13,7 +13,7 @@ from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
-from geogs.priors.base import PriorMaps
+from geogs.priors.monocular_prior import PriorMaps
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframes.monocular_priors import KeyframePriors

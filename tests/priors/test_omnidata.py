@@ -9,9 +9,9 @@ import torch
 
 from fixtures.make_vit_hybrid_oracle import formula, picture, sample
 from geogs.errors import InputError
-from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.priors.card import load_card
 from geogs.priors.dpt import DptHybrid, Fusion, Readout
+from geogs.priors.monocular_prior import DepthKind, MonocularPrior
 from geogs.priors.omnidata import OmnidataPrior
 from geogs.priors.vit_hybrid import HybridTransformer, StandardisedConv, pad_same
 

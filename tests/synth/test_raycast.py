@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth_maps import normals_from_depth
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView

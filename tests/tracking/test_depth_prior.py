@@ -11,7 +11,7 @@ from geogs.config import PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.priors.alignment import align_inverse_depth
-from geogs.priors.base import DepthKind
+from geogs.priors.monocular_prior import DepthKind
 from geogs.tracking.depth_prior import (
     DEVIATION,
     FlowEvidence,

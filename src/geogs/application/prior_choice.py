@@ -9,7 +9,7 @@ from geogs.geometry.camera import Camera
 if TYPE_CHECKING:
     import torch
 
-    from geogs.priors.base import MonocularPrior
+    from geogs.priors.monocular_prior import MonocularPrior
 
 
 def open_prior(
@@ -19,7 +19,7 @@ def open_prior(
 
     Raises InputError if a file is missing or does not fit its card.
     """
-    from geogs.priors.base import CombinedPrior
+    from geogs.priors.monocular_prior import CombinedPrior
 
     depth = _open(config.model, config.card, "prior.card", camera, device)
     normal = _open(config.normal_model, config.normal_card, "prior.normal-card", camera, device)

@@ -3,19 +3,25 @@
 The string under a field is its help text: meaning, unit, range.
 """
 
-from geogs.config.input import InputConfig
-from geogs.config.losses import LossAblation, LossConfig
-from geogs.config.mapping import DepthConfig, DiskConfig, MapAblation, MappingConfig, PhotoConfig
-from geogs.config.mesh import MeshConfig
-from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
-from geogs.config.reconstruct import (
+from geogs.config.input_config import InputConfig
+from geogs.config.loss_config import LossAblation, LossConfig
+from geogs.config.mapping_config import (
+    DepthConfig,
+    DiskConfig,
+    MapAblation,
+    MappingConfig,
+    PhotoConfig,
+)
+from geogs.config.mesh_config import MeshConfig
+from geogs.config.prior_config import DepthSensorConfig, OdometryConfig, PriorConfig
+from geogs.config.reconstruct_config import (
     ReconstructConfig,
     SearchConfig,
     known_pose_mapping,
     reconstruct_preset,
 )
-from geogs.config.run import Config, Preset, Seed, preset
-from geogs.config.tracking import CalibrationConfig, LoopConfig, TrackingConfig
+from geogs.config.run_config import Config, Preset, Seed, preset
+from geogs.config.tracking_config import CalibrationConfig, LoopConfig, TrackingConfig
 
 __all__ = [
     "CalibrationConfig",

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import get_args
 
 from geogs.config.leaves import Leaf, default_text, leaves
-from geogs.config.reconstruct import ReconstructConfig, reconstruct_preset
-from geogs.config.run import Config, Preset, preset
+from geogs.config.reconstruct_config import ReconstructConfig, reconstruct_preset
+from geogs.config.run_config import Config, Preset, preset
 from geogs.config.setting import Basic, Only, Settings
 
 _INTRODUCTION = """\

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 
-from geogs.config.losses import LossConfig
-from geogs.config.mapping import MappingConfig
-from geogs.config.priors import DepthSensorConfig, OdometryConfig
-from geogs.config.reconstruct import ReconstructConfig
-from geogs.config.run import Config
+from geogs.config.loss_config import LossConfig
+from geogs.config.mapping_config import MappingConfig
+from geogs.config.prior_config import DepthSensorConfig, OdometryConfig
+from geogs.config.reconstruct_config import ReconstructConfig
+from geogs.config.run_config import Config
 
 
 def idle_settings(config: Config | ReconstructConfig) -> list[str]:

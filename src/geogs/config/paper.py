@@ -6,10 +6,16 @@ ours where these do not fit.
 
 from dataclasses import replace
 
-from geogs.config.losses import LossAblation, LossConfig
-from geogs.config.mapping import DepthConfig, DiskConfig, MapAblation, MappingConfig, PhotoConfig
-from geogs.config.priors import PriorConfig
-from geogs.config.tracking import LoopConfig
+from geogs.config.loss_config import LossAblation, LossConfig
+from geogs.config.mapping_config import (
+    DepthConfig,
+    DiskConfig,
+    MapAblation,
+    MappingConfig,
+    PhotoConfig,
+)
+from geogs.config.prior_config import PriorConfig
+from geogs.config.tracking_config import LoopConfig
 
 LONG_EDGE = 616
 """Pixels; as large as the front ends that the paper builds on have Replica's images."""

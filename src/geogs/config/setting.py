@@ -137,7 +137,7 @@ class Kind:
     is_tuple: bool = False
     """Whether it is any number of such values."""
     range: Range = Range()
-    """Of numbers."""
+    """Which numbers."""
     marks: tuple[object, ...] = ()
     """What else the type says of it, such as :class:`Basic`."""
 

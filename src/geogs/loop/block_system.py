@@ -40,7 +40,7 @@ class BlockSystem:
         ).tocsc()
         numbered.sort_indices()
         self._order = numbered.data.astype(np.int64)
-        """Of the numbers of all blocks in the matrix, column by column."""
+        """Places of the matrix's numbers, column by column, among those of all blocks."""
         self._matrix: csc_matrix = numbered
 
     def is_of(self, row: Int[Tensor, "b"], column: Int[Tensor, "b"]) -> bool:

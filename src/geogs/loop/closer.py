@@ -53,7 +53,7 @@ class _Asked:
     answer: Future[LoopClosure | None]
     world: Tracker
     age: int
-    """Of the world then."""
+    """That of the world then."""
 
 
 class LoopCloser:
@@ -80,7 +80,7 @@ class LoopCloser:
         self._asked: _Asked | None = None
         """What the thread is at, or has answered."""
         self._age = 0
-        """Of the world: how often more than a closing has changed it."""
+        """How often more than a closing has changed the world."""
 
     def settle(self) -> None:
         """Bring the table up to date: searches under way are finished."""

@@ -27,7 +27,7 @@ class ClosingQuestion:
     """What a closing is computed from; nothing in it changes any more."""
 
     ids: Sequence[int]
-    """Of the keyframes, ascending."""
+    """Keyframes, ascending."""
     T_cw: Float[Tensor, "n 4 4"]
     """Their poses, world to camera."""
     relative: RelativePoses

@@ -33,7 +33,7 @@ class Drift:
     """What odometry may have drifted from the first keyframe to each, in the frame of the world."""
 
     covariance: Float[Tensor, "n 7 7"]
-    """Of what is new at every step, summed up."""
+    """That of what is new at every step, summed up."""
     bias: Float[Tensor, "n 7 7"]
     """One column for each number of the tangent, were it wrong by the same amount at every step."""
 

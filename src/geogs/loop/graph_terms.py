@@ -55,7 +55,7 @@ class LinearTerm(Protocol):
         ...
 
     def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> Float[Tensor, "n p"] | None:
-        """Of the inverse depths, after a step of the keyframes; none if it has none."""
+        """Change of the inverse depths after a step of the keyframes; none if it has none."""
         ...
 
 

@@ -25,8 +25,8 @@ from geogs.loop.graph_terms import BlockEquations, GraphState
 HUBER = 3.0
 """Standard deviations beyond which a residual counts linearly."""
 FACTOR = 1e-3
-"""Of the cost. The cells of an edge err together, so that an edge of a thousand cells says little
-more than one of them; relative poses are weighed in the same way."""
+"""What the cost is multiplied by. The cells of an edge err together, so that an edge of a thousand
+cells says little more than one of them; relative poses are weighed in the same way."""
 DEPTH_DAMPING = 1e-3
 """Damping of inverse depth relative to the mean curvature of its keyframe."""
 CHUNK = 24
@@ -41,7 +41,7 @@ class MatchedEdges:
     rays: Float[Tensor, "p 3"]
     """K^-1 (x, y, 1) of each cell."""
     inverse_depth: Float[Tensor, "n p"]
-    """Of every keyframe of the graph, in its own unit of length."""
+    """That of every keyframe of the graph, in its own unit of length."""
     source: Int[Tensor, "e"]
     """Index of a keyframe; ascending."""
     target: Int[Tensor, "e"]

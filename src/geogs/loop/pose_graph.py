@@ -241,7 +241,7 @@ class _Problem:
         self.graph = graph
         self.terms: list[GraphTerm] = []
         self._system: BlockSystem | None = None
-        """Of the last step; the next has the same blocks."""
+        """Solver of the last step; the next has the same blocks."""
 
     def linearise(self, state: GraphState) -> list[LinearTerm]:
         """All terms."""

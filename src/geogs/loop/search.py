@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
-from geogs.loop.features import orb_features
+from geogs.loop.orb_features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
-from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.threads import worker_count
 from geogs.tracking.locate.frame_locator import Recognition
 from geogs.world.grid import SampleGrid
@@ -35,7 +35,7 @@ class Query:
 
     id: int
     features: Future[Features]
-    """Of its image."""
+    """Those of its image."""
     near: frozenset[int]
     """Keyframes that cannot be its loops, for being of the same time."""
     by_pose: tuple[int, ...]
@@ -84,8 +84,9 @@ class PlaceRecognition:
         id = query.id
         self.table.features[id] = query.features.result()
         candidates = self._candidates(query)
-        views = [self._depth_views(p, query.depths) for p in candidates]
-        seen = self._helpers.map(lambda both: self._verifier.verify(*both), views)
+        first = [self._view(p.first, query.depths) for p in candidates]
+        second = [self._view(p.second, query.depths) for p in candidates]
+        seen = self._helpers.map(self._verifier.verify, first, second)
         verified = [VerifiedCandidate(p, view) for p, view in zip(candidates, seen, strict=True)]
         self.index.add(id, self.table.features[id])
         self.table.found.append(verified)
@@ -94,8 +95,7 @@ class PlaceRecognition:
         """Keyframes that show what an image shows, with its pose; most alike first."""
         features, found = orb_features(image, self._mask), []
         for id in self._similar(features, frozenset()):
-            known = DepthView.of(self.grid, *depths[id], self.table.features[id])
-            view = self._verifier.verify(known, DepthView(features))
+            view = self._verifier.verify(self._view(id, depths), FeatureView(features))
             if view.accepted and view.is_metric and view.T_ji is not None:
                 found.append(Recognition(id, view.T_ji))
         return found
@@ -133,8 +133,5 @@ class PlaceRecognition:
         found = self.index.query(features, excluded, self.config.appearance)
         return [c.keyframe for c in found if c.score >= MIN_SCORE]
 
-    def _depth_views(self, p: LoopCandidate, depths: Depths) -> tuple[DepthView, DepthView]:
-        first, second = (
-            DepthView.of(self.grid, *depths[k], self.table.features[k]) for k in (p.first, p.second)
-        )
-        return first, second
+    def _view(self, id: int, depths: Depths) -> FeatureView:
+        return FeatureView.of(self.grid, *depths[id], self.table.features[id])

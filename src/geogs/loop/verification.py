@@ -43,7 +43,7 @@ ITERATIONS = 300
 
 
 @dataclass(frozen=True)
-class DepthView:
+class FeatureView:
     """A view's features and what is known of their depth."""
 
     features: Features
@@ -56,14 +56,14 @@ class DepthView:
         inverse_depth: Float[Tensor, "p"],
         information: Float[Tensor, "p"],
         features: Features,
-    ) -> "DepthView":
+    ) -> "FeatureView":
         """Depth of the features from a keyframe's; known where its nearest cell has information."""
         points = torch.from_numpy(features.pixels).to(grid.device)
         inverse = grid.sample_field(inverse_depth[:, None], points)[:, 0]
         cell, inside = grid.cells_of(points)
         known = inside & (information[cell] > 0) & (inverse > 1e-6)
         depth = torch.where(known, 1 / inverse.clamp(min=1e-6), torch.zeros_like(inverse))
-        return DepthView(features, depth.float().cpu().numpy())
+        return FeatureView(features, depth.float().cpu().numpy())
 
 
 class TwoViewVerifier:
@@ -75,7 +75,7 @@ class TwoViewVerifier:
         self._edge = max(camera.width, camera.height)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
-    def verify(self, first: DepthView, second: DepthView) -> TwoViewMatch:
+    def verify(self, first: FeatureView, second: FeatureView) -> TwoViewMatch:
         """Pose of the second view from matches with the first.
 
         With depth in the first view by PnP, metric; otherwise by the essential matrix. Depth in

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth_maps import normals_from_depth
 
 # Added to the squared length of a blended normal (about 1): bounds the slope of normalising it.
 NORMAL_EPSILON = 1e-6

@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import averaged_over_planes, normals_from_depth
+from geogs.geometry.depth_maps import averaged_over_planes, normals_from_depth
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.map_frame import MapFrame

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.least_squares import Policy, Step, minimise
-from geogs.priors.base import DepthKind
+from geogs.priors.monocular_prior import DepthKind
 
 MIN_CELLS = 32
 """Cells that must be known to both for an alignment."""
@@ -105,7 +105,7 @@ def _robust_line(
 def _best_of_medians(
     x: Float[Tensor, "n"], y: Float[Tensor, "n"], w: Float[Tensor, "n"]
 ) -> Float[Tensor, "2"] | None:
-    """Of all rising lines through the medians of two parts, that with the least median error."""
+    """The rising line through the medians of two parts that has the least median error."""
     parts = torch.argsort(x).tensor_split(_BINS)
     u, v = (torch.stack([_weighted_median(q[p], w[p]) for p in parts]) for q in (x, y))
     i, j = torch.triu_indices(_BINS, _BINS, 1, device=x.device)

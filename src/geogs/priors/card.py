@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from geogs.config.setting import Count, CountOrZero, Kind, Positive, Range, kinds
 from geogs.documents import read_yaml
 from geogs.errors import InputError
-from geogs.priors.base import DepthKind
+from geogs.priors.monocular_prior import DepthKind
 
 _CARDS = Path(__file__).parent / "cards"
 _AXES = re.compile(r"([+-])x([+-])y([+-])z")
@@ -37,7 +37,7 @@ class PriorCard:
     width: CountOrZero = 0
     multiple: Count = 1
     interpolation: Literal["linear", "cubic", "area"] = "linear"
-    """Of the image on its way in."""
+    """How the image is resized on its way in."""
     channels: Literal["rgb", "bgr"] = "rgb"
     full_scale: Number = 1.0
     """Value of white before ``mean`` and ``std``: 1 or 255."""

@@ -37,7 +37,7 @@ _EVERYWHERE = np.ones((3, 3), np.uint8)
 _STEPS = 4.0
 """Deviations of the sensor that a step between neighbouring pixels exceeds at an edge, too."""
 INDEPENDENT = 9.0
-"""Of 25 neighbouring pixels, so many whose noise has nothing to do with each other."""
+"""Independent measurements that 25 neighbouring pixels amount to."""
 _MARGIN = 1
 """Pixels beside a hole or an edge that are not believed."""
 

@@ -20,7 +20,7 @@ def _double(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
     return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
 
 
-class Readout(nn.Module):
+class TokenReadout(nn.Module):
     """Mixes the class token into every other one."""
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Readout(nn.Module):
 
 def _reassemble(halved: bool) -> nn.ModuleDict:
     """Tokens to a map; the names are places in the published sequence, the others hold nothing."""
-    parts = {"0": Readout(), "3": nn.Conv2d(WIDTH, WIDTH, 1)}
+    parts = {"0": TokenReadout(), "3": nn.Conv2d(WIDTH, WIDTH, 1)}
     if halved:
         parts["4"] = nn.Conv2d(WIDTH, WIDTH, 3, stride=2, padding=1)
     return nn.ModuleDict(parts)

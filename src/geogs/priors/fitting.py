@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.priors.base import DepthKind, PriorMaps
 from geogs.priors.card import PriorCard
+from geogs.priors.monocular_prior import DepthKind, PriorMaps
 
 _INTERPOLATION = {
     "linear": cv2.INTER_LINEAR,

@@ -17,7 +17,7 @@ FIT = 16.8
 PROPOSALS = 256
 """Scales that are tried at most, evenly chosen along the path."""
 ROUNDS = 10
-"""Of reweighting."""
+"""Rounds of reweighting."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ScaleVote:
     scale: float
     """Metres to the unit of the images' motions."""
     deviation: float
-    """Of the scale, as a part of it; infinite where nothing tells."""
+    """Standard deviation of the scale, as a part of it; infinite where nothing tells."""
     fits: Bool[Tensor, "m"]
     """Which motions fit at that scale."""
 

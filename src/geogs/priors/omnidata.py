@@ -9,10 +9,10 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.priors.base import PriorMaps
 from geogs.priors.card import PriorCard
 from geogs.priors.dpt import MULTIPLE, DptHybrid
 from geogs.priors.fitting import fit_image, prior_maps
+from geogs.priors.monocular_prior import PriorMaps
 
 PREFIX = "model."
 """Before every name of the checkpoints, which hold more than the network."""

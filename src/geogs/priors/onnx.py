@@ -10,9 +10,9 @@ from jaxtyping import UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.priors.base import PriorMaps
 from geogs.priors.card import PriorCard
 from geogs.priors.fitting import fit_image, prior_maps
+from geogs.priors.monocular_prior import PriorMaps
 from geogs.threads import worker_count
 
 MISSING = "Monocular networks in ONNX files need onnxruntime: pip install 'geogs[priors]'."

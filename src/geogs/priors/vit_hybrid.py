@@ -51,7 +51,7 @@ class StandardisedConv(nn.Conv2d):
         return F.conv2d(x, weight, stride=self.stride)
 
 
-class Projection(nn.Module):
+class Shortcut(nn.Module):
     """What a bottleneck adds its result to where size or channels change."""
 
     def __init__(self, channels: int, out: int, stride: int) -> None:
@@ -70,7 +70,7 @@ class Bottleneck(nn.Module):
         super().__init__()
         middle = out // 4
         is_same = channels == out and stride == 1
-        self.downsample = None if is_same else Projection(channels, out, stride)
+        self.downsample = None if is_same else Shortcut(channels, out, stride)
         self.conv1 = StandardisedConv(channels, middle, 1)
         self.norm1 = nn.GroupNorm(_GROUPS, middle)
         self.conv2 = StandardisedConv(middle, middle, 3, stride)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.config import Config
 from geogs.errors import TrackingLost
-from geogs.priors.base import MonocularPrior
+from geogs.priors.monocular_prior import MonocularPrior
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.locate.frame_locator import Recognition
 from geogs.tracking.tracker import Tracker, TrackResult

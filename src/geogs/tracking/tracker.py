@@ -12,7 +12,7 @@ from geogs.config import Config
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.priors.base import MonocularPrior
+from geogs.priors.monocular_prior import MonocularPrior
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.follower import Follower

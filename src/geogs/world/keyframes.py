@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.geometry.lie import scaled, sim3_scale
-from geogs.priors.base import DepthKind
+from geogs.priors.monocular_prior import DepthKind
 from geogs.types import MeasuredPose, PoseCorrection
 from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
 from geogs.world.grid import SampleGrid

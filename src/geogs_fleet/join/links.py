@@ -16,7 +16,7 @@ from geogs.loop.constraints import of_loop
 from geogs.loop.dense_check import dense_check
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.search import MIN_SCORE, SUPPRESSION
-from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.flow.operator_choice import build_operator
@@ -141,11 +141,11 @@ def loaded_keyframes(
     return loaded
 
 
-def _seen(grid: SampleGrid, views: PartViews, n: int) -> DepthView:
+def _seen(grid: SampleGrid, views: PartViews, n: int) -> FeatureView:
     inverse, information = (
         torch.from_numpy(x[n]) for x in (views.inverse_depth, views.information)
     )
-    return DepthView.of(grid, inverse, information, views.features[n])
+    return FeatureView.of(grid, inverse, information, views.features[n])
 
 
 def _between(relative: RelativePoses, first: int) -> RelativePoses:

@@ -12,7 +12,7 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_folder import image_path, read_image
-from geogs.loop.features import orb_features
+from geogs.loop.orb_features import orb_features
 from geogs.threads import on_one_torch_thread
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features

@@ -14,7 +14,7 @@ from geogs.depth.engine_choice import depth_engine
 from geogs.depth.network import engine as network_engine
 from geogs.depth.network.engine import resampled
 from geogs.depth.network.search_range import RATIO, search_range
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth_maps import normals_from_depth
 
 CONFIG = DepthConfig(engine="network")
 

@@ -14,7 +14,7 @@ from geogs.depth.network.plane_views import cell_rays
 from geogs.depth.network.surface_normals import normals_of
 from geogs.depth.network.volume import combined
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth_maps import normals_from_depth
 
 
 def network(seed: int = 0) -> DepthNetwork:

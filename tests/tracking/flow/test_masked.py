@@ -7,7 +7,7 @@ import torch
 
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
-from geogs.loop.features import orb_features
+from geogs.loop.orb_features import orb_features
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.world.grid import STRIDE, SampleGrid

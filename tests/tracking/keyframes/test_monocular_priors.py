@@ -12,7 +12,7 @@ from geogs.config import Config, PriorConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
-from geogs.priors.base import DepthKind, PriorMaps
+from geogs.priors.monocular_prior import DepthKind, PriorMaps
 from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection

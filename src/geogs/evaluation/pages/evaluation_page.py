@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,14 +45,13 @@ class Evaluation:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        parts = {
-            "trajectory": self.trajectory,
-            "keyframes": self.keyframes,
-            "reconstruction": self.reconstruction,
-            "photoconsistency": self.photo,
+        return {
+            "trajectory": self.trajectory and self.trajectory.as_dict(),
+            "keyframes": self.keyframes and self.keyframes.as_dict(),
+            "reconstruction": self.reconstruction and asdict(self.reconstruction),
+            "photoconsistency": self.photo and asdict(self.photo),
+            "settings": self.settings,
         }
-        scores = {name: None if part is None else part.as_dict() for name, part in parts.items()}
-        return scores | {"settings": self.settings}
 
 
 def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:

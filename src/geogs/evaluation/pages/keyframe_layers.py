@@ -5,6 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from geogs.evaluation.pages.run_pictures import normal_colours
 from geogs.types import RenderedKeyframe
 
 Layer = Literal["image", "depth", "normal", "confidence"]
@@ -25,9 +26,7 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
         case "depth":
             return depth_picture(keyframe.depth.cpu().numpy())
         case "normal":
-            normal = keyframe.normal.cpu().numpy()
-            known = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
-            return _bytes(np.where(known, 0.5 + 0.5 * normal * [1, -1, -1], 0))
+            return normal_colours(keyframe.normal.cpu().numpy(), background=0)
         case "confidence":
             weight = keyframe.weight.cpu().numpy()
             return _bytes(np.repeat(weight[..., None], 3, -1))

@@ -40,7 +40,7 @@ def write_run_page(
     Raises:
         OutputError: it cannot be written.
     """
-    name = _shown(_plain, summary.get("source")) or "result"
+    name = _shown(str, summary.get("source")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
     head += [HtmlSection(model_html(model))] if model is not None else []
     pictures = [PictureSection(title, folder / file) for file, title in PICTURES.items()]
@@ -53,7 +53,7 @@ def figures(summary: Mapping[str, Any], numbers: list[tuple[str, str]]) -> Figur
     verdict = summary.get("verdict")
     if not isinstance(verdict, Mapping):
         return FiguresSection("", None, numbers)
-    sentence = _shown(_plain, verdict.get("sentence"))
+    sentence = _shown(str, verdict.get("sentence"))
     return FiguresSection(sentence, bool(verdict.get("is_reliable")), numbers)
 
 
@@ -94,10 +94,6 @@ def _shown(show: Show, value: object) -> str:
         return ""
 
 
-def _plain(value: object) -> str:
-    return str(value)
-
-
 def _time(value: object) -> str:
     return duration(value) if isinstance(value, int | float) else ""
 
@@ -133,8 +129,8 @@ def _yes(value: object) -> str:
 
 
 _RUN_ROWS = (
-    ("source", "source", _plain),
-    ("format", "kind", _plain),
+    ("source", "source", str),
+    ("format", "kind", str),
     ("frames", "frames", _count),
     ("keyframes", "keyframes", _count),
     ("skipped images", "skipped_images", _present),
@@ -143,11 +139,11 @@ _RUN_ROWS = (
     ("disks", "disks", _count),
     ("mesh faces", "mesh_faces", _count),
     ("frames per second", "frames_per_second", _rates),
-    ("computed on", "device", _plain),
+    ("computed on", "device", str),
     ("peak memory", "peak_memory_bytes", _memory),
     ("peak GPU memory", "peak_gpu_memory_bytes", _memory),
-    ("intrinsics", "intrinsics", _plain),
-    ("scale", "scale", _plain),
+    ("intrinsics", "intrinsics", str),
+    ("scale", "scale", str),
     ("stopped early", "interrupted", _yes),
-    ("seed", "seed", _plain),
+    ("seed", "seed", str),
 )

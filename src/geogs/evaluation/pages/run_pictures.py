@@ -119,11 +119,13 @@ def depth_colours(
     return np.where(is_known[..., None], colours, np.uint8(255))
 
 
-def normal_colours(normal: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Normals of the camera's frame as colours; white where there is none."""
+def normal_colours(
+    normal: Float[np.ndarray, "h w 3"], background: int = 255
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Normals of the camera's frame as colours; grey or white where there is none."""
     is_known = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
     colours = (255 * (0.5 + 0.5 * normal * [1, -1, -1]).clip(0, 1)).round().astype(np.uint8)
-    return np.where(is_known, colours, np.uint8(255))
+    return np.where(is_known, colours, np.uint8(background))
 
 
 def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> None:

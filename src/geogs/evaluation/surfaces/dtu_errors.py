@@ -4,7 +4,7 @@ Aanaes et al., "Large-scale data for multiple-view stereopsis", IJCV 2016, in th
 Python evaluation that 2DGS and PGSR come with.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +67,6 @@ class DtuScores:
     def colour_limit_cm(self) -> float:
         """Distance that pictures show as the worst."""
         return 0.2
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
         """For a table."""

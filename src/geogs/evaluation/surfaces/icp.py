@@ -1,7 +1,5 @@
 """Iterative closest points: the last rigid motion between a reconstruction and the truth."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,49 +11,39 @@ from geogs.geometry.umeyama import umeyama
 _REACH, _ITERATIONS, _TOLERANCE = 0.1, 30, 1e-6
 
 
-@dataclass(frozen=True)
-class IcpResult:
-    """The rigid motion that was found."""
-
-    T: Float[np.ndarray, "4 4"]
-    """Moves the source onto the target."""
-    fitness: float
-    """Part of the points that found a partner."""
-    rmse: float
-    """Root mean square of their distances, in the unit of the points."""
-    iterations: int
-
-
 def icp(
     points: Float[np.ndarray, "n 3"],
     target: SurfaceDistance,
     iterations: int = _ITERATIONS,
-) -> IcpResult:
+) -> Float[np.ndarray, "4 4"]:
     """Rigid motion of ``points`` onto ``target`` from the identity.
 
     Partners are the nearest surface points within 0.1 m. Distances along the normals
     are minimised for a mesh (point to plane, Chen and Medioni 1992), those between the points for
-    a point set (Besl and McKay 1992). Stops when fitness and RMSE change by less than 1e-6
-    relatively. With fewer than six partners the identity is returned.
+    a point set (Besl and McKay 1992). Stops when the fraction of the points that have a partner and
+    the RMSE change by less than 1e-6 relatively. With fewer than six partners the identity is
+    returned.
     """
     T, fitness, rmse = np.eye(4), 0.0, 0.0
-    for step in range(iterations):
+    for _ in range(iterations):
         moved = points @ T[:3, :3].T + T[:3, 3]
         distance, closest, normal = target.nearest(moved)
         near = distance < _REACH
         if near.sum() < 6:
-            return IcpResult(np.eye(4), float(near.mean()), 0.0, step)
+            return np.eye(4)
         previous = fitness, rmse
         fitness, rmse = float(near.mean()), float(np.sqrt((distance[near] ** 2).mean()))
         change = max(abs(fitness - previous[0]), abs(rmse - previous[1]) / max(rmse, 1e-12))
         if change < _TOLERANCE:
-            return IcpResult(T, fitness, rmse, step)
+            return T
         normals = None if normal is None else normal[near]
         T = _step(moved[near], closest[near], normals) @ T
-    return IcpResult(T, fitness, rmse, iterations)
+    return T
 
 
-def icp_points(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> IcpResult:
+def icp_points(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "4 4"]:
     """Rigid motion of points onto points from the identity, with Open3D's rules.
 
     Partners are the nearest target points nearer than 0.1 m; the squared distances
@@ -79,7 +67,7 @@ def icp_points(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"
         previous = fitness, rmse
         T = _step(moved[near], target[index[near]], None) @ T
         moved = source @ T[:3, :3].T + T[:3, 3]
-    return IcpResult(T, fitness, rmse, step)
+    return T
 
 
 def _step(

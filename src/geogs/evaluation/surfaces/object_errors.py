@@ -1,8 +1,7 @@
 """Errors of the reconstruction of one object whose true mesh is known."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -53,10 +52,6 @@ class ObjectScores:
     def colour_limit_cm(self) -> float:
         """Distance that pictures show as the worst."""
         return 0.2 * self.threshold_mm
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
         """For a table."""

@@ -1,8 +1,7 @@
 """How well images agree on a surface: a measure for real scenes without a true surface."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -52,10 +51,6 @@ class PhotoScores:
     """Side of the correlation window, pixels."""
     width: int
     """Width of the images, pixels."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
         """For a table."""

@@ -1,7 +1,6 @@
 """How far a reconstructed surface is from the true one."""
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -42,10 +41,6 @@ class ReconstructionScores:
     """Mean motion of the samples by ICP; 0 where it was not used."""
     protocol: str = "area-weighted (NICE-SLAM), distances to the surface"
     """How the errors are defined."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
 
     @property
     def colour_limit_cm(self) -> float:
@@ -100,7 +95,7 @@ def evaluate_reconstruction(
     shift = 0.0
     if use_icp:
         probe = sample_surface(reconstruction, _ICP_POINTS, rng)[0]
-        T = icp(probe, to_truth).T
+        T = icp(probe, to_truth)
         shift = float(np.linalg.norm(probe @ T[:3, :3].T + T[:3, 3] - probe, axis=1).mean())
         reconstruction = reconstruction.transformed(T)
     points = sample_surface(reconstruction, samples, rng)[0]

@@ -1,7 +1,7 @@
 """Scores of a surface by one protocol, and the points they come from."""
 
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,9 @@ from jaxtyping import Float
 
 @runtime_checkable
 class SurfaceScores(Protocol):
-    """Errors of a surface by one protocol."""
+    """Errors of a surface by one protocol: a dataclass of numbers."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def protocol(self) -> str:
@@ -19,10 +21,6 @@ class SurfaceScores(Protocol):
     @property
     def colour_limit_cm(self) -> float:
         """Distance that pictures show as the worst."""
-        ...
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         ...
 
     def rows(self) -> list[tuple[str, str]]:

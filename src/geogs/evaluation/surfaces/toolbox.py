@@ -109,7 +109,7 @@ def _registered(surface: Surface, truth: Surface, use_icp: bool) -> tuple[Surfac
     """The surface after ICP of its vertices, and their mean motion."""
     if not use_icp:
         return surface, 0.0
-    moved = surface.transformed(icp_points(surface.vertices, truth.vertices).T)
+    moved = surface.transformed(icp_points(surface.vertices, truth.vertices))
     return moved, float(np.linalg.norm(moved.vertices - surface.vertices, axis=1).mean())
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.config import PriorConfig
 from geogs.priors.alignment import align_inverse_depth
-from geogs.priors.base import MonocularPrior
+from geogs.priors.monocular_prior import MonocularPrior
 from geogs.tracking.depth_prior import DEVIATION, FlowEvidence, adjust_depth, flow_evidence
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid

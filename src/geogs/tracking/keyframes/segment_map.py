@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import Config
-from geogs.priors.base import MonocularPrior
+from geogs.priors.monocular_prior import MonocularPrior
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.frames.frame_recorder import FrameRecorder
 from geogs.tracking.graph.frame_graph import FrameGraph

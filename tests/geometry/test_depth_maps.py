@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import averaged_over_planes, normals_from_depth
+from geogs.geometry.depth_maps import averaged_over_planes, normals_from_depth
 
 F64 = torch.float64
 CAMERA = Camera(fx=300.0, fy=310.0, cx=151.3, cy=117.9, width=320, height=240)

@@ -4,12 +4,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
 
-from geogs.config.input import InputConfig
-from geogs.config.losses import LossConfig
-from geogs.config.mapping import DepthConfig, MappingConfig, PhotoConfig
-from geogs.config.mesh import MeshConfig
+from geogs.config.input_config import InputConfig
+from geogs.config.loss_config import LossConfig
+from geogs.config.mapping_config import DepthConfig, MappingConfig, PhotoConfig
+from geogs.config.mesh_config import MeshConfig
 from geogs.config.paper import paper_known_pose_mapping
-from geogs.config.run import Preset, Seed
+from geogs.config.run_config import Preset, Seed
 from geogs.config.setting import Basic, Count, Range, Settings
 
 

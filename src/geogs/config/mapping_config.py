@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from geogs.config.losses import LossConfig
+from geogs.config.loss_config import LossConfig
 from geogs.config.setting import (
     Angle,
     Basic,
@@ -18,7 +18,7 @@ from geogs.config.setting import (
 )
 
 FINAL_STEPS = 600, 3000
-"""Of the final training where nobody says how many, on the CPU and on a GPU."""
+"""Steps of the final training where nobody says how many, on the CPU and on a GPU."""
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from geogs.config.input import InputConfig
-from geogs.config.mapping import MappingConfig
-from geogs.config.mesh import MeshConfig
+from geogs.config.input_config import InputConfig
+from geogs.config.mapping_config import MappingConfig
+from geogs.config.mesh_config import MeshConfig
 from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior
-from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
+from geogs.config.prior_config import DepthSensorConfig, OdometryConfig, PriorConfig
 from geogs.config.setting import Count, Range, Settings
-from geogs.config.tracking import CalibrationConfig, LoopConfig, TrackingConfig
+from geogs.config.tracking_config import CalibrationConfig, LoopConfig, TrackingConfig
 
 Preset = Literal["default", "fast", "accurate", "paper"]
 Seed = Annotated[int, Range(0, 2**32 - 1)]

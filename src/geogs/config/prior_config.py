@@ -15,8 +15,8 @@ class DepthSensorConfig(Settings, group="sensor"):
     """
 
     deviation: Positive = 0.0015
-    """Of an inverse depth, per metre: what grows with the square of depth, such as 1.5 mm at 1 m
-    and 24 mm at 4 m, as structured light and stereo have it."""
+    """Deviation of an inverse depth, per metre: what grows with the square of depth, such as 1.5 mm
+    at 1 m and 24 mm at 4 m, as structured light and stereo have it."""
     ratio: Fraction = 0.005
     """Fraction of the depth that is wrong in common: calibration, temperature."""
 

@@ -6,7 +6,7 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.geometry import depth as maps
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import averaged_once, averaged_once_on_gpu, averaged_over_planes
+from geogs.geometry.depth_maps import averaged_once, averaged_once_on_gpu, averaged_over_planes
 
 CAMERA = Camera(fx=60.0, fy=62.0, cx=25.2, cy=17.1, width=53, height=37)
 GPU = pytest.param(
