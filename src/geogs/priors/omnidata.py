@@ -40,8 +40,9 @@ class OmnidataPrior:
         """Depth or normals at the size of the image, on the CPU."""
         fitted = fit_image(image, self.card)
         output = self.network(torch.from_numpy(fitted.pixels).to(self.device)).cpu().numpy()
-        both = (output, None) if self.card.axes is None else (None, output)
-        return prior_maps(*both, fitted, self.card)
+        if self.card.axes is None:
+            return prior_maps(output, None, fitted, self.card)
+        return prior_maps(None, output, fitted, self.card)
 
 
 def load_checkpoint(network: DptHybrid, path: Path) -> None:
