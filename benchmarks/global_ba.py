@@ -17,6 +17,7 @@ import resource
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -53,7 +54,8 @@ def peak() -> float:
 def measure(count: int, args: argparse.Namespace) -> None:
     """One walk in this process."""
     torch.set_num_threads(1)
-    settings.ROUNDS, settings.ITERATIONS, settings.PAIRS = args.rounds, args.iterations, args.pairs
+    settings.ROUNDS, settings.PAIRS = args.rounds, args.pairs
+    settings.GLOBAL_OPTIONS = replace(settings.GLOBAL_OPTIONS, iterations=args.iterations)
     tracker, truth = planted_tracker(count, CAMERA)
     drift(tracker, args.drift, args.yaw)
     base, before = peak(), error_cm(tracker, truth)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.geometry.lie import quaternion_to_matrix
 
 
 @runtime_checkable
@@ -173,8 +174,6 @@ class MapSnapshot:
     @property
     def normal(self) -> Float[Tensor, "n 3"]:
         """Third axis of each disk, world frame."""
-        from geogs.geometry.lie import quaternion_to_matrix
-
         return quaternion_to_matrix(self.quaternion)[..., 2]
 
     def is_finite(self) -> bool:

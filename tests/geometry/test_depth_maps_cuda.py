@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
-from geogs.geometry import depth as maps
+from geogs.geometry import depth_maps as maps
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth_maps import averaged_once, averaged_once_on_gpu, averaged_over_planes
 

@@ -9,7 +9,7 @@ import torch
 
 from geogs.config import Config
 from geogs.loop import global_bundle
-from geogs.loop.global_bundle import global_options
+from geogs.loop.global_bundle import GLOBAL_OPTIONS
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
@@ -88,7 +88,7 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     assert {(a // 4, b // 4) for a, b in graph.edges} == {
         (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2
     }
-    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, global_options())
+    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, GLOBAL_OPTIONS)
     for n in range(3):
         wanted = segment.poses([ids[n, place] for place in range(4)])
         moved = float((wanted - placements[n].T_cw).abs().max())

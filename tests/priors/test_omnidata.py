@@ -10,7 +10,7 @@ import torch
 from fixtures.make_vit_hybrid_oracle import formula, picture, sample
 from geogs.errors import InputError
 from geogs.priors.card import load_card
-from geogs.priors.dpt import DptHybrid, Fusion, Readout
+from geogs.priors.dpt import DptHybrid, Fusion, TokenReadout
 from geogs.priors.monocular_prior import DepthKind, MonocularPrior
 from geogs.priors.omnidata import OmnidataPrior
 from geogs.priors.vit_hybrid import HybridTransformer, StandardisedConv, pad_same
@@ -121,7 +121,7 @@ def test_filters_have_mean_zero_and_variance_one():
 def test_fusion_doubles_and_readout_drops_the_class_token():
     with torch.inference_mode():
         fused = Fusion()(torch.rand(1, 256, 3, 4), torch.rand(1, 256, 3, 4))
-        rest = Readout()(torch.rand(2, 7, 768))
+        rest = TokenReadout()(torch.rand(2, 7, 768))
     assert fused.shape == (1, 256, 6, 8)
     assert rest.shape == (2, 6, 768)
 

@@ -13,14 +13,14 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import PhotoScores, evaluate_photoconsistency
 from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks, mesh_silhouettes
 from geogs.evaluation.surfaces.surface import Surface, read_surface
-from geogs.evaluation.surfaces.surface_scores import SurfaceScores
+from geogs.evaluation.surfaces.surface_errors import SurfaceScores
 from geogs.evaluation.surfaces.visibility import Visibility, cull_mesh
 from geogs.evaluation.true_scene import TrueScene, photographs, silhouettes
 from geogs.geometry.camera import Camera
 from geogs.io.writers.intrinsics_file import read_camera
 
 if TYPE_CHECKING:
-    from geogs.evaluation.surfaces.surface_scores import SurfaceErrors
+    from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 
 _MASK_EDGE, _PHOTO_EDGE = 1600, 800
 _MILLIMETRES = 1000.0

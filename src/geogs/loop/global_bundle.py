@@ -11,8 +11,6 @@ from geogs.types import PoseCorrection
 
 ROUNDS = 4
 """Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
-ITERATIONS = 10
-"""Most Gauss-Newton steps per round."""
 REMEASURE = 0.25
 """A pair is matched again when its reprojection has moved by this many pixels."""
 MAX_DISTANCE = 0.5
@@ -27,8 +25,9 @@ PRIORS_TOGETHER = 32
 """Keyframes whose depths are adjusted with their priors at a time; bounds memory."""
 CONVERGED = 0.02
 """The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
-SMALL_STEP = 1e-5
-"""A round ends with a step that moves no pose by more, in units and radians."""
+GLOBAL_OPTIONS = BundleOptions(iterations=10, huber=HUBER, tolerance=1e-5)
+"""How each round is solved; it ends with a step that moves no pose by more, in units and
+radians."""
 
 
 def global_bundle(
@@ -59,7 +58,6 @@ def global_bundle(
     graph.edges.clear()
     odometry.update_scale_by_all()
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
-    options = global_options()
     for n in range(ROUNDS if pairs else 0):
         # Pairs of the same keyframe one after the other: images of old ones are read from a file.
         stale = sorted(graph.stale(pairs, REMEASURE))
@@ -70,10 +68,10 @@ def global_bundle(
             if progress is not None:
                 done = (n + start / len(stale)) / ROUNDS
                 progress(done, "matching all keyframes")
-        graph.adjust(list(graph.edges), free if fixed else ids[1:], free, options)
+        graph.adjust(list(graph.edges), free if fixed else ids[1:], free, GLOBAL_OPTIONS)
         graph.update_dynamic(set(free), config.moving)
         odometry.update_scale_by_all()
-    correct_rows(tracker, free if fixed else ids[1:], free, options)
+    correct_rows(tracker, free if fixed else ids[1:], free, GLOBAL_OPTIONS)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:
@@ -82,11 +80,6 @@ def global_bundle(
     correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
     store.correct(correction)
     return correction
-
-
-def global_options() -> BundleOptions:
-    """How an adjustment of all keyframes is solved."""
-    return BundleOptions(iterations=ITERATIONS, huber=HUBER, tolerance=SMALL_STEP)
 
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:

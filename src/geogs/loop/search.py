@@ -53,12 +53,12 @@ class PlaceRecognition:
         grid: SampleGrid,
         config: LoopConfig,
         order: Mapping[int, int],
-        mask: Bool[np.ndarray, "h w"] | None = None,
-        table: LoopTable | None = None,
+        mask: Bool[np.ndarray, "h w"] | None,
+        table: LoopTable,
     ) -> None:
         """``order`` is the rank in time of each keyframe; it may grow meanwhile. Outside a
         ``mask`` of the size of the images no features are found."""
-        self.table = table or LoopTable()
+        self.table = table
         self.grid = grid
         self.config = config
         self.index = AppearanceIndex(self.table.vocabulary)

@@ -16,8 +16,8 @@ MULTIPLE = 32
 """Height and width of the image must be multiples of this."""
 
 
-def _double(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
-    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+def _doubling() -> nn.Module:
+    return nn.Upsample(scale_factor=2, mode="bilinear", align_corners=True)
 
 
 class TokenReadout(nn.Module):
@@ -78,20 +78,14 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(FEATURES, FEATURES, 1)
         self.resConfUnit1 = ResidualUnit()  # published, but unused, in the coarsest one, too
         self.resConfUnit2 = ResidualUnit()
+        self.upsample = _doubling()
 
     def forward(
         self, x: Float[Tensor, "b c h w"], finer: Float[Tensor, "b c h w"] | None = None
     ) -> Float[Tensor, "b c h2 w2"]:
         if finer is not None:
             x = x + self.resConfUnit1(finer)
-        return self.out_conv(_double(self.resConfUnit2(x)))
-
-
-class Doubling(nn.Module):
-    """The step of the head that doubles the size."""
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
-        return _double(x)
+        return self.out_conv(self.upsample(self.resConfUnit2(x)))
 
 
 class Decoder(nn.Module):
@@ -104,7 +98,7 @@ class Decoder(nn.Module):
             setattr(self, f"refinenet{n}", Fusion())
         self.output_conv = nn.Sequential(
             nn.Conv2d(FEATURES, FEATURES // 2, 3, padding=1),
-            Doubling(),
+            _doubling(),
             nn.Conv2d(FEATURES // 2, 32, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(32, channels, 1),

@@ -24,7 +24,7 @@ from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import move
-from geogs.loop.global_bundle import CONVERGED, ROUNDS, global_options
+from geogs.loop.global_bundle import CONVERGED, GLOBAL_OPTIONS, ROUNDS
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -151,7 +151,7 @@ class _Adjustment:
 
     def solve(self) -> None:
         """Gauss-Newton steps until they are small, and the depths after the last of them."""
-        options = global_options()
+        options = GLOBAL_OPTIONS
         policy = Policy(options.iterations, options.damping, options.tolerance)
         poses = _AllPoses(self)
         found = minimise(_Poses(self.poses()), poses.linearise, poses.step, policy)
@@ -239,7 +239,7 @@ def follow(job: StepJob) -> PoseSums | None:
 
     By the numbers of the whole; nothing where there is no next.
     """
-    grid, options = SampleGrid(job.camera), global_options()
+    grid, options = SampleGrid(job.camera), GLOBAL_OPTIONS
     graph, nodes = _known_graph(job, grid)
     own = graph.keyframes.ids[: len(job.own.T_cw)]
     problem, ids = graph.streamed_problem(list(graph.edges), [], own)

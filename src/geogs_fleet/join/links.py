@@ -39,7 +39,7 @@ class Link:
     S_ji: Float[Tensor, "4 4"]
     """Sim(3) that takes points of the first camera, in its part's lengths, to the second in its."""
     matched: float
-    """Allocation of the cells whose flow agrees."""
+    """Fraction of the cells whose flow agrees."""
     relative: RelativePoses
     """The same with information, between 0 (the first) and 1, in both directions."""
 

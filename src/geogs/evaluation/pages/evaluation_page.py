@@ -18,7 +18,7 @@ from geogs.evaluation.pages.page import (
     write_page,
 )
 from geogs.evaluation.surfaces.photoconsistency import PhotoScores
-from geogs.evaluation.surfaces.surface_scores import SurfaceScores
+from geogs.evaluation.surfaces.surface_errors import SurfaceScores
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
 from geogs.io.writers.atomic import write_text
 

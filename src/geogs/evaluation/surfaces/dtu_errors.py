@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface, read_surface
-from geogs.evaluation.surfaces.surface_scores import SurfaceErrors
+from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 from geogs.evaluation.surfaces.thinning import dense_points, thin
 from geogs.threads import on_one_torch_thread
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.silhouettes import Silhouette, inside_masks
 from geogs.evaluation.surfaces.surface import Surface, sample_surface
-from geogs.evaluation.surfaces.surface_scores import SurfaceErrors
+from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 from geogs.evaluation.surfaces.triangle_tree import TriangleTree
 from geogs.threads import on_one_torch_thread
 

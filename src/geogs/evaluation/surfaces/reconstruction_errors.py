@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.icp import icp
 from geogs.evaluation.surfaces.surface import Surface, SurfaceDistance, sample_surface
-from geogs.evaluation.surfaces.surface_scores import SurfaceErrors
+from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 from geogs.evaluation.surfaces.visibility import Visibility
 from geogs.threads import on_one_torch_thread
 

@@ -14,7 +14,7 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.icp import icp_points
 from geogs.evaluation.surfaces.reconstruction_errors import ReconstructionScores, surface_scores
 from geogs.evaluation.surfaces.surface import Surface, sample_surface
-from geogs.evaluation.surfaces.surface_scores import SurfaceErrors
+from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 from geogs.threads import on_one_torch_thread
 
 VERTEX_WEIGHTED = "vertex-weighted (Splat-SLAM toolbox)"

@@ -49,27 +49,14 @@ class Visibility:
         result = np.zeros(len(points), bool)
         for T, depth in zip(self._T_cw, self._depths, strict=True):
             rest = np.flatnonzero(~result)
-            z, surface = self._look_up(points[rest], T, depth)
+            u, v, z = _projected(points[rest], self._camera, T)
+            u, v = np.rint(u), np.rint(v)
+            height, width = depth.shape
+            inside = (z > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            surface = np.full(len(rest), -np.inf, np.float32)
+            surface[inside] = depth[v[inside].astype(int), u[inside].astype(int)]
             result[rest] = z <= surface + self._tolerance
         return result
-
-    def _look_up(
-        self,
-        points: Float[np.ndarray, "n 3"],
-        T_cw: Float[np.ndarray, "4 4"],
-        depth: Float[np.ndarray, "h w"],
-    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Depth of the points and of the surface along their rays; -inf outside the image."""
-        camera = self._camera
-        x, y, z = (points @ T_cw[:3, :3].T + T_cw[:3, 3]).T
-        front = z > 1e-6
-        safe = np.where(front, z, 1.0)
-        u = np.rint(camera.fx * x / safe + camera.cx)
-        v = np.rint(camera.fy * y / safe + camera.cy)
-        inside = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        surface = np.full(len(points), -np.inf, np.float32)
-        surface[inside] = depth[v[inside].astype(int), u[inside].astype(int)]
-        return z, surface
 
 
 def cull_mesh(
@@ -111,9 +98,16 @@ def in_frustum(
     result = np.zeros(len(points), bool)
     for T in T_cw:
         rest = np.flatnonzero(~result)
-        x, y, z = (points[rest] @ T[:3, :3].T + T[:3, 3]).T
-        safe = np.where(z > 0, z, 1.0)
-        u, v = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
+        u, v, z = _projected(points[rest], camera, T)
         inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
         result[rest] = inside & (z > 0)
     return result
+
+
+def _projected(
+    points: Float[np.ndarray, "n 3"], camera: Camera, T_cw: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Pixels and depths of points; pixels mean something only where z > 0."""
+    x, y, z = (points @ T_cw[:3, :3].T + T_cw[:3, 3]).T
+    safe = np.where(z > 0, z, 1.0)
+    return camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy, z
