@@ -10,8 +10,9 @@ import functools
 import itertools
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -61,6 +62,26 @@ def thread_map(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def ordered_map(
+    function: Callable[[T], R], items: Iterable[T], threads: int, name: str = ""
+) -> Iterator[R]:
+    """``map(function, items)``, the next ones being computed meanwhile in a few threads.
+
+    No more items are taken than there are threads, beside the one that is asked for.
+    """
+    pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
+    pending: deque[Future[R]] = deque()
+    try:
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) > threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:

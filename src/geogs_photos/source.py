@@ -10,7 +10,7 @@ from geogs.config import ReconstructConfig
 from geogs.documents import UNUSABLE, expanded, read_json
 from geogs.errors import InputError
 from geogs.io.sources.formats.colmap import open_colmap
-from geogs.io.sources.posed.one_camera import unlike_common
+from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
 from geogs_photos.photograph import PhotoFolder, find_photographs
@@ -66,7 +66,7 @@ def _source(
     """The photographs that have a pose, but for those of quite other cameras."""
     posed = open_colmap(model, chosen.root)
     auto = replace(config.input, intrinsics="auto", start=0, stop=None, stride=1)
-    unlike = unlike_common(posed.files, auto)
+    unlike = OneCamera(posed.files, auto).unlike()
     names = [file.path.relative_to(chosen.root).as_posix() for file in posed.files]
     left_out = [(out.name, out.reason) for out in found.left_out]
     left_out += [(names[i], "was taken with quite another camera than most") for i in unlike]

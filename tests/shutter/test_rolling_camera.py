@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geogs.geometry.camera import Camera
-from geogs.io.sources.formats.video import turn_upright
+from geogs.io.sources.formats.video_file import turn_upright
 from geogs.shutter.rolling_camera import RollingCamera
 
 LANDSCAPE = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)

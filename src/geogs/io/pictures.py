@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from geogs.documents import read_bytes
 from geogs.errors import InputError
@@ -33,6 +33,11 @@ class Decoded:
     """As OpenCV gives it; none where there is no picture in the file."""
     is_damaged: bool = False
     """Whether the decoder complained, or the file is cut off, although there is a picture."""
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        """The picture in RGB, if it was decoded in colour."""
+        return None if self.picture is None else cv2.cvtColor(self.picture, cv2.COLOR_BGR2RGB)
 
 
 def decoded(path: Path, flags: int) -> Decoded:

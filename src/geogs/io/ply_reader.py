@@ -74,7 +74,7 @@ class _Property:
         return [(self.prefix, self.stored_length), (self.name, self.stored, (length,))]
 
 
-class _Wrong(ValueError):
+class _WrongPly(ValueError):
     """What is wrong, in words of ours."""
 
 
@@ -97,7 +97,7 @@ def read_ply(path: str | Path) -> dict[str, PlyElement]:
             elements[name], start = _element(data, start, name, count, properties)
     except (ValueError, OverflowError, MemoryError) as error:
         said = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
-        why = f" ({said})" if isinstance(error, _Wrong) else ""
+        why = f" ({said})" if isinstance(error, _WrongPly) else ""
         raise InputError(f"{path} is no readable PLY file{why}.") from None
     return elements
 
@@ -106,7 +106,7 @@ def _numbers(text: bytes) -> Float64[np.ndarray, "n"]:
     try:
         return np.array(text.split(), np.float64)
     except ValueError:
-        raise _Wrong("could not convert a word of its rows to a number") from None
+        raise _WrongPly("could not convert a word of its rows to a number") from None
 
 
 def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], int]:
@@ -115,7 +115,7 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
     start = data.find(b"\n", end) + 1
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
     if not data.startswith(b"ply") or end < 0 or not start:
-        raise _Wrong("it has no header")
+        raise _WrongPly("it has no header")
     order: _Order | Literal[""] | None = ""
     layout: dict[str, tuple[int, list[_Property]]] = {}
     for words in map(str.split, lines[1:]):
@@ -129,12 +129,12 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
             case ["property", *kinds, name] if layout and order != "":
                 properties = next(reversed(layout.values()))[1]
                 if any(name == other.name for other in properties):
-                    raise _Wrong(f"the property {name} is there twice")
+                    raise _WrongPly(f"the property {name} is there twice")
                 properties.append(_property(name, kinds, order))
             case _:
-                raise _Wrong(f"its header says '{' '.join(words)[:80]}'")
+                raise _WrongPly(f"its header says '{' '.join(words)[:80]}'")
     if order == "":
-        raise _Wrong("its header names no format")
+        raise _WrongPly("its header names no format")
     return order is None, layout, start
 
 
@@ -145,7 +145,7 @@ def _property(name: str, kinds: list[str], order: _Order | None) -> _Property:
         return _Property(name, types[0], stored[0], None)
     if kinds[:1] == ["list"] and len(kinds) == 3 and len(types) == 2 and types[0].kind in "iu":
         return _Property(name, types[1], stored[1], stored[0])
-    raise _Wrong(f"the type of the property {name} is '{' '.join(kinds)[:80]}'")
+    raise _WrongPly(f"the type of the property {name} is '{' '.join(kinds)[:80]}'")
 
 
 def _element(
@@ -154,7 +154,7 @@ def _element(
     """The rows that begin at ``start``, and where they end."""
     smallest = sum((p.stored_length or p.stored).itemsize for p in properties)
     if count * smallest > len(data) - start:
-        raise _Wrong(f"it is cut off: {count} rows of {name} are not there")
+        raise _WrongPly(f"it is cut off: {count} rows of {name} are not there")
     values, lengths, end = _rows(data, start, count, properties)
     columns, lists = {}, {}
     for p, stored, length in zip(properties, values, lengths.T, strict=True):
@@ -199,13 +199,13 @@ def _walk(
             if p.stored_length is not None:
                 (length,) = np.frombuffer(data, p.stored_length, 1, at).tolist()
                 if length < 0 or length != int(length):
-                    raise _Wrong(f"a list of {p.name} has length {length}")
+                    raise _WrongPly(f"a list of {p.name} has length {length}")
                 lengths[row, i] = length
                 at += p.stored_length.itemsize
             starts[row, i] = at
             at += p.stored.itemsize * int(lengths[row, i])
         if at > len(data):
-            raise _Wrong("it is cut off")
+            raise _WrongPly("it is cut off")
     return starts, lengths, at
 
 
@@ -223,5 +223,5 @@ def _declared(stored: np.ndarray, p: _Property) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):
         numbers = stored.astype(p.kind)
     if p.kind.kind in "iu" and (numbers != stored).any():
-        raise _Wrong(f"{p.name} holds what is no {p.kind}")
+        raise _WrongPly(f"{p.name} holds what is no {p.kind}")
     return numbers

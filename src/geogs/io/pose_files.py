@@ -68,7 +68,7 @@ def read_replica_trajectory(path: str | Path) -> Trajectory:
     rows = _read_table(path, columns=(16, 12), layout="a 4x4 matrix a row")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3] = rows[:, :12].reshape(-1, 3, 4)
-    valid = np.isfinite(rows).all(axis=1) & _is_rigid(T_wc)
+    valid = np.isfinite(rows).all(axis=1) & is_rigid(T_wc)
     seconds = np.arange(len(rows)) / FRAMES_PER_SECOND
     return _trajectory(path, seconds, T_wc, valid)
 
@@ -81,7 +81,7 @@ def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
         raise InputError(f"{folder} holds no frame-*.pose.txt; give the folder of one sequence.")
     T_wc = np.stack([_read_matrix(path) for _, path in numbered])
     seconds = np.array([number for number, _ in numbered]) / FRAMES_PER_SECOND
-    return _trajectory(folder, seconds, T_wc, _is_rigid(T_wc))
+    return _trajectory(folder, seconds, T_wc, is_rigid(T_wc))
 
 
 def read_poses(path: str | Path) -> Trajectory:
@@ -152,11 +152,18 @@ def _check_quaternions(
         )
 
 
-def _is_rigid(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
+def is_rigid(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
+    """Which matrices are finite, with a rotation to 1e-2."""
     finite = np.isfinite(T).all(axis=(1, 2))
     rotation = np.where(finite[:, None, None], T[:, :3, :3], 0.0)
     error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     return finite & (error < 1e-2) & (np.linalg.det(rotation) > 0)
+
+
+def says_pose(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
+    """Which matrices are meant to be a pose: finite, with a 3x3 part that is not all zero."""
+    finite = np.isfinite(T).all(axis=(1, 2))
+    return finite & (np.abs(np.where(finite[:, None, None], T, 0))[:, :3, :3].sum((1, 2)) > 0)
 
 
 def _trajectory(
@@ -165,11 +172,7 @@ def _trajectory(
     T_wc: Float[np.ndarray, "n 4 4"],
     valid: Bool[np.ndarray, "n"],
 ) -> Trajectory:
-    finite = np.isfinite(T_wc).all(axis=(1, 2))
-    has_pose = finite & (
-        np.abs(np.where(finite[:, None, None], T_wc, 0))[:, :3, :3].sum((1, 2)) > 0
-    )
-    if valid.sum() < 0.5 * has_pose.sum():
+    if valid.sum() < 0.5 * says_pose(T_wc).sum():
         raise InputError(
             f"{path}: the matrices are no rigid motions; expected 4x4 camera-to-world matrices, "
             f"row by row."

@@ -19,7 +19,7 @@ from geogs.mesh.extract import VolumePlan, integrate
 from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.level_set import CHUNK, SurfacePart, stitched, surface_parts
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, band_blocks
+from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, band_blocks, meets_frustum
 from geogs.threads import on_one_torch_thread
 
 
@@ -74,18 +74,9 @@ def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> b
     low, high = (np.array(c, dtype=np.float64) for c in (box.low, box.high))
     centre, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
     T = T_cw.double().numpy()
-    x, y, z = T[:3, :3] @ centre + T[:3, 3]
+    point = torch.from_numpy(T[:3, :3] @ centre + T[:3, 3])[None]
     far = plan.max_depth + plan.truncation * plan.voxel
-    if not -radius < z < far + radius:
-        return False
-    for p, f, c, size in (
-        (x, camera.fx, camera.cx, camera.width),
-        (y, camera.fy, camera.cy, camera.height),
-    ):
-        for slope, sign in (((-0.5 - c) / f, 1.0), ((size - 0.5 - c) / f, -1.0)):
-            if sign * (p - slope * z) <= -radius * (1 + slope**2) ** 0.5:
-                return False
-    return True
+    return bool(meets_frustum(point, radius, camera, far))
 
 
 @on_one_torch_thread

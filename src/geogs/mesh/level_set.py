@@ -1,8 +1,6 @@
 """From signed distances to triangles."""
 
-from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +11,7 @@ from torch import Tensor
 from geogs.mesh.marching import march
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
-from geogs.threads import worker_count
+from geogs.threads import ordered_map, worker_count
 
 CHUNK = 16
 """Blocks along a side of a chunk."""
@@ -48,29 +46,14 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
 
 def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
     """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
-    return (part for part in _marched(tsdf, min_weight) if len(part.faces))
+    parts = ordered_map(_part, _chunks(tsdf, min_weight), worker_count())
+    return (part for part in parts if len(part.faces))
 
 
-def _marched(tsdf: SparseTsdf, min_weight: float) -> Iterator[SurfacePart]:
-    """What threads make of the chunks, in their order; some are empty."""
-    with ThreadPoolExecutor(worker_count()) as threads:
-        waiting: deque[Future[SurfacePart]] = deque()
-        for chunk in _chunks(tsdf, min_weight):
-            waiting.append(threads.submit(_part, *chunk))
-            if len(waiting) > worker_count():  # chunks are large
-                yield waiting.popleft().result()
-        yield from (part.result() for part in waiting)
-
-
-def _part(
-    chunk: tuple[int, int, int],
-    origin: Int[np.ndarray, "3"],
-    distance: Float[np.ndarray, "x y z"],
-    cell: Bool[np.ndarray, "x y z"],
-) -> SurfacePart:
-    vertices, axis, triangles = march(distance, cell)
-    keys = _edge_keys(np.floor(vertices).astype(np.int64) + origin, axis)
-    return SurfacePart(chunk, keys, vertices + origin, triangles)
+def _part(chunk: "_Chunk") -> SurfacePart:
+    vertices, axis, triangles = march(chunk.distance, chunk.cell)
+    keys = _edge_keys(np.floor(vertices).astype(np.int64) + chunk.origin, axis)
+    return SurfacePart(chunk.chunk, keys, vertices + chunk.origin, triangles)
 
 
 def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
@@ -86,14 +69,20 @@ def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
     return Mesh.from_triangles(vertices.astype(np.float32), inverse[faces].astype(np.int32))
 
 
-def _chunks(
-    tsdf: SparseTsdf, min_weight: float
-) -> Iterator[tuple[tuple[int, int, int], np.ndarray, np.ndarray, np.ndarray]]:
-    """Chunk, first voxel, distances and cells of dense boxes that overlap by one voxel layer.
+@dataclass(frozen=True)
+class _Chunk:
+    """A dense box of voxels."""
 
-    A cell is true at its upper corner if all its eight voxels were seen. Boxes without a cell or
-    without a zero are left out.
-    """
+    chunk: tuple[int, int, int]
+    origin: Int[np.ndarray, "3"]
+    """Its first voxel."""
+    distance: Float[np.ndarray, "x y z"]
+    cell: Bool[np.ndarray, "x y z"]
+    """True at a cell's upper corner if all its eight voxels were seen."""
+
+
+def _chunks(tsdf: SparseTsdf, min_weight: float) -> Iterator[_Chunk]:
+    """Boxes that overlap by one voxel layer, but for those without a cell or without a zero."""
     blocks = tsdf.coordinates
     chunk_of = torch.div(blocks, CHUNK, rounding_mode="floor")
     # A cell reaches one voxel up, so a chunk also needs the first layer of the next blocks.
@@ -114,8 +103,8 @@ def _chunks(
         cell = _seen_cells(weight >= max(min_weight, 1e-6))
         if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
             x, y, z = chunk.tolist()
-            numbers = first.cpu().numpy() * BLOCK, distance.cpu().numpy(), cell.cpu().numpy()
-            yield (x, y, z), *numbers
+            origin = first.cpu().numpy() * BLOCK
+            yield _Chunk((x, y, z), origin, distance.cpu().numpy(), cell.cpu().numpy())
 
 
 def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

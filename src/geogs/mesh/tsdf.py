@@ -73,6 +73,21 @@ def band_blocks(
     return unpack(torch.unique(pack(blocks[inside])))
 
 
+def meets_frustum(
+    points: Float[Tensor, "k 3"], radius: float, camera: Camera, far: float
+) -> Bool[Tensor, "k"]:
+    """Whether balls around points of the camera's frame meet its view frustum up to ``far``."""
+    x, y, z = points.unbind(-1)
+    inside = (z > -radius) & (z < far + radius)
+    for p, f, c, size in (
+        (x, camera.fx, camera.cx, camera.width),
+        (y, camera.fy, camera.cy, camera.height),
+    ):
+        for slope, sign in (((-0.5 - c) / f, 1.0), ((size - 0.5 - c) / f, -1.0)):
+            inside &= sign * (p - slope * z) > -radius * (1 + slope**2) ** 0.5
+    return inside
+
+
 class SparseTsdf:
     """Distances and weights of the voxels near observed surfaces.
 
@@ -222,15 +237,8 @@ class SparseTsdf:
         side = self.voxel * BLOCK
         radius = side * 0.5 * 3**0.5
         centre = (self._coordinates + 0.5).double() * side
-        x, y, z = (centre @ T_cw[:3, :3].mT + T_cw[:3, 3]).unbind(-1)
-        inside = (z > -radius) & (z < far + radius)
-        for p, f, c, size in (
-            (x, camera.fx, camera.cx, camera.width),
-            (y, camera.fy, camera.cy, camera.height),
-        ):
-            for slope, sign in (((-0.5 - c) / f, 1.0), ((size - 0.5 - c) / f, -1.0)):
-                inside &= sign * (p - slope * z) > -radius * (1 + slope**2) ** 0.5
-        return inside.nonzero()[:, 0]
+        points = centre @ T_cw[:3, :3].mT + T_cw[:3, 3]
+        return meets_frustum(points, radius, camera, far).nonzero()[:, 0]
 
     def _update(
         self,

@@ -40,7 +40,7 @@ def _has_masks(scene: BenchmarkScene) -> bool:
 
 
 def _thinned(scene: BenchmarkScene) -> BenchmarkScene:
-    count = open_replica(scene.source).length or 1
+    count = len(open_replica(scene.source).files)
     stride = Option("input.stride", str(max(1, round(count / _IMAGES))))
     return replace(scene, options=(*scene.options, *_same("600", "0.01"), stride))
 

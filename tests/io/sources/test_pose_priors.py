@@ -1,5 +1,7 @@
 """Poses beside the images: which are read, of which camera, and which are used unasked."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,9 @@ def test_archives_of_record3d_are_what_was_packed(tmp_path):
     np.testing.assert_allclose(found(source), PATH, atol=1e-7)
     folder = list(open_source(tmp_path / "room", InputConfig(readout=0.0)))
     assert all((a.image == b.image).all() for a, b in zip(frames, folder, strict=True))
+    with zipfile.ZipFile(archive, "a") as more:
+        more.writestr(f"rgbd/{'7' * 5000}.jpg", b"no number of a frame")
+    assert open_source(archive, InputConfig(readout=0.0)).length == len(frames)
     archive.write_bytes(archive.read_bytes()[:200])
     with pytest.raises(InputError):
         open_source(archive, InputConfig())

@@ -8,7 +8,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources.formats.video import clockwise_quarter_turns, turn_upright
+from geogs.io.sources.formats.video_file import clockwise_quarter_turns, turn_upright
 from geogs.io.sources.sniff import open_source
 from io_samples import gradient_image, write_video
 

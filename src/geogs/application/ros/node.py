@@ -12,7 +12,7 @@ from geogs.application.ros.node_settings import NodeSettings
 from geogs.application.ros.published_messages import Messages
 from geogs.application.slam_in_python import save_slam, slam_mesh
 from geogs.errors import InputError
-from geogs.io.sources.ros.messages import calibration_of, picture_of
+from geogs.io.sources.ros.recorded_messages import calibration_of, picture_of
 from geogs.io.sources.undistort import Rectifier
 from geogs.slam import Slam
 

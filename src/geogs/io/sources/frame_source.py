@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.reader import NeverWaits, RawFrame
+from geogs.io.sources.live.live_reader import LiveReader
+from geogs.io.sources.reader import RawFrame
 from geogs.io.sources.working_images import WorkingImages
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.shutter import Shutter
@@ -95,7 +96,7 @@ class Source:
         self._recordings = tuple(recordings)
         self.name = " + ".join(images.name for images in recordings)
         """Names of the sequences."""
-        self.kind: str = first.reader.kind
+        self.kind = first.reader.info.kind
         """The format of the first: video, images, bag, replica, tum or 7scenes."""
         self.camera = first.camera
         """The pinhole camera of every frame."""
@@ -137,7 +138,7 @@ class Source:
     def dropped(self) -> int:
         """Frames of a live source that came too fast to be used, so far in this iteration."""
         reader = self._recordings[0].reader
-        return reader.dropped if isinstance(reader, NeverWaits) else 0
+        return reader.dropped if isinstance(reader, LiveReader) else 0
 
     @property
     def spans(self) -> list[RecordingSpan]:

@@ -2,8 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,6 +11,7 @@ from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
 from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.sources.reader import RecordingInfo
 from geogs.types import MeasuredPose, Trajectory
 
 LONGEST_GAP = 0.25
@@ -23,26 +22,11 @@ KEYWORDS = ("none", "auto", "prior")
 """What ``input.poses`` may be beside a file."""
 
 
-@runtime_checkable
-class KnowsPoses(Protocol):
-    """A reader whose images come with poses that are no truth."""
-
-    poses_by: str | None
-    """Who said them; none where there are none."""
-    is_capture: bool
-    """Whether they are plainly those of an app that tracked its camera, in metres."""
-
-
 @dataclass(frozen=True)
 class TimedPoses:
     """Poses of a file by time."""
 
     trajectory: Trajectory
-
-    @staticmethod
-    def read(path: Path) -> "TimedPoses":
-        """Raises InputError where the file is not one of rows ``t tx ty tz qx qy qz qw``."""
-        return TimedPoses(read_tum_trajectory(path))
 
     def at(self, seconds: float) -> MeasuredPose | None:
         """The pose at a time, interpolated between the two around; none where they are far."""
@@ -107,8 +91,8 @@ class ChosenPoses:
         return own if self.file is None else self.file.at(seconds)
 
 
-def chosen_poses(asked: str, reader: object, name: str) -> ChosenPoses:
-    """By what ``input.poses`` asks of a reader.
+def chosen_poses(asked: str, info: RecordingInfo) -> ChosenPoses:
+    """By what ``input.poses`` asks of a recording.
 
     Raises:
         InputError: there are none, or the file cannot be read.
@@ -117,12 +101,11 @@ def chosen_poses(asked: str, reader: object, name: str) -> ChosenPoses:
     if word == "none":
         return ChosenPoses()
     if word not in KEYWORDS:
-        return ChosenPoses(True, TimedPoses.read(expanded(asked)))
-    has_poses = isinstance(reader, KnowsPoses) and reader.poses_by is not None
+        return ChosenPoses(True, TimedPoses(read_tum_trajectory(expanded(asked))))
+    has_poses = info.poses_by is not None
     if word == "prior" and not has_poses:
         raise InputError(
-            f"{name} has no poses of another tracker beside its images that can be read here; "
+            f"{info.name} has no poses of another tracker beside its images that can be read here; "
             "name their file (rows t tx ty tz qx qy qz qw), or leave out --poses."
         )
-    is_wanted = word == "prior" or (isinstance(reader, KnowsPoses) and reader.is_capture)
-    return ChosenPoses(has_poses and is_wanted)
+    return ChosenPoses(has_poses and (word == "prior" or info.is_capture))

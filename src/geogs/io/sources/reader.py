@@ -2,17 +2,17 @@
 
 import hashlib
 import stat
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
 from geogs.io.sources.calibration import Calibration
+from geogs.threads import ordered_map
 from geogs.types import MeasuredDepth, MeasuredPose, SeenRows
 
 S = TypeVar("S")
@@ -50,9 +50,9 @@ class RawFrame:
         return f"{self.label} {self.why_not}"
 
 
-@runtime_checkable
-class Reader(Protocol):
-    """How one format stores its images."""
+@dataclass(frozen=True, slots=True)
+class RecordingInfo:
+    """What a recording says of itself."""
 
     kind: str
     """Name of the format."""
@@ -61,19 +61,27 @@ class Reader(Protocol):
     width: int
     """Width of the upright images, pixels."""
     height: int
-    quarter_turns: int
-    """Clockwise quarter turns from the stored to the upright images."""
     fps: float
     """Frames per second, nominal."""
-    length: int | None
-    """Images in the source; none where only reading to the end would tell."""
-    calibration: Calibration | None
+    length: int | None = None
+    """Images in it; none where only reading to the end would tell."""
+    calibration: Calibration | None = None
     """The camera as far as the data set says."""
+    quarter_turns: int = 0
+    """Clockwise quarter turns from the stored to the upright images."""
+    has_depth: bool = False
+    """Whether a sensor's depth comes with any of the images."""
+    poses_by: str | None = None
+    """Who said the poses that come with images and are no truth; none where there are none."""
+    is_capture: bool = False
+    """Whether they are plainly those of an app that tracked its camera, in metres."""
 
-    @property
-    def has_depth(self) -> bool:
-        """Whether a sensor's depth comes with any of the images."""
-        ...
+
+@runtime_checkable
+class Reader(Protocol):
+    """How one format stores its images."""
+
+    info: RecordingInfo
 
     @property
     def paths(self) -> Sequence[Path]:
@@ -85,23 +93,14 @@ class Reader(Protocol):
         ...
 
 
-@runtime_checkable
-class NeverWaits(Protocol):
-    """A reader whose frames do not wait until they are asked for."""
-
-    is_live: Literal[True]
-    dropped: int
-    """Frames of the present reading that came too fast."""
-
-
-def of_one_size(raw: RawFrame, reader: Reader) -> RawFrame:
+def of_one_size(raw: RawFrame, info: RecordingInfo) -> RawFrame:
     """The image as it is; without its picture if that has another size than the first."""
     if raw.image is None:
         return raw
     height, width = raw.image.shape[:2]
-    if (width, height) == (reader.width, reader.height):
+    if (width, height) == (info.width, info.height):
         return raw
-    sizes = f"{width}x{height} but the first image is {reader.width}x{reader.height}"
+    sizes = f"{width}x{height} but the first image is {info.width}x{info.height}"
     return replace(raw, image=None, why_not=f"is {sizes}")
 
 
@@ -117,17 +116,7 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
 
 def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T]:
     """``map(read, places)``, the next ones being read meanwhile in a few threads."""
-    pool = ThreadPoolExecutor(READERS, thread_name_prefix="read-ahead")
-    pending: deque[Future[T]] = deque()
-    try:
-        for place in places:
-            pending.append(pool.submit(read, place))
-            if len(pending) > READERS:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return ordered_map(read, places, READERS, "read-ahead")
 
 
 def fingerprint_of(paths: Sequence[Path]) -> str:

@@ -18,7 +18,7 @@ def read_clips(
     They are as many as tell the readout. A video can only be read from its beginning on, so that
     they come from its first minute.
     """
-    ends = [n for n in (config.stop, reader.length) if n is not None]
+    ends = [n for n in (config.stop, reader.info.length) if n is not None]
     count = min(ends) - config.start if ends else CLIP * CLIPS
     if len(reader.paths) > 1:
         starts = clip_starts(config.start, count)
@@ -26,7 +26,7 @@ def read_clips(
             lambda n: list(map(resized, reader.read(n, n + CLIP, 1))), starts
         )
         return
-    starts = clip_starts(config.start, min(count, round(MINUTE * reader.fps)))
+    starts = clip_starts(config.start, min(count, round(MINUTE * reader.info.fps)))
     if not starts:
         return
     clip: list[RawFrame] = []

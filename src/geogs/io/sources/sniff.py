@@ -104,7 +104,7 @@ def _reader(path: Path, config: InputConfig) -> Reader:
             raise InputError(f"{path} is empty; is the copy or download complete?")
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    from geogs.io.sources.formats.video import VideoFile  # loads FFmpeg
+    from geogs.io.sources.formats.video_file import VideoFile  # loads FFmpeg
 
     return VideoFile(path)
 

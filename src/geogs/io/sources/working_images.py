@@ -21,9 +21,9 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import RecordedDepth, RectifiedDepth
 from geogs.io.sources.frame_masks import FrameMasks, masked_out
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
+from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.pose_priors import chosen_poses
 from geogs.io.sources.reader import (
-    NeverWaits,
     RawFrame,
     Reader,
     fingerprint_of,
@@ -60,25 +60,22 @@ class WorkingImages:
 
         ``shutter``, where it is known better than the settings'.
         """
-        _check_selection(config, reader.length)
-        if config.depth == "sensor" and not reader.has_depth:
+        info = reader.info
+        _check_selection(config, info.length)
+        if config.depth == "sensor" and not info.has_depth:
             raise InputError(
-                f"{reader.name} has no depth of a sensor beside its images that can be read here; "
+                f"{info.name} has no depth of a sensor beside its images that can be read here; "
                 "leave out --depth."
             )
-        self.poses = chosen_poses(config.poses, reader, reader.name)
+        self.poses = chosen_poses(config.poses, info)
         """Of another tracker, beside the images."""
         self.reader = reader
         """How they are stored."""
-        self.name = reader.name
+        self.name = info.name
         """Name of the sequence."""
         self._config = config
         self.calibration = calibration or resolve_intrinsics(
-            config.intrinsics,
-            reader.calibration,
-            reader.width,
-            reader.height,
-            reader.quarter_turns,
+            config.intrinsics, info.calibration, info.width, info.height, info.quarter_turns
         )
         """The camera of the images as they came, upright, with its distortion."""
         self.shutter = shutter or shutter_of(config.readout)
@@ -86,7 +83,7 @@ class WorkingImages:
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
         self.camera = self._rectifier.camera
         """The pinhole camera of the working images."""
-        check_large_enough(self.camera, reader.name)
+        check_large_enough(self.camera, info.name)
         masks = None if config.mask is None else expanded(config.mask)
         self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
         self.mask = None if masks is None or self._masks is not None else self._working_mask(masks)
@@ -99,7 +96,7 @@ class WorkingImages:
 
     def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
         """A mask for all images, straightened as they are."""
-        return self._straight(read_mask(path, (self.reader.height, self.reader.width)))
+        return self._straight(read_mask(path, (self.reader.info.height, self.reader.info.width)))
 
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
         grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
@@ -108,7 +105,7 @@ class WorkingImages:
     @property
     def uses_depth(self) -> bool:
         """Whether images come with the depth that a sensor measured."""
-        return self._config.depth != "none" and self.reader.has_depth
+        return self._config.depth != "none" and self.reader.info.has_depth
 
     @property
     def is_calibration_open(self) -> bool:
@@ -118,13 +115,13 @@ class WorkingImages:
 
     def with_calibration(self, calibration: Calibration) -> "WorkingImages":
         """The same images, undistorted by another calibration of the images as they came."""
-        fitted = calibration.fit(self.reader.width, self.reader.height)
+        fitted = calibration.fit(self.reader.info.width, self.reader.info.height)
         return WorkingImages(self.reader, self._config, fitted, self.shutter)
 
     @property
     def is_live(self) -> bool:
         """Whether frames do not wait until they are asked for."""
-        return isinstance(self.reader, NeverWaits)
+        return isinstance(self.reader, LiveReader)
 
     @property
     def is_shutter_open(self) -> bool:
@@ -140,8 +137,9 @@ class WorkingImages:
     @property
     def rolling_camera(self) -> RollingCamera:
         """The camera of the images that :meth:`clips` gives."""
-        turns = self.reader.quarter_turns
-        lines = self.reader.width if turns % 2 else self.reader.height
+        info = self.reader.info
+        turns = info.quarter_turns
+        lines = info.width if turns % 2 else info.height
         return self._rectifier.rolling_camera(lines, turns)
 
     def clips(self) -> Generator[list[RawFrame], None, None]:
@@ -153,7 +151,7 @@ class WorkingImages:
         return map(self._at_working_size, self.reader.read(start, stop, 1))
 
     def _at_working_size(self, raw: RawFrame) -> RawFrame:
-        raw = of_one_size(raw, self.reader)
+        raw = of_one_size(raw, self.reader.info)
         if raw.image is None:
             return raw
         return replace(raw, image=self._rectifier.resized(raw.image))
@@ -161,16 +159,17 @@ class WorkingImages:
     @property
     def fps(self) -> float:
         """Frames per second after the stride, nominal."""
-        return self.reader.fps / self._config.stride
+        return self.reader.info.fps / self._config.stride
 
     @property
     def length(self) -> int | None:
         """Images to expect, unreadable ones included; none where it is not known beforehand."""
-        if self.reader.length is None:
-            return None
-        stop = self._config.stop
-        stop = self.reader.length if stop is None else min(stop, self.reader.length)
-        return len(range(self._config.start, stop, self._config.stride))
+        config, length = self._config, self.reader.info.length
+        return (
+            None
+            if length is None
+            else len(range(length)[config.start : config.stop : config.stride])
+        )
 
     def fingerprint(self) -> str:
         """Sixteen digits that change with the names and sizes of the files."""
@@ -190,7 +189,7 @@ class WorkingImages:
             yield from self._with_rows_rectified(start)
             return
         for raw in reader.read(start, config.stop, config.stride):
-            raw = of_one_size(raw, reader)
+            raw = of_one_size(raw, reader.info)
             if raw.image is not None:
                 image = self._rectifier(raw.image)
                 raw = replace(raw, image=image, depth=self._rectified(raw.depth))
@@ -202,7 +201,7 @@ class WorkingImages:
             if self._masks is None or raw.image is None:
                 yield raw
                 continue
-            valid = self._masks.read(raw.name, (self.reader.height, self.reader.width))
+            valid = self._masks.read(raw.name, (self.reader.info.height, self.reader.info.width))
             straight = None if valid is None else self._straight(valid)
             yield replace(raw, image=masked_out(raw.image, straight))
 

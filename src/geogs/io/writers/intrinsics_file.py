@@ -30,22 +30,12 @@ def write_intrinsics(
     """
     document: dict[str, object] = {
         "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        **pinhole(camera),
         "first_pixel_centre": [0, 0],
     }
     if calibration is not None:
         document["source"] = {
-            "width": calibration.width,
-            "height": calibration.height,
-            "fx": calibration.fx,
-            "fy": calibration.fy,
-            "cx": calibration.cx,
-            "cy": calibration.cy,
+            **pinhole(calibration),
             "lens": calibration.lens,
             "distortion": list(calibration.distortion),
             "origin": calibration.origin,
@@ -55,6 +45,11 @@ def write_intrinsics(
     if shutter is not None:
         document["shutter"] = {"readout": shutter.readout, "origin": shutter.origin}
     write_text(path, json.dumps(document, indent=2) + "\n")
+
+
+def pinhole(camera: Camera | Calibration) -> dict[str, object]:
+    """Size, focal lengths and principal point, by their names in documents."""
+    return {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
 def _refinement(calibration: Calibration) -> dict[str, object]:

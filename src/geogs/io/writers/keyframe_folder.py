@@ -1,7 +1,7 @@
 """``keyframes/``: the images of keyframes as they were used, their masks, and where and when a
 rolling shutter saw what they show."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -33,12 +33,12 @@ def mask_path(folder: Path, keyframe_id: int) -> Path:
 def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     """Write RGB as JPEG or PNG, by the suffix."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if path.suffix == ".jpg" else []
-    _write(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    write_picture(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
 
 
 def write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
     """Write a mask as PNG: 255 where it is true."""
-    _write(path, mask.astype(np.uint8) * 255, [])
+    write_picture(path, mask.astype(np.uint8) * 255)
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
@@ -51,7 +51,8 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     return _read(path, cv2.IMREAD_GRAYSCALE) > 127
 
 
-def _write(path: Path, picture: np.ndarray, options: list[int]) -> None:
+def write_picture(path: Path, picture: np.ndarray, options: Sequence[int] = ()) -> None:
+    """Write a picture, in OpenCV's order of channels, in the format of the suffix."""
     _, data = cv2.imencode(path.suffix, picture, options)
     with atomic_file(path) as stream:
         stream.write(data.tobytes())

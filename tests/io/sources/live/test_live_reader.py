@@ -12,7 +12,7 @@ from geogs.io.sources.frame_source import Source
 from geogs.io.sources.live.feeds import Played
 from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.live.pipe import Pipe
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, RecordingInfo
 from geogs.io.sources.sniff import open_source
 from geogs.io.sources.working_images import WorkingImages
 
@@ -22,8 +22,7 @@ SECONDS = 0.02
 class Clip:
     """Twelve images of their own number, one in ``SECONDS``."""
 
-    kind, name, width, height, fps = "clip", "clip", 64, 48, 1 / SECONDS
-    quarter_turns, length, calibration, paths, has_depth = 0, 12, None, (), False
+    info, paths = RecordingInfo("clip", "clip", 64, 48, 1 / SECONDS, 12), ()
     asked = 0
     """Number of the image that was asked for last."""
 

@@ -20,7 +20,8 @@ def test_bare_pixels_come_as_they_are_and_are_timed_by_their_number():
     images = pictures()
     data = b"".join(image.tobytes() for image in images)
     pipe = Pipe(io.BytesIO(data + b"cut off"), "16x12:rgb24@25")
-    assert (pipe.width, pipe.height, pipe.fps) == (16, 12, 25.0)
+    info = pipe.info
+    assert (info.width, info.height, info.fps) == (16, 12, 25.0)
     frames = list(pipe.frames())
     assert [f.timestamp for f in frames] == pytest.approx([0, 0.04, 0.08])
     for frame, image in zip(frames, images, strict=True):
@@ -55,8 +56,8 @@ def test_yuv4mpeg2_says_its_own_format(chroma, tolerance):
     stream.seek(0)
     pipe = Pipe(stream)
     frames = list(pipe.frames())
-    assert (pipe.width, pipe.height) == (16, 12)
-    assert pipe.fps == pytest.approx(29.97, abs=0.001)
+    assert (pipe.info.width, pipe.info.height) == (16, 12)
+    assert pipe.info.fps == pytest.approx(29.97, abs=0.001)
     assert frames[1].timestamp == pytest.approx(1001 / 30000)
     for frame, image in zip(frames, images, strict=True):
         error = np.abs(frame.image.astype(int) - image)

@@ -8,6 +8,8 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.io.sources.formats.nerfstudio import open_nerfstudio
+from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.sniff import open_posed_source
 from io_samples import gradient_image, write_image
 
@@ -116,6 +118,13 @@ def test_other_cameras_are_resampled_into_the_first(other, long_edge, tmp_path):
     assert np.percentile(difference, 99) < 8
     shifted = np.abs(first.image[:, 1:].astype(float) - second.image[:, :-1]).mean()
     assert shifted > 3 * difference.mean()
+
+
+def test_images_of_one_strongly_distorted_lens_are_alike(tmp_path):
+    bent = FIRST | {"fl_x": 80.0, "fl_y": 80.0, "k1": 0.5}
+    write_transforms(tmp_path, [pattern(**FIRST)] * 2, [bent] * 2)
+    files = open_nerfstudio(tmp_path).files
+    assert OneCamera(files, NATIVE).unlike() == []
 
 
 def test_pixels_that_a_camera_does_not_see_are_masked(tmp_path):

@@ -104,7 +104,7 @@ def read_model(folder: Path) -> SparseModel:
             points = _collected(_binary_points(path) if binary else _text_points(path))
     except (struct.error, ValueError, IndexError, ArithmeticError) as error:
         said = str(error)  # by a parser of numbers: it would repeat what the file holds
-        why = f" ({said})" if isinstance(error, _Wrong) else ""
+        why = f" ({said})" if isinstance(error, _WrongModel) else ""
         raise InputError(
             f"{path} is cut off or no file of a COLMAP model{why}; copy it again."
         ) from None
@@ -137,7 +137,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
             number, model, width, height, *parameters = words
             values = tuple(float(word) for word in parameters)
             if len(values) != dict(_MODELS).get(model, len(values)):
-                raise _Wrong(f"{len(values)} parameters of a {model} camera")
+                raise _WrongModel(f"{len(values)} parameters of a {model} camera")
             yield int(number), ModelCamera(model, int(width), int(height), values)
 
 
@@ -148,7 +148,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
         if not words:
             continue
         if len(words) != 10:
-            raise _Wrong(f"{len(words)} columns in the row of an image, not 10")
+            raise _WrongModel(f"{len(words)} columns in the row of an image, not 10")
         w, x, y, z, *t = (float(word) for word in words[1:8])
         tx, ty, tz = t
         yield int(words[0]), ModelImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
@@ -161,7 +161,7 @@ def _text_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
             yield [float(word) for word in words[1:4]], [int(word) for word in words[8::2]]
 
 
-class _Wrong(ValueError):
+class _WrongModel(ValueError):
     """What is wrong, in words of ours."""
 
 
@@ -181,7 +181,7 @@ class _Bytes:
         """A number of records; refuses one that cannot be, before memory is asked for it."""
         (count,) = self.take("Q")
         if count > len(self._data):
-            raise _Wrong(f"{count} records")
+            raise _WrongModel(f"{count} records")
         return count
 
     def text(self) -> str:
@@ -193,7 +193,7 @@ class _Bytes:
     def skip(self, size: int) -> None:
         self._at += size
         if self._at > len(self._data):
-            raise _Wrong("end of file")
+            raise _WrongModel("end of file")
 
     def array(self, count: int, columns: int) -> Int64[np.ndarray, "n k"]:
         """``count`` rows of 32-bit numbers."""
@@ -208,7 +208,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("IiQQ")
         if not 0 <= model < len(_MODELS):
-            raise _Wrong(f"camera model number {model} is unknown here")
+            raise _WrongModel(f"camera model number {model} is unknown here")
         name, parameters = _MODELS[model]
         yield number, ModelCamera(name, width, height, data.take(f"{parameters}d"))
 

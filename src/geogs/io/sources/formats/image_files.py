@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from geogs.errors import InputError
 from geogs.io.pictures import decoded
@@ -17,7 +16,7 @@ from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.known_intrinsics import calibration_from_exif, find_calibration
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, RecordingInfo
 from geogs.types import MeasuredPose
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -43,8 +42,6 @@ class ImageFile:
 class ImageList:
     """Reader of image files; the first one that can be read sets the size."""
 
-    quarter_turns = 0
-
     def __init__(
         self,
         kind: str,
@@ -54,47 +51,36 @@ class ImageList:
         poses_by: str | None = None,
         is_capture: bool = False,
     ) -> None:
-        """``poses_by`` and ``is_capture`` as of :class:`KnowsPoses`."""
-        self.poses_by, self.is_capture = poses_by, is_capture
-        self.kind = kind
-        self.name = name
-        self.calibration = calibration
-        self.length: int | None = len(files)
-        self.fps = _median_rate([file.timestamp for file in files])
+        """What it says of itself is described in :class:`RecordingInfo`."""
         self.files = files
-        first = next(
-            (image for file in files if (image := read_image(file.path)) is not None), None
-        )
+        images = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in files)
+        first = next((image for image in images if image is not None), None)
         if first is None:
             raise InputError(f"{name}: none of its {len(files)} images can be read.")
-        self.height, self.width = first.shape[:2]
+        height, width = first.shape[:2]
+        self.info = RecordingInfo(
+            kind, name, width, height,
+            fps=_median_rate([file.timestamp for file in files]),
+            length=len(files),
+            calibration=calibration,
+            has_depth=any(file.depth is not None for file in files),
+            poses_by=poses_by,
+            is_capture=is_capture,
+        )  # fmt: skip
 
     @property
     def paths(self) -> list[Path]:
         """The files that are read."""
         return [file.path for file in self.files]
 
-    @property
-    def has_depth(self) -> bool:
-        """Whether a sensor's depth lies beside any of them."""
-        return any(file.depth is not None for file in self.files)
-
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
         for file in self.files[start:stop:stride]:
             found = decoded(file.path, cv2.IMREAD_COLOR)
-            image = found.picture
-            image = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
             yield RawFrame(
-                str(file.path), file.timestamp, image, found.is_damaged, depth=file.depth,
+                str(file.path), file.timestamp, found.rgb, found.is_damaged, depth=file.depth,
                 pose=file.pose, name=file.path.name,
             )  # fmt: skip
-
-
-def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Read an image as RGB, upright by its EXIF orientation; none if it is damaged or missing."""
-    image = decoded(path, cv2.IMREAD_COLOR).picture
-    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def open_image_folder(folder: Path) -> ImageList:

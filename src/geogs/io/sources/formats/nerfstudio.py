@@ -68,8 +68,9 @@ def with_transforms(images: ImageList, folder: Path) -> ImageList:
         files.append(replace(file, pose=None if T_wc is None else measured_pose(T_wc)))
     if not any(file.pose is not None for file in files):
         return images
+    said = images.info
     return ImageList(
-        images.kind, images.name, files, images.calibration, "the transforms.json beside them"
+        said.kind, said.name, files, said.calibration, "the transforms.json beside them"
     )
 
 

@@ -8,6 +8,7 @@ and ``poses`` ``qx qy qz qw tx ty tz`` (camera to world, axes of OpenGL); ``rgbd
 import importlib
 import json
 import logging
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,10 +26,11 @@ from geogs.io.pose_files import OPENCV_FROM_OPENGL, poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import LEAST_CONFIDENCE, DepthCamera
 from geogs.io.sources.pose_priors import measured_pose, rigid
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, RecordingInfo
 from geogs.types import MeasuredPose
 
 _log = logging.getLogger(__name__)
+_NUMBER = re.compile(r"\d{1,18}")
 _LIDAR = (192, 256)
 """Rows and columns of a depth whose size is not given."""
 _LARGEST_DEPTH = 1 << 26
@@ -130,78 +132,76 @@ class Record3dDepth:
 class Record3dRecording:
     """Reader of a recording."""
 
-    kind = "record3d"
-    quarter_turns = 0
-    is_capture = True
-
     def __init__(self, path: Path) -> None:
-        self.name = path.resolve().stem
         self._path = path
         self._files: Files = _Folder(path) if path.is_dir() else _Archive(path)
         names = [name for name in self._files.names() if name.startswith("rgbd/")]
-        numbers = [Path(name).stem for name in names if name.endswith((".jpg", ".png"))]
-        self._numbers = sorted(int(n) for n in numbers if n.isdecimal())
-        if not self._numbers:
+        pictures = {Path(n).stem: n for n in names if n.endswith((".jpg", ".png"))}
+        numbered = ((int(k), name) for k, name in pictures.items() if _NUMBER.fullmatch(k))
+        self._images = dict(sorted(numbered))
+        """Names of the pictures by the number of the frame."""
+        if not self._images:
             raise InputError(f"{path} holds no images in rgbd/; export it again.")
-        suffix = {Path(name).stem: name for name in names if name.endswith((".jpg", ".png"))}
-        self._image = {int(stem): name for stem, name in suffix.items() if stem.isdecimal()}
-        first = self._picture(self._numbers[0])
+        first = self._picture(next(iter(self._images)))
         if first is None:
             raise InputError(f"{path}: its first image cannot be read; export it again.")
-        self.height, self.width = first.shape[:2]
-        self.length: int | None = len(self._numbers)
+        height, width = first.shape[:2]
         try:
             metadata: dict[str, Any] = json.loads(self._files.read("metadata", LARGEST_DOCUMENT))
-            self.fps = float(metadata.get("fps") or 30)
-            self.calibration: Calibration | None = self._calibration(metadata)
+            fps = float(metadata.get("fps") or 30)
+            calibration = _calibration(metadata, width, height)
             self._poses = _poses(metadata.get("poses", []))
             self._times = [float(t) for t in metadata.get("frameTimestamps") or []]
             self._size = _whole(metadata, "dh", _LIDAR[0]), _whole(metadata, "dw", _LIDAR[1])
         except (*UNUSABLE, UnicodeDecodeError) as error:
             raise InputError(f"{path}: its metadata cannot be understood ({error}).") from None
-        if not (0 < self.fps < 1e4):
-            raise InputError(f"{path}: its metadata says {self.fps} frames a second.")
-        self.poses_by = "Record3D" if self._poses else None
+        if not (0 < fps < 1e4):
+            raise InputError(f"{path}: its metadata says {fps} frames a second.")
         depths = any(name.endswith(".depth") for name in names)
-        self.has_depth = depths and _lzfse() is not None
-        if depths and not self.has_depth:
+        has_depth = depths and _lzfse() is not None
+        if depths and not has_depth:
             _log.info("Record3D's depth needs pip install 'geogs[record3d]'.")
+        self.info = RecordingInfo(
+            "record3d", path.resolve().stem, width, height, fps, len(self._images), calibration,
+            has_depth=has_depth, poses_by="Record3D" if self._poses else None, is_capture=True,
+        )  # fmt: skip
 
     @property
     def paths(self) -> Sequence[Path]:
         """The archive, or the images of the folder."""
         if not self._path.is_dir():
             return [self._path]
-        return [self._path / self._image[n] for n in self._numbers]
+        return [self._path / name for name in self._images.values()]
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read frames ``start, start + stride, ...`` before ``stop``."""
-        for n in range(len(self._numbers))[start:stop:stride]:
-            number = self._numbers[n]
-            depth = Record3dDepth(self._files, number, self._size) if self.has_depth else None
-            seconds = self._times[n] if len(self._times) == self.length else n / self.fps
+        info, has_times = self.info, len(self._times) == len(self._images)
+        for n, number in list(enumerate(self._images))[start:stop:stride]:
+            depth = Record3dDepth(self._files, number, self._size) if info.has_depth else None
+            seconds = self._times[n] if has_times else n / info.fps
             pose = self._poses.get(number)
-            label = f"{self.name}, frame {number}"
+            label = f"{info.name}, frame {number}"
             yield RawFrame(
                 label, seconds, self._picture(number), depth=depth, pose=pose, name=str(number)
             )
 
     def _picture(self, number: int) -> np.ndarray | None:
         try:
-            data = self._files.read(self._image[number], LARGEST_PICTURE)
+            data = self._files.read(self._images[number], LARGEST_PICTURE)
         except InputError:
             return None
-        picture = decoded_bytes(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).picture
-        return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        return decoded_bytes(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).rgb
 
-    def _calibration(self, metadata: dict[str, Any]) -> Calibration | None:
-        if "K" not in metadata:
-            return None
-        K = np.array(metadata["K"], dtype=np.float64).reshape(3, 3).T
-        width, height = _whole(metadata, "w", self.width), _whole(metadata, "h", self.height)
-        return Calibration(
-            K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=width, height=height, origin="Record3D"
-        ).fit(self.width, self.height)
+
+def _calibration(metadata: dict[str, Any], width: int, height: int) -> Calibration | None:
+    """The camera for images of a size."""
+    if "K" not in metadata:
+        return None
+    K = np.array(metadata["K"], dtype=np.float64).reshape(3, 3).T
+    size = _whole(metadata, "w", width), _whole(metadata, "h", height)
+    return Calibration(
+        K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=size[0], height=size[1], origin="Record3D"
+    ).fit(width, height)
 
 
 def _poses(rows: object) -> dict[int, MeasuredPose]:

@@ -6,6 +6,7 @@ pose of image k in line k, camera to world.
 
 import re
 from collections.abc import Container
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,9 @@ def open_replica(folder: Path) -> ImageList:
         for k, path in numbered(results, _NAME)
     ]
     reader = ImageList("replica", scene.name, files, None)
-    reader.calibration = _find_calibration(scene, reader.width, reader.height)
+    info = reader.info
+    calibration = _find_calibration(scene, info.width, info.height)
+    reader.info = replace(info, calibration=calibration)
     return reader
 
 
@@ -85,10 +88,10 @@ def open_posed_replica(folder: Path) -> PosedSet:
         path = file.path.with_name(f"mask{number:06d}.png")
         mask = path if path.is_file() else None
         pose = T_cw[number]
-        files.append(PosedFile(file.path, pose, reader.calibration, mask, file.timestamp))
+        files.append(PosedFile(file.path, pose, reader.info.calibration, mask, file.timestamp))
     if not files:
         raise InputError(f"{poses} holds no pose for any image of {poses.parent}.")
-    return PosedSet("replica", reader.name, tuple(files), scene_scale="metres")
+    return PosedSet("replica", reader.info.name, tuple(files), scene_scale="metres")
 
 
 def _results(folder: Path) -> Path:

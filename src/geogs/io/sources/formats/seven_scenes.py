@@ -72,16 +72,16 @@ def open_posed_seven_scenes(folder: Path) -> PosedSet:
     frames = np.rint(trajectory.timestamps * FRAMES_PER_SECOND).astype(int)
     T_cw = {int(k): colour @ np.linalg.inv(T) for k, T in zip(frames, trajectory.T_wc, strict=True)}
     files = tuple(
-        PosedFile(file.path, T_cw[k], reader.calibration, None, file.timestamp)
+        PosedFile(file.path, T_cw[k], reader.info.calibration, None, file.timestamp)
         for file in reader.files
         if (k := round(file.timestamp * FRAMES_PER_SECOND)) in T_cw
     )
     _log.info(
         "%s: the poses are those of the depth camera; the colour camera is taken to be 2.5 cm "
         "beside it.",
-        reader.name,
+        reader.info.name,
     )
-    return PosedSet("7scenes", reader.name, files, scene_scale="metres")
+    return PosedSet("7scenes", reader.info.name, files, scene_scale="metres")
 
 
 def _depth(image: Path, there: Container[str]) -> DepthFile | None:

@@ -14,7 +14,7 @@ from geogs.errors import InputError
 from geogs.io.pose_files import poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.video import VideoFile
+from geogs.io.sources.formats.video_file import VideoFile
 from geogs.io.sources.pose_priors import measured_pose, rigid, turned_upright
 from geogs.io.sources.reader import RawFrame
 from geogs.types import MeasuredPose
@@ -35,22 +35,23 @@ class StrayRecording(VideoFile):
     Poses are ARKit's, camera to world, of the frames as they are stored.
     """
 
-    kind = "stray"
-    is_capture = True
-
     def __init__(self, folder: Path) -> None:
         super().__init__(folder / "rgb.mp4")
-        self.name = folder.resolve().name
         found = (p for p in (folder / "depth").glob("*.png") if p.stem.isdecimal())
-        turns = self.quarter_turns
+        turns = self.info.quarter_turns
         self._depths = {int(path.stem): _depth(folder, path, turns) for path in found}
-        self.has_depth = bool(self._depths)
         matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
-        if matrix.is_file():
-            stored = (self.width, self.height)[:: -1 if turns % 2 else 1]
-            self.calibration = _calibration(matrix, *stored)
-        self._poses = _poses(odometry, self.quarter_turns) if odometry.is_file() else {}
-        self.poses_by = "Stray Scanner" if self._poses else None
+        stored = (self.info.width, self.info.height)[:: -1 if turns % 2 else 1]
+        self._poses = _poses(odometry, turns) if odometry.is_file() else {}
+        self.info = replace(
+            self.info,
+            kind="stray",
+            name=folder.resolve().name,
+            calibration=_calibration(matrix, *stored) if matrix.is_file() else None,
+            has_depth=bool(self._depths),
+            poses_by="Stray Scanner" if self._poses else None,
+            is_capture=True,
+        )
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read frames ``start, start + stride, ...`` before ``stop``."""

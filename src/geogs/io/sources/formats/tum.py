@@ -122,14 +122,14 @@ def open_posed_tum(folder: Path) -> PosedSet:
     if not known.all():
         _log.warning(
             "%s: left out %d of %d images, at whose time no pose was measured.",
-            reader.name, int((~known).sum()), len(known),
+            reader.info.name, int((~known).sum()), len(known),
         )  # fmt: skip
     files = tuple(
-        PosedFile(file.path, np.linalg.inv(T), reader.calibration, None, file.timestamp)
+        PosedFile(file.path, np.linalg.inv(T), reader.info.calibration, None, file.timestamp)
         for file, T, is_known in zip(reader.files, T_wc, known, strict=True)
         if is_known
     )
-    return PosedSet("tum", reader.name, files, scene_scale="metres")
+    return PosedSet("tum", reader.info.name, files, scene_scale="metres")
 
 
 def poses_at(

@@ -12,7 +12,7 @@ from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.live.capture import Capture
 from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.live.pipe import Pipe
-from geogs.io.sources.reader import RawFrame, Reader
+from geogs.io.sources.reader import RawFrame, Reader, RecordingInfo
 
 
 def open_live(address: LiveAddress, pipe: str, played: Reader | None = None) -> LiveReader:
@@ -33,13 +33,12 @@ def open_live(address: LiveAddress, pipe: str, played: Reader | None = None) -> 
 class Played:
     """The frames of another reader, none before its time has come: a rehearsal of a camera."""
 
-    kind = "play"
-
     def __init__(self, reader: Reader, name: str) -> None:
         self._reader = reader
-        self.name = name
-        self.width, self.height, self.fps = reader.width, reader.height, reader.fps
-        self.calibration = reader.calibration
+        said = reader.info
+        self.info = RecordingInfo(
+            "play", name, said.width, said.height, said.fps, calibration=said.calibration
+        )
 
     def frames(self) -> Generator[RawFrame, None, None]:
         """Frames from the first on, by their time stamps."""

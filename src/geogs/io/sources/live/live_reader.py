@@ -5,8 +5,7 @@ from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
-from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, RecordingInfo
 
 T = TypeVar("T")
 
@@ -15,15 +14,7 @@ T = TypeVar("T")
 class Feed(Protocol):
     """Where frames come from at their own pace."""
 
-    kind: str
-    name: str
-    width: int
-    """Width of the upright images, pixels."""
-    height: int
-    fps: float
-    """Frames per second, nominal."""
-    calibration: Calibration | None
-    """The camera as far as the feed says."""
+    info: RecordingInfo
 
     def frames(self) -> Generator[RawFrame, None, None]:
         """Frames from now on; each is waited for."""
@@ -33,16 +24,9 @@ class Feed(Protocol):
 class LiveReader:
     """Reader of a feed: at most one frame waits, older ones are dropped and counted."""
 
-    is_live = True
-    quarter_turns = 0
-    has_depth = False
-    length: int | None = None
-
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
-        self.kind, self.name = feed.kind, feed.name
-        self.width, self.height, self.fps = feed.width, feed.height, feed.fps
-        self.calibration = feed.calibration
+        self.info = feed.info
         self.dropped = 0
         """Frames of the last reading that came too fast to be used."""
 

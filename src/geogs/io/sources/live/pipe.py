@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from geogs.errors import InputError
-from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, RecordingInfo
 
 _RAW = re.compile(r"(\d{1,5})x(\d{1,5}):(rgb24|bgr24|gray|yuv420p)(?:@(\d+(?:\.\d+)?))?")
 _MAGIC = b"YUV4MPEG2 "
@@ -94,9 +93,6 @@ def _checked(form: RawFormat) -> RawFormat:
 class Pipe:
     """Raw frames from a stream of bytes."""
 
-    kind = "pipe"
-    name = "pipe"
-
     def __init__(self, stream: BufferedIOBase, given: str = "auto") -> None:
         """``given`` is the format in words, or auto for YUV4MPEG2. Raises InputError."""
         self._stream = stream
@@ -111,9 +107,8 @@ class Pipe:
             self._format = format_from_header(line)
         else:
             self._format = format_from_words(given)
-        self.width, self.height = self._format.width, self._format.height
-        self.fps = self._format.fps or 30.0
-        self.calibration: Calibration | None = None
+        form = self._format
+        self.info = RecordingInfo("pipe", "pipe", form.width, form.height, form.fps or 30.0)
         self._began: float | None = None
 
     def frames(self) -> Generator[RawFrame, None, None]:

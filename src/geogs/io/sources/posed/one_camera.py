@@ -33,26 +33,50 @@ class OneCamera:
     """The common camera, that of most images, and the way of each image into it."""
 
     def __init__(self, files: Sequence[PosedFile], config: InputConfig) -> None:
+        self._files = files
         self._sizes = [_size(file) for file in files]
         keys = [(file.calibration, size) for file, size in zip(files, self._sizes, strict=True)]
         cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
-        most = common_place(keys)
-        first = cameras[keys[most]]
+        self._common = common_place(keys)
+        first = cameras[keys[self._common]]
         rectifier = Rectifier(first, config.long_edge, config.field_of_view)
         self.camera: Camera = rectifier.camera
         """The pinhole camera of every image."""
         self.origin = first.origin
         """Where its intrinsics come from."""
+        keeps_maps = len(cameras) <= MAX_KEPT_MAPS
         ways = {
-            key: rectifier if camera == first else _way(camera, self.camera, rectifier.zoom)
+            key: rectifier
+            if camera == first
+            else _way(camera, self.camera, rectifier.zoom, keeps_maps)
             for key, camera in cameras.items()
         }
-        if len(ways) <= MAX_KEPT_MAPS:
-            for way in ways.values():
-                if isinstance(way, Resampler):
-                    way.keep_maps()
         self._ways = [ways[key] for key in keys]
-        _check_shared(files, self._ways, files[most])
+
+    def unlike(self) -> list[int]:
+        """Places of the images whose cameras differ too much for the common one to stand in."""
+        ways = enumerate(self._ways)
+        return [k for k, way in ways if isinstance(way, Resampler) and way.is_unlike]
+
+    def check(self) -> None:
+        """Raises InputError where cameras differ too much; warns where images are cropped."""
+        cropped = 0
+        for file, way in zip(self._files, self._ways, strict=True):
+            if isinstance(way, Rectifier):
+                continue
+            if way.is_unlike:
+                raise InputError(
+                    f"{file.path} ({way.description}) was taken with quite another camera than "
+                    f"{self._files[self._common].path}; give images of one camera, or undistort "
+                    "and crop them to one."
+                )
+            cropped += way.shared < 0.9
+        if cropped:
+            _log.warning(
+                "%d of %d images are from other cameras than most; what only they see at "
+                "their edges is not used.",
+                cropped, len(self._files),
+            )  # fmt: skip
 
     def stored_shape(self, index: int) -> tuple[int, int]:
         """Width and height of image ``index`` on disk."""
@@ -87,11 +111,15 @@ class Resampler:
     source's distortion D, whatever the scene.
     """
 
-    def __init__(self, source: Calibration, target: Camera, zoom: float) -> None:
+    def __init__(
+        self, source: Calibration, target: Camera, zoom: float, keeps_maps: bool = False
+    ) -> None:
+        """With ``keeps_maps`` where each pixel comes from is worked out once; 8 bytes a pixel."""
         camera = source.camera()
         self.shared = _shared_view(camera, target)
         """Part of the larger field of view that both have."""
-        self.enlargement = target.fx / camera.fx
+        self.is_unlike = target.fx / camera.fx > MAX_ZOOM or self.shared < MIN_SHARED
+        """Whether the cameras differ too much for the target to stand in."""
         self.description = f"{camera.width}x{camera.height}, focal length {camera.fx:.0f}"
         # The source comes to about the target's scale first, so that no detail is skipped.
         scale = min(1.0, target.fx / zoom / camera.fx)
@@ -102,11 +130,8 @@ class Resampler:
         self._resized = resized
         self._distortion, self._lens = source.distortion, source.lens
         self._target = target
+        self._keeps_maps = keeps_maps
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
-
-    def keep_maps(self) -> None:
-        """Compute where each pixel comes from once for all; takes 8 bytes a pixel."""
-        self._kept = self._maps()
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The image of the target."""
@@ -125,54 +150,20 @@ class Resampler:
         """Column and row in the resized source of each pixel of the target."""
         if self._kept is not None:
             return self._kept
-        return lens_maps(self._target, self._resized, self._distortion, self._lens)
-
-
-def unlike_common(files: Sequence[PosedFile], config: InputConfig) -> list[int]:
-    """Places of the images whose cameras differ too much from that of most for one to stand in."""
-    keys = [(file.calibration, _size(file)) for file in files]
-    cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
-    common = cameras[keys[common_place(keys)]]
-    rectifier = Rectifier(common, config.long_edge, config.field_of_view)
-    ways = {key: _way(c, rectifier.camera, rectifier.zoom) for key, c in cameras.items()}
-    return [place for place, key in enumerate(keys) if _is_unlike(ways[key])]
+        maps = lens_maps(self._target, self._resized, self._distortion, self._lens)
+        if self._keeps_maps:
+            self._kept = maps
+        return maps
 
 
 def common_place(keys: Sequence[Hashable]) -> int:
     """Place of the first image of the camera that took most; of several the first one."""
-    counts = Counter(keys)
-    return keys.index(max(counts, key=lambda key: counts[key]))
+    return keys.index(Counter(keys).most_common(1)[0][0])
 
 
-def _is_unlike(way: "Resampler | Rectifier") -> bool:
-    if isinstance(way, Rectifier):
-        return False
-    return way.enlargement > MAX_ZOOM or way.shared < MIN_SHARED
-
-
-def _check_shared(
-    files: Sequence[PosedFile], ways: Sequence[Resampler | Rectifier], common: PosedFile
-) -> None:
-    """Raise InputError where cameras differ too much for one to stand for the other."""
-    cropped = 0
-    for file, way in zip(files, ways, strict=True):
-        if isinstance(way, Rectifier):
-            continue
-        if _is_unlike(way):
-            raise InputError(
-                f"{file.path} ({way.description}) was taken with quite another camera than "
-                f"{common.path}; give images of one camera, or undistort and crop them to one."
-            )
-        cropped += way.shared < 0.9
-    if cropped:
-        _log.warning(
-            "%d of %d images are from other cameras than most; what only they see at "
-            "their edges is not used.",
-            cropped, len(files),
-        )  # fmt: skip
-
-
-def _way(camera: Calibration, target: Camera, zoom: float) -> Resampler | Rectifier:
+def _way(
+    camera: Calibration, target: Camera, zoom: float, keeps_maps: bool
+) -> Resampler | Rectifier:
     """The way of a camera into the target; without resampling where they are the same anyway."""
     if not camera.is_distorted:
         rectifier = Rectifier(camera, max(target.width, target.height))
@@ -180,7 +171,7 @@ def _way(camera: Calibration, target: Camera, zoom: float) -> Resampler | Rectif
         is_same_size = (own.width, own.height) == (target.width, target.height)
         if is_same_size and np.abs(_corners(own, target)).max() < SAME_CAMERA:
             return rectifier
-    return Resampler(camera, target, zoom)
+    return Resampler(camera, target, zoom, keeps_maps)
 
 
 def _corners(camera: Camera, target: Camera) -> Float64[np.ndarray, "2 2"]:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from geogs.errors import InputError
+from geogs.io.pose_files import is_rigid, says_pose
 from geogs.io.sources.calibration import Calibration
 
 _log = logging.getLogger(__name__)
@@ -94,12 +95,9 @@ def without_invalid_poses(posed: PosedSet) -> PosedSet:
         InputError: no pose is left, or they are mirrored or scaled altogether.
     """
     T = np.stack([file.T_cw for file in posed.files])
-    finite = np.isfinite(T).all(axis=(1, 2))
-    rotation = np.where(finite[:, None, None], T[:, :3, :3], 0.0)
-    has_pose = finite & (np.abs(rotation).sum(axis=(1, 2)) > 0)
-    valid = has_pose & _is_rotation(rotation)
+    valid, has_pose = is_rigid(T), says_pose(T)
     if valid.sum() < 0.5 * has_pose.sum():
-        _refuse(posed, rotation[has_pose])
+        _refuse(posed, T[has_pose, :3, :3])
     if not valid.any():
         raise InputError(f"{posed.name} holds no valid pose: all {len(T)} are NaN, inf or zero.")
     if not valid.all():
@@ -111,11 +109,6 @@ def without_invalid_poses(posed: PosedSet) -> PosedSet:
     return replace(
         posed, files=tuple(replace(file, T_cw=_rigid(file.T_cw)) for file in posed.files)
     )
-
-
-def _is_rotation(rotation: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, "n"]:
-    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    return (error < 1e-2) & (np.linalg.det(rotation) > 0)
 
 
 def _refuse(posed: PosedSet, rotation: Float64[np.ndarray, "n 3 3"]) -> None:

@@ -77,6 +77,7 @@ class PosedSource:
         )
         """Seconds."""
         self._one_camera = OneCamera(posed.files, config)
+        self._one_camera.check()
         check_large_enough(self._one_camera.camera, posed.name)
 
     @property

@@ -12,8 +12,8 @@ import numpy as np
 from geogs.errors import GeogsError, InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.reader import RawFrame
-from geogs.io.sources.ros.messages import (
+from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.ros.recorded_messages import (
     CAMERA_INFO,
     COMPRESSED,
     RAW,
@@ -48,10 +48,6 @@ def is_bag(path: Path) -> bool:
 class Bag:
     """Reader of the images of one topic."""
 
-    kind = "bag"
-    has_depth = False
-    quarter_turns = 0
-
     def __init__(self, path: Path, topic: str = "auto") -> None:
         """``topic`` is that of the images, or ``auto`` for the one that most likely is the camera.
 
@@ -59,20 +55,20 @@ class Bag:
             InputError: ``rosbags`` is not installed, the bag is damaged, or has no such images.
         """
         self._path = path
-        self.name = path.resolve().name
         with _opened(path) as bag:
             chosen = _chosen(bag, path, topic)
             self.topic: str = chosen
             """Whose images are read."""
             connections = _connections(bag, chosen)
-            self.length: int | None = sum(c.msgcount for c in connections)
+            length = sum(c.msgcount for c in connections)
             times = [t for _, t, _ in islice(bag.messages(connections=connections), _LOOKED_AT)]
-            self.fps = _rate(times)
             first = _first_picture(bag, connections)
             if first is None:
                 raise InputError(f"{path}: no image on {chosen} can be read; is the bag whole?")
-            self.height, self.width = first.shape[:2]
-            self.calibration: Calibration | None = _calibration(bag, chosen)
+            (height, width), calibration = first.shape[:2], _calibration(bag, chosen)
+            self.info = RecordingInfo(
+                "bag", path.resolve().name, width, height, _rate(times), length, calibration
+            )
 
     @property
     def paths(self) -> list[Path]:
@@ -93,7 +89,7 @@ class Bag:
             for index, (connection, received, data) in enumerate(islice(messages, stop)):
                 if index < start or (index - start) % stride:
                     continue
-                label = f"{self.name}, image {index}"
+                label = f"{self.info.name}, image {index}"
                 message = _read(bag, connection, data)
                 if message is None:
                     yield RawFrame(label, max(last, 0.0), None)

@@ -3,12 +3,13 @@
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file, write_text
+from geogs.io.writers.intrinsics_file import pinhole
+from geogs.io.writers.keyframe_folder import write_picture
 
 STEPS = 65535
 """Largest value of a 16-bit image."""
@@ -22,7 +23,7 @@ def depth_unit(farthest: float) -> float:
 def write_depth_png(path: Path, depth: Float[np.ndarray, "h w"], unit: float) -> None:
     """Write depth in steps of ``unit``, rounded; 0 where it is unknown or beyond the last step."""
     steps = np.round(np.where(np.isfinite(depth), depth, 0.0) / unit)
-    _write_png(path, np.where((steps > 0) & (steps <= STEPS), steps, 0).astype(np.uint16))
+    write_picture(path, np.where((steps > 0) & (steps <= STEPS), steps, 0).astype(np.uint16))
 
 
 def write_normal_png(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
@@ -30,7 +31,7 @@ def write_normal_png(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
     known = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
     steps = np.round((0.5 + 0.5 * normal.clip(-1, 1)) * STEPS)
     rgb = np.where(known, steps, 0).astype(np.uint16)
-    _write_png(path, np.ascontiguousarray(rgb[..., ::-1]))
+    write_picture(path, np.ascontiguousarray(rgb[..., ::-1]))
 
 
 def write_npz(path: Path, name: str, values: Float32[np.ndarray, "..."]) -> None:
@@ -41,12 +42,5 @@ def write_npz(path: Path, name: str, values: Float32[np.ndarray, "..."]) -> None
 
 def write_description(path: Path, camera: Camera, meaning: dict[str, object]) -> None:
     """``description.json``: the camera of the maps, and what their numbers mean."""
-    pinhole = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    document = {**pinhole, "first_pixel_centre": [0, 0], **meaning}
+    document = {**pinhole(camera), "first_pixel_centre": [0, 0], **meaning}
     write_text(path, json.dumps(document, indent=2) + "\n")
-
-
-def _write_png(path: Path, picture: np.ndarray) -> None:
-    _, data = cv2.imencode(".png", picture)
-    with atomic_file(path) as stream:
-        stream.write(data.tobytes())

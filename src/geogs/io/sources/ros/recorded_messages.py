@@ -59,9 +59,7 @@ def picture_of(message: Any) -> Decoded:
     if not hasattr(message, "format"):
         return Decoded(_raw(message))
     found = decoded_bytes(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
-    if found.picture is None:
-        return found
-    return Decoded(cv2.cvtColor(found.picture, cv2.COLOR_BGR2RGB), found.is_damaged)
+    return Decoded(found.rgb, found.is_damaged)
 
 
 def _raw(message: Any) -> UInt8[np.ndarray, "h w 3"] | None:

@@ -10,8 +10,7 @@ from av.container import InputContainer
 from jaxtyping import UInt8
 
 from geogs.errors import InputError
-from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, RecordingInfo
 
 # FFmpeg also "plays" text, single pictures and play lists; none of them is a video file.
 _NOT_VIDEO = frozenset({"tty", "image2", "hls", "concat", "concatf", "dash", "sdp", "lrc", "srt"})
@@ -25,25 +24,22 @@ _log = logging.getLogger(__name__)
 class VideoFile:
     """Reader of one video; turned upright by the container's display matrix."""
 
-    kind = "video"
-    has_depth = False
-
     def __init__(self, path: Path) -> None:
-        self.name = path.name
         self._path = path
         with _open(path) as container:
             stream = container.streams.video[0]
-            self.length: int | None = stream.frames or None
-            self.fps = float(stream.average_rate or stream.guessed_rate or 30)
+            length = stream.frames or None
+            fps = float(stream.average_rate or stream.guessed_rate or 30)
             first = next((frame for frame in _decoded(container, path) if frame), None)
             if first is None:
                 raise InputError(
                     f"{path} holds no picture that can be decoded; is it complete and a video?"
                 )
-            self.quarter_turns = clockwise_quarter_turns(float(first.rotation))
-            size = (first.width, first.height)
-        self.width, self.height = size[::-1] if self.quarter_turns % 2 else size
-        self.calibration: Calibration | None = None
+            turns = clockwise_quarter_turns(float(first.rotation))
+            width, height = (first.width, first.height)[:: -1 if turns % 2 else 1]
+        self.info = RecordingInfo(
+            "video", path.name, width, height, fps, length, quarter_turns=turns
+        )
 
     @property
     def paths(self) -> list[Path]:
@@ -58,12 +54,12 @@ class VideoFile:
                 if stop is not None and index >= stop:
                     return
                 is_wanted = index >= start and (index - start) % stride == 0
-                label = f"{self.name}, frame {index}"
+                label = f"{self.info.name}, frame {index}"
                 if frame is not None:
                     last = self._time(frame, last)
                     if is_wanted:
                         image = frame.to_ndarray(format="rgb24")
-                        upright = turn_upright(image, self.quarter_turns)
+                        upright = turn_upright(image, self.info.quarter_turns)
                         yield RawFrame(label, last, upright, name=str(index))
                 elif is_wanted:
                     yield RawFrame(label, last or 0.0, None)
@@ -72,7 +68,7 @@ class VideoFile:
         """The presentation time; raw streams and broken muxers have none that increases."""
         if frame.time is not None and (last is None or frame.time > last):
             return frame.time
-        return 0.0 if last is None else last + 1 / self.fps
+        return 0.0 if last is None else last + 1 / self.info.fps
 
 
 def clockwise_quarter_turns(rotation: float) -> int:
