@@ -12,7 +12,7 @@ from geogs.mapping import view_arrays
 from geogs.mapping.dense_depths import get_depth
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.arrays import ArrayTable
-from geogs.world.keyframes import MeasuredCells
+from geogs.world.cell_depths import MeasuredCells
 from geogs.world.map import ViewRow
 from keyframe_samples import Sample, segment_of, views_of
 

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.world.cell_depths import MeasuredCells
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import KeyframeSet, KeyframeTable, MeasuredCells, check_keyframes
+from geogs.world.keyframes import KeyframeSet, KeyframeTable, check_keyframes
 from geogs.world.pack import pack, schema, unpack
 
 

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.geometry.lie import scaled, sim3_scale
-from geogs.priors.monocular_prior import DepthKind
 from geogs.types import MeasuredPose, PoseCorrection
 from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
+from geogs.world.cell_depths import KeyframePrior, MeasuredCells
 from geogs.world.grid import SampleGrid
 from geogs.world.pose_table import PoseTable
 
@@ -25,41 +25,6 @@ KNOWN = 0.3
 """Relative deviation up to which a depth helps to tell where a camera is."""
 RELATIVE_FLOOR = 0.004
 """Relative depth deviation that no amount of matches removes."""
-
-
-@dataclass
-class KeyframePrior:
-    """What a monocular prior said of a keyframe's depth, and how it is scaled; mutable."""
-
-    kind: DepthKind
-    values: Float[Tensor, "p"]
-    """As the prior gave them, on the grid."""
-    inverse_depth: Float[Tensor, "p"]
-    """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
-    scale: Float[Tensor, "k"]
-    """Factors of the aligned inverse depth at the nodes of a coarse grid, row by row."""
-    information: Float[Tensor, "p"]
-    """What it adds to the inverse variance of the keyframe's inverse depth."""
-    is_aligned: bool = False
-
-    def rescale(self, factor: float) -> None:
-        """Multiply every length by ``factor``."""
-        self.scale = self.scale / factor
-        self.information = self.information * factor**2
-
-
-@dataclass
-class MeasuredCells:
-    """What a depth sensor says of a keyframe's cells, in the lengths of the map; mutable."""
-
-    inverse_depth: Float[Tensor, "p"]
-    information: Float[Tensor, "p"]
-    """Inverse variance of inverse depth; 0 where it says nothing."""
-
-    def rescale(self, factor: float) -> None:
-        """Multiply every length by ``factor``."""
-        self.inverse_depth = self.inverse_depth / factor
-        self.information = self.information * factor**2
 
 
 @dataclass(eq=False)
@@ -221,7 +186,7 @@ class KeyframeTable:
     """The flow operator's; images are encoded again by it when needed."""
     set_of: dict[int, "KeyframeSet"] = field(init=False, repr=False, metadata=NOT_STORED)
     """The set that a keyframe is in at present."""
-    _removed: list[int] = field(default_factory=list, init=False, repr=False, metadata=NOT_STORED)
+    removed: list[int] = field(default_factory=list, init=False, repr=False, metadata=NOT_STORED)
     """Keyframes that somebody may still be looking at."""
 
     @staticmethod
@@ -254,23 +219,12 @@ class KeyframeTable:
     def __contains__(self, id: int) -> bool:
         return id in self.set_of
 
-    @property
-    def resident(self) -> int:
-        """Keyframes whose large arrays stay in memory."""
-        return self.arrays.resident
-
-    def pop(self, id: int) -> Keyframe:
-        """Take a keyframe out; what is kept of it by id goes with ``forget_removed``."""
-        del self.set_of[id]
-        self._removed.append(id)
-        return self.keyframes.pop(id)
-
     def forget_removed(self) -> None:
         """Let poses and large arrays of keyframes that were taken out go."""
-        for id in self._removed:
+        for id in self.removed:
             self.arrays.forget(id)
             self.poses.T_cw.pop(id, None)
-        self._removed = []
+        self.removed = []
 
     def new_set(self) -> "KeyframeSet":
         """A set without keyframes."""
@@ -357,8 +311,11 @@ class KeyframeSet:
 
     def remove(self, id: int) -> Keyframe:
         """Take a keyframe out of set and table; it has pose and images until the next is added."""
+        table = self.table
         self.members.remove(id)
-        return self.table.pop(id)
+        del table.set_of[id]
+        table.removed.append(id)
+        return table.keyframes.pop(id)
 
     def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera, float64, on the CPU."""

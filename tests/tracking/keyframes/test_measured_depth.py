@@ -10,8 +10,8 @@ from geogs.config import Config
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
+from geogs.world.cell_depths import MeasuredCells
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import MeasuredCells
 from geogs.world.segments import TrackState
 from records import copied
 from tracking_runs import CONFIG

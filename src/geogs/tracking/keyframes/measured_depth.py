@@ -8,8 +8,9 @@ from geogs.bundle.device_choice import grid_fields
 from geogs.config import DepthSensorConfig
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.types import MeasuredDepth
+from geogs.world.cell_depths import MeasuredCells
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs.world.keyframes import Keyframe, MeasuredCells
+from geogs.world.keyframes import Keyframe
 
 
 class KeyframeDepthSensor:

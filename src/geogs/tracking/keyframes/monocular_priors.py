@@ -12,8 +12,9 @@ from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.monocular_prior import MonocularPrior
 from geogs.tracking.depth_prior import DEVIATION, FlowEvidence, adjust_depth, flow_evidence
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
+from geogs.world.cell_depths import KeyframePrior
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs.world.keyframes import Keyframe, KeyframePrior
+from geogs.world.keyframes import Keyframe
 
 CAUTION = 4.0
 """Factor on the deviation that mapping is given of a prior, since it takes a tracker's deviations
