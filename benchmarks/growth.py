@@ -91,7 +91,7 @@ def mapping(count: int, size: tuple[int, int]) -> dict[str, float]:
     return {
         "views whose depths check one": cost(lambda: mapper.depths.near(view)),
         "views that vote on disks": cost(lambda: mapper.growth.voters(view)),
-        "photometric partners": cost(lambda: mapper.partners.choose(view)),
+        "photometric partners": cost(lambda: mapper.partners.choose([view])),
         "loop candidates by pose": cost(lambda: detector.candidates(count - 1)),
         "depths for the search of loops": cost(detector._depths),
         "poses of all keyframes": cost(lambda: segment.poses(segment.ids)),

@@ -278,7 +278,7 @@ class Judge:
 
 def normals(mapper: Mapper) -> Tensor:
     """Of the disks."""
-    return quaternion_to_matrix(mapper.table.disks.quaternion.detach().double())[:, :, 2]
+    return quaternion_to_matrix(mapper.table.disks.parameters.quaternion.detach().double())[:, :, 2]
 
 
 def neighbouring(mapper: Mapper, reach: int = 8) -> tuple[Tensor, Tensor]:

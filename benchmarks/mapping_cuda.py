@@ -33,8 +33,9 @@ from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
 from geogs.splat.cuda import autograd
+from geogs.splat.cuda.autograd import RasterizeOnGpu
 from geogs.splat.init import NEIGHBOURS, initialise_disks
-from geogs.splat.render import render_views
+from geogs.splat.render import NEAR, RenderOutput
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
@@ -188,7 +189,8 @@ class Plain:
 
     def _loss(self) -> Tensor:
         window, config = self.window, self.config
-        out = render_views(self.disks, window.cameras.render, self.poses, "cuda")
+        camera = window.cameras.render
+        out = RenderOutput(*RasterizeOnGpu.apply(*self.disks, self.poses, camera, NEAR))
         shown = torch.where(out.alpha.detach() > MIN_ALPHA, out.depth, 0.0)
         losses = []
         for k, (view, partners) in enumerate(window.batch):

@@ -51,7 +51,9 @@ def test_replaced_disks_keep_their_keyframe_and_start_without_moments() -> None:
     chosen = worth_splitting(scene, optimizer.position_gradient, 0.34, 0.05)
     assert chosen.tolist() == [True, False, False]
     ids = scene.keyframe_id[chosen]
-    scene.replace(chosen, split(scene, chosen), torch.cat([ids, ids]))
+    halves = split(scene, chosen)
+    scene.keep(~chosen)
+    scene.append(halves, torch.cat([ids, ids]))
     assert scene.keyframe_id.tolist() == [1, 2, 0, 0]
     assert optimizer.position_gradient.tolist() == pytest.approx([0.1, 1.0, 0.0, 0.0], rel=1e-4)
     assert scene.steps.tolist() == [1, 1, 0, 0]

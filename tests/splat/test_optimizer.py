@@ -110,7 +110,7 @@ def test_zero_grad_and_missing_gradients() -> None:
     set_gradients(optimizer.disks, 1)
     optimizer.zero_grad()
     before = [p.detach().clone() for p in optimizer.disks.parameters]
-    optimizer.disks.opacity_logit.grad = torch.ones(3)
+    optimizer.disks.parameters.opacity_logit.grad = torch.ones(3)
     optimizer.step(torch.ones(3, dtype=torch.bool))
     after = optimizer.disks.parameters
     assert all(torch.equal(a, b) for a, b in zip(after[:3], before[:3], strict=True))

@@ -25,7 +25,7 @@ def filled(n: int = 20) -> GaussianMap:
 
 def test_append_and_keep() -> None:
     full = filled(4)
-    full.mark_seen(torch.tensor([True, False, True, False]))
+    full.seen += torch.tensor([True, False, True, False])
     full.append(disks(2, seed=1), torch.tensor([7, 8]))
     assert len(full) == 6
     assert full.keyframe_id.tolist() == [3, 3, 3, 3, 7, 8]
@@ -50,8 +50,10 @@ def test_snapshot_is_detached_and_normalised() -> None:
     full = filled()
     snapshot = full.snapshot()
     assert torch.allclose(snapshot.quaternion.norm(dim=1), torch.ones(20))
-    assert torch.allclose(snapshot.scale.log(), full.log_scale.detach())
-    assert torch.allclose(snapshot.opacity.logit(), full.opacity_logit.detach(), atol=1e-5)
+    assert torch.allclose(snapshot.scale.log(), full.parameters.log_scale.detach())
+    assert torch.allclose(
+        snapshot.opacity.logit(), full.parameters.opacity_logit.detach(), atol=1e-5
+    )
     before = snapshot.position.clone()
     with torch.no_grad():
         full.position.add_(1)
@@ -87,8 +89,8 @@ def test_a_similarity_per_disk() -> None:
         alone.transform(sim3_exp(xi[k]))
         for a, b in zip(together.parameters, alone.parameters, strict=True):
             assert torch.allclose(a[k], b[k], atol=1e-6)
-    assert together.log_scale.detach().numpy() == pytest.approx(
-        filled().log_scale.detach().numpy() + xi[:, 6:].numpy(), abs=1e-5
+    assert together.parameters.log_scale.detach().numpy() == pytest.approx(
+        filled().parameters.log_scale.detach().numpy() + xi[:, 6:].numpy(), abs=1e-5
     )
 
 

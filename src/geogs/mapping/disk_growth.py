@@ -87,5 +87,6 @@ class DiskGrowth:
         chosen = worth_splitting(
             disks, optimizer.position_gradient, config.split_ratio, SPLIT_PIXELS * pixel
         )
-        ids = disks.keyframe_id[chosen]
-        disks.replace(chosen, split(disks, chosen), torch.cat([ids, ids]))
+        halves, ids = split(disks, chosen), disks.keyframe_id[chosen]
+        disks.keep(~chosen)
+        disks.append(halves, torch.cat([ids, ids]))

@@ -56,10 +56,8 @@ class MapView:
     @property
     def depth_view(self) -> DepthView:
         """What the depth estimation needs."""
-        loaded, (inverse_depth, information) = (
-            self.arrays.load(self.id),
-            self.keyframe.depth_field(),
-        )
+        loaded = self.arrays.load(self.id)
+        inverse_depth, information = self.keyframe.depth_field()
         if loaded.matched is None:
             loaded.matched = depth_images(loaded.image, self.arrays.cameras.render)
         if (search := self.row.search) is not None:  # the grid says what is usual, and hardly that
@@ -83,7 +81,8 @@ class MapView:
     @property
     def has_depth(self) -> bool:
         """Whether its depth has been estimated."""
-        return self.arrays.has_depth(self.id)
+        loaded = self.arrays.loaded.peek(self.id)
+        return (self.row.depth if loaded is None else loaded.depth) is not None
 
     @property
     def dense(self) -> DenseDepth:
@@ -98,7 +97,10 @@ class MapView:
     @property
     def typical_depth(self) -> float:
         """Median of the dense depth, map units."""
-        return self.arrays.typical_depth(self.id)
+        written = self.row.depth
+        if self.id not in self.arrays.loaded and written is not None:
+            return written.typical_at(self.keyframe.scale)
+        return self.dense.typical
 
     @property
     def constants(self) -> ViewConstants | None:
@@ -119,7 +121,11 @@ class MapView:
 
     @rendered_depth.setter
     def rendered_depth(self, depth: Float[Tensor, "h w"] | None) -> None:
-        self.arrays.set_rendered_depth(self.id, depth)
+        if depth is None:
+            self.arrays.table.arrays.drop("rendered depth", self.id)
+        if self.id in self.arrays.loaded or depth is not None:
+            loaded = self.arrays.load(self.id)
+            loaded.rendered_depth, loaded.is_render_written = depth, False
 
     def set_depth(self, depth: DenseDepth) -> None:
         """Take over a dense depth, on which the losses' constants then live."""
@@ -127,7 +133,10 @@ class MapView:
 
     def set_exposure(self, exposure: Float[Tensor, "2"]) -> None:
         """Compensate its exposure, which was not known."""
-        self.arrays.set_exposure(self.id, exposure)
+        self.row.exposure = exposure
+        loaded = self.arrays.loaded.peek(self.id)
+        if loaded is not None:
+            loaded.photo = exposure[0] * loaded.photo + exposure[1]
 
 
 class KeyframeViews(Mapping[int, MapView]):

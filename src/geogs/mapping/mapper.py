@@ -79,7 +79,11 @@ class Mapper:
         self.table = table
         self.views = KeyframeViews(ViewArrays(table, keyframes, self.cameras, config.loss))
         engine = depth_engine(
-            table.disks.device, render, self.cameras.working, config.depth, keyframes.resident
+            table.disks.device,
+            render,
+            self.cameras.working,
+            config.depth,
+            keyframes.arrays.resident,
         )
         self.depths = KeyframeDepths(engine, self.views, sensor)
         self.partners = Partners(self.views, table, config.photo)
@@ -96,7 +100,7 @@ class Mapper:
                 self.table.unit = _unit(self.views[self.table.mapped[0]])
             self._trainer = map_trainer(
                 self.table.disks, self.cameras, self.config, self.table.unit,
-                self.keyframes.resident,
+                self.keyframes.arrays.resident,
             )  # fmt: skip
         return self._trainer
 
@@ -134,7 +138,7 @@ class Mapper:
             view.set_depth(shown_depth(shown))
         self.table.mapped, self.table.given = [*ids], [*ids]
         self.table.unit = _unit(self.views[ids[0]])
-        self.partners.choose_all()
+        self.partners.choose(self._mapped())
         self.table.disks.append(parameters, ids[0])
         self.table.disks.seen.fill_(1)
 
@@ -150,8 +154,7 @@ class Mapper:
         self.depths.check([view])
         self.pause()
         table.mapped.append(keyframe_id)
-        self.partners.choose(view)
-        self.partners.compensate(view)
+        self.partners.choose([view])
         trainer = self.trainer
         self.growth.carve([view, *self.depths.near(view)])
         self.pause()
@@ -209,8 +212,8 @@ class Mapper:
 
     def grow(self) -> None:
         """Carve the map with all mapped keyframes, and add what their depths show beyond it."""
-        self.partners.choose_all()
         views = self._mapped()
+        self.partners.choose(views)
         self.growth.prune(views)
         for view in views:
             self.growth.insert(view, self.config.disk.insert_confidence)

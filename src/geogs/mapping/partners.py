@@ -36,7 +36,14 @@ class Partners:
     def __init__(self, views: KeyframeViews, table: MapTable, config: PhotoConfig) -> None:
         self._views, self._table, self._config = views, table, config
 
-    def choose(self, view: MapView) -> None:
+    def choose(self, views: Sequence[MapView]) -> None:
+        """Partners of some mapped views, then their exposures."""
+        for view in views:
+            self._choose(view)
+        for view in views:
+            self._compensate(view)
+
+    def _choose(self, view: MapView) -> None:
         """Partners of a view; it becomes a candidate for those before it."""
         near = self._views.near(view, self._table.mapped, CANDIDATES)
         view.row.partners = choose_partners(view, near, self._config)
@@ -46,20 +53,13 @@ class Partners:
             pool = [self._views[j] for j in ids if j in self._views]
             other.row.partners = choose_partners(other, pool, self._config)
 
-    def compensate(self, view: MapView) -> None:
+    def _compensate(self, view: MapView) -> None:
         """Give a view's grey values the exposure of the partners where that is known."""
         if view.row.exposure is not None or not self._config.compensate_exposure:
             return
         partners = [self._views[i] for i in view.row.partners]
         known = [other for other in partners if other.row.exposure is not None]
         view.set_exposure(exposure_of(view, known))
-
-    def choose_all(self) -> None:
-        """Partners of all mapped views, then their exposures."""
-        for i in self._table.mapped:
-            self.choose(self._views[i])
-        for i in self._table.mapped:
-            self.compensate(self._views[i])
 
 
 def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -> list[int]:

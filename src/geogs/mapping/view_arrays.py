@@ -79,12 +79,12 @@ class ViewArrays:
         self.cameras = cameras
         self.loss = loss
         self.device = table.disks.device
-        self.loaded: LruCache[int, LoadedView] = LruCache(keyframes.resident, self._write)
+        self.loaded: LruCache[int, LoadedView] = LruCache(keyframes.arrays.resident, self._write)
         """Those in memory; whoever asks uses ``load``."""
         self._ahead = ReadAhead(
             lambda id: self._with_constants(id, self._load(id)), self._basis, self.device
         )
-        table.arrays.resident = keyframes.resident
+        table.arrays.resident = keyframes.arrays.resident
         for id in table.resident:
             self.loaded.put(id, self._load(id, as_written=True))
 
@@ -120,11 +120,6 @@ class ViewArrays:
             "mask there", id, lambda: torch.from_numpy(arrays.load("mask", id)).to(self.device)
         )
 
-    def has_depth(self, id: int) -> bool:
-        """Whether its depth has been estimated."""
-        loaded = self.loaded.peek(id)
-        return (self.table.views[id].depth if loaded is None else loaded.depth) is not None
-
     def depth(self, id: int) -> DenseDepth:
         """The dense depth, where there must be one."""
         loaded = self.loaded.peek(id)
@@ -133,13 +128,6 @@ class ViewArrays:
         depth = self._at_scale(id, loaded).depth
         assert depth is not None, f"keyframe {id} has no depth yet"
         return depth
-
-    def typical_depth(self, id: int) -> float:
-        """Median of the dense depth, map units."""
-        written = self.table.views[id].depth
-        if id not in self.loaded and written is not None:
-            return written.typical_at(self.keyframes[id].scale)
-        return self.depth(id).typical
 
     def set_depth(self, id: int, depth: DenseDepth) -> None:
         """Take over a dense depth, on which the losses' constants then live."""
@@ -165,31 +153,12 @@ class ViewArrays:
         """What the single-view losses need; None until the keyframe has a depth."""
         return self._with_constants(id, self.load(id)).constants
 
-    def set_exposure(self, id: int, exposure: Float[Tensor, "2"]) -> None:
-        """Compensate the exposure of a view, for which that was not known."""
-        self.table.views[id].exposure = exposure
-        loaded = self.loaded.peek(id)
-        if loaded is not None:
-            loaded.photo = exposure[0] * loaded.photo + exposure[1]
-
-    def set_rendered_depth(self, id: int, depth: Float[Tensor, "h w"] | None) -> None:
-        """Take over the map's last rendering from a view, or that there is none any more."""
-        if depth is None:
-            self.table.arrays.drop("rendered depth", id)
-        if id in self.loaded or depth is not None:
-            loaded = self.load(id)
-            loaded.rendered_depth, loaded.is_render_written = depth, False
-
     # --- from and to the file --------------------------------------------------------------
 
     def _load(self, id: int, as_written: bool = False) -> LoadedView:
         """The large parts of a view; its depth at the keyframe's scale, or as it was written."""
-        cameras, loss, keyframe, row = (
-            self.cameras,
-            self.loss,
-            self.keyframes[id],
-            self.table.views[id],
-        )
+        cameras, loss = self.cameras, self.loss
+        keyframe, row = self.keyframes[id], self.table.views[id]
         image = keyframe.image
         photo = PhotoView.prepare(
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour

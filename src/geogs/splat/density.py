@@ -86,9 +86,10 @@ def split(disks: GaussianMap, chosen: Bool[Tensor, "n"]) -> DiskParameters:
     scale = disks.scale[chosen]
     longer = scale.argmax(1)
     rows = torch.arange(len(scale), device=scale.device)
-    axes = quaternion_to_matrix(disks.quaternion.detach()[chosen])
+    position, quaternion, _, opacity_logit = (p.detach()[chosen] for p in disks.parameters)
+    axes = quaternion_to_matrix(quaternion)
     offset = 0.5 * scale[rows, longer, None] * axes[rows, :, longer]
-    position, log_scale = disks.position.detach()[chosen], scale.log()
+    log_scale = scale.log()
     log_scale[rows, longer] -= log(_SPLIT_SHRINK)
 
     def twice(x: Tensor) -> Tensor:
@@ -96,7 +97,7 @@ def split(disks: GaussianMap, chosen: Bool[Tensor, "n"]) -> DiskParameters:
 
     return DiskParameters(
         torch.cat([position - offset, position + offset]),
-        twice(disks.quaternion.detach()[chosen]),
+        twice(quaternion),
         twice(log_scale),
-        twice(disks.opacity_logit.detach()[chosen]),
+        twice(opacity_logit),
     )

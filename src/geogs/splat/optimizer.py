@@ -1,8 +1,7 @@
 """Adam for a map whose disks come, go and move."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,8 +10,7 @@ from torch import Tensor
 from geogs.world.disks import GaussianMap
 
 
-@dataclass(frozen=True, slots=True)
-class LearningRates:
+class LearningRates(NamedTuple):
     """Adam step sizes per group."""
 
     position: float
@@ -20,9 +18,6 @@ class LearningRates:
     quaternion: float
     log_scale: float
     opacity_logit: float
-
-    def __iter__(self) -> Iterator[float]:
-        return iter((self.position, self.quaternion, self.log_scale, self.opacity_logit))
 
 
 class MapOptimizer:

@@ -88,34 +88,6 @@ def render(
     return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, worker_count()))
 
 
-def render_views(
-    disks: GaussianMap | DiskParameters,
-    camera: Camera,
-    T_cw: Float[Tensor, "b 4 4"],
-    backend: Backend = "auto",
-    near: float = NEAR,
-) -> RenderOutput:
-    """:func:`render` for several poses at once; every map has a leading dimension.
-
-    On a GPU all views share each kernel's launch.
-    """
-    parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
-    on_gpu = parameters.position.is_cuda and parameters.position.dtype == torch.float32
-    if backend == "cuda" or (backend == "auto" and on_gpu):
-        from geogs.splat.cuda.autograd import RasterizeOnGpu
-
-        return RenderOutput(*RasterizeOnGpu.apply(*parameters, T_cw, camera, near))
-    views = [render(parameters, camera, T, backend, near) for T in T_cw]
-    return RenderOutput(
-        depth=torch.stack([v.depth for v in views]),
-        normal=torch.stack([v.normal for v in views]),
-        alpha=torch.stack([v.alpha for v in views]),
-        distortion=torch.stack([v.distortion for v in views]),
-        median_depth=torch.stack([v.median_depth for v in views]),
-        visible=torch.stack([v.visible for v in views]).any(0),
-    )
-
-
 class _Rasterize(torch.autograd.Function):
     """The cpu backend."""
 

@@ -52,7 +52,7 @@ class GaussianMap:
     steps: Int64[Tensor, "n"]
     """Steps of the optimiser so far."""
     seen: Int64[Tensor, "n"]
-    """Times that a disk was marked as seen."""
+    """Renderings in training that showed a disk."""
 
     def __post_init__(self) -> None:
         groups = (self.parameters, self.first, self.second)
@@ -82,21 +82,6 @@ class GaussianMap:
         """Centres, world frame, map units."""
         return self.parameters.position
 
-    @property
-    def quaternion(self) -> Float[Tensor, "n 4"]:
-        """As the parameters have it."""
-        return self.parameters.quaternion
-
-    @property
-    def log_scale(self) -> Float[Tensor, "n 2"]:
-        """As the parameters have it."""
-        return self.parameters.log_scale
-
-    @property
-    def opacity_logit(self) -> Float[Tensor, "n"]:
-        """As the parameters have it."""
-        return self.parameters.opacity_logit
-
     def __len__(self) -> int:
         return len(self.position)
 
@@ -108,12 +93,12 @@ class GaussianMap:
     @property
     def scale(self) -> Float[Tensor, "n 2"]:
         """Standard deviations along the tangents, detached."""
-        return self.log_scale.detach().exp()
+        return self.parameters.log_scale.detach().exp()
 
     @property
     def opacity(self) -> Float[Tensor, "n"]:
         """In (0, 1), detached."""
-        return self.opacity_logit.detach().sigmoid()
+        return self.parameters.opacity_logit.detach().sigmoid()
 
     @property
     def capacity(self) -> int:
@@ -125,16 +110,12 @@ class GaussianMap:
         """The trained tensors with all their room; rows beyond the disks mean nothing."""
         return DiskParameters(*(rows.room for rows in self._trained))
 
-    @property
-    def counters_room(self) -> tuple[Int[Tensor, "c"], Int[Tensor, "c"]]:
-        """``steps`` and ``seen`` with all their room."""
-        return self._counts[1].room, self._counts[2].room
-
-    def moments_room(self) -> list[Tensor]:
-        """First, then second moments of the four groups with all their room (as the parameters)."""
+    def training_room(self) -> list[Tensor]:
+        """First, then second moments of the four groups, ``steps`` and ``seen``, with as much room
+        as the parameters."""
         for m, p in zip(self._moments, self._trained * 2, strict=True):
             m.reserve(len(p.room))
-        return [m.room for m in self._moments]
+        return [rows.room for rows in (*self._moments, *self._counts[1:])]
 
     def append(self, parameters: DiskParameters, keyframe_id: int | Int[Tensor, "m"]) -> None:
         """Add disks behind the present ones, with empty moments; old gradients are dropped."""
@@ -161,12 +142,6 @@ class GaussianMap:
         self._expose()
 
     @torch.no_grad()
-    def replace(self, gone: Bool[Tensor, "n"], new: DiskParameters, keyframe_id: Tensor) -> None:
-        """Drop some disks and add others."""
-        self.keep(~gone)
-        self.append(new, keyframe_id)
-
-    @torch.no_grad()
     def excerpt(self, index: Int[Tensor, "m"]) -> "GaussianMap":
         """A map of some of the disks: copies, which :meth:`take_back` returns."""
 
@@ -185,10 +160,6 @@ class GaussianMap:
         theirs = (*part.parameters, *part.first, *part.second, part.steps, part.seen)
         for mine, other in zip(own, theirs, strict=True):
             mine.detach()[index] = other.detach()
-
-    def mark_seen(self, visible: Bool[Tensor, "n"]) -> None:
-        """Count the disks that a rendering showed."""
-        self.seen += visible
 
     @torch.no_grad()
     def transform(self, S: Float[Tensor, "*n 4 4"]) -> None:
@@ -212,16 +183,17 @@ class GaussianMap:
             first.copy_((matrix @ first[..., None])[..., 0])
             second.copy_((matrix.square() @ second[..., None])[..., 0])
         moved = (linear @ self.position.to(S.dtype)[..., None])[..., 0] + S[..., :3, 3]
+        position, quaternion, log_scale, _ = self.parameters
         turned = quaternion_multiply(
-            rotation.expand(len(self), 4).contiguous(), self.quaternion.to(S.dtype)
+            rotation.expand(len(self), 4).contiguous(), quaternion.to(S.dtype)
         )
-        self.position.copy_(moved)
-        self.quaternion.copy_(turned)
-        self.log_scale.add_(scale.log()[..., None].to(self.log_scale.dtype))
+        position.copy_(moved)
+        quaternion.copy_(turned)
+        log_scale.add_(scale.log()[..., None].to(log_scale.dtype))
 
     def snapshot(self) -> MapSnapshot:
         """The disks as plain numbers: copies, detached, quaternions normalised."""
-        quaternion = self.quaternion.detach()
+        quaternion = self.parameters.quaternion.detach()
         return MapSnapshot(
             position=self.position.detach().clone(),
             quaternion=quaternion / quaternion.norm(dim=-1, keepdim=True),

@@ -141,7 +141,7 @@ class CpuTrainer:
         sums = [sum(g[1:], g[0]) for g in zip(*(p.gradients for p in passes), strict=True)]
         for parameter, gradient in zip(self.disks.parameters, sums, strict=True):
             parameter.grad = gradient
-        self.disks.mark_seen(visible)
+        self.disks.seen += visible
         self.optimizer.step(visible & _sane_gradients(self.disks.parameters))
         self.optimizer.zero_grad()
         self._bound_scales()
@@ -169,7 +169,7 @@ class CpuTrainer:
     def _bound_scales(self) -> None:
         disk = self.config.disk
         low, high = disk.min_scale * self.unit, disk.max_scale * self.unit
-        self.disks.log_scale.clamp_(float(np.log(low)), float(np.log(high)))
+        self.disks.parameters.log_scale.clamp_(float(np.log(low)), float(np.log(high)))
 
 
 def _within(view: MapView, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -128,7 +128,7 @@ class _TrainingStep:
         self._schedule[: len(rows)] = to_device(torch.from_numpy(rows), self._device)
         scale = torch.as_tensor(np.asarray(factors, np.float32))
         self._factors[: len(rows)] = to_device(scale, self._device)
-        rates = torch.tensor(list(self._trainer.optimizer.learning_rates))
+        rates = torch.tensor(self._trainer.optimizer.learning_rates)
         self._base.copy_(to_device(rates, self._device))
         self._count.fill_(len(self._trainer.disks))
         self._completed.zero_()
@@ -165,7 +165,6 @@ class _TrainingStep:
         bounds = (np.log(disk.min_scale * trainer.unit), np.log(disk.max_scale * trainer.unit))
         self._kernels["adam_step"](
             -(-self._capacity // 256), 256, self._capacity, self._count, p.rasterizer.status,
-            self._completed, *room, *p.d_disks, *trainer.disks.moments_room(),
-            *trainer.disks.counters_room, p.maps.visible, self._rates, *optimizer.betas,
-            optimizer.eps, GRADIENT_LIMIT, *bounds,
+            self._completed, *room, *p.d_disks, *trainer.disks.training_room(), p.maps.visible,
+            self._rates, *optimizer.betas, optimizer.eps, GRADIENT_LIMIT, *bounds,
         )  # fmt: skip
