@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from geogs.depth.completion import complete_inverse_depth, upsample_grid
-from geogs.depth.depth_view import DepthView, KeyframeDepth, depth_view
+from geogs.depth.depth_view import DepthView, KeyframeDepth, depth_images
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.evidence import CONFIDENT_DEVIATION
 from geogs.depth.fusion import check_depth
@@ -52,7 +52,8 @@ def load_views(
         keyframe.inverse_depth = torch.from_numpy((data["d"][i] / scale).astype(np.float32)).ravel()
         information = (data["info"][i] * scale**2).astype(np.float32)
         keyframe.information = torch.from_numpy(information).ravel()
-        views.append(depth_view(keyframe, render))
+        images = (*depth_images(keyframe.image, render), keyframe.image)
+        views.append(DepthView(i, keyframe.T_cw.numpy(), *images, *keyframe.depth_field()))
     return views, working, render, true
 
 

@@ -17,7 +17,7 @@ from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
-from geogs.depth.depth_view import depth_view
+from geogs.depth.depth_view import Viewpoint
 from geogs.depth.estimate import estimate_depth
 from geogs.errors import InputError
 from geogs.io.pose_files import read_tum_trajectory
@@ -28,7 +28,6 @@ from geogs.mapping.known_poses import depth_search
 from geogs.mapping.map_all import spread_order
 from geogs.mesh.mesh_file import read_mesh
 from geogs.reconstruction import Reconstruction
-from keyframe_samples import Sample, segment_of
 from posed_scene import (
     DEFAULT,
     SMALL,
@@ -291,9 +290,7 @@ def test_poses_that_show_nothing_are_refused():
 
 
 def test_where_depth_is_searched_follows_from_the_points():
-    sample = Sample(0, np.zeros((144, 192, 3), np.uint8), torch.eye(4, dtype=torch.float64))
-    (keyframe,) = segment_of([sample], WORKING)
-    view = depth_view(keyframe, WORKING)
+    view = Viewpoint(0, np.eye(4))
     z = np.linspace(2.0, 4.0, 401)
     seen = np.stack([0 * z, 0 * z, z], 1)
     beside, behind = seen + np.array([50.0, 0, 0]), -10 * seen

@@ -7,7 +7,7 @@ import torch
 
 from bundle_scenes import CAMERA, scene
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.marginals import marginals
+from geogs.bundle.marginals import ALIKE, marginals
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -37,10 +37,10 @@ def full_covariance(problem: BundleProblem, grid: SampleGrid):
 def test_the_block_inverse_is_that_of_the_whole():
     grid, problem = scene(frames=3)
     pose, depth = full_covariance(problem, grid)
-    found = marginals(grid, problem, EXACT, alike=4.0)
+    found = marginals(grid, problem, EXACT)
     got = found.pose.diagonal(dim1=-2, dim2=-1)
-    torch.testing.assert_close(got, 4 * pose, rtol=1e-3, atol=1e-12)
-    expected = 2 * depth.sqrt() / problem.inverse_depth
+    torch.testing.assert_close(got, ALIKE * pose, rtol=1e-3, atol=1e-12)
+    expected = ALIKE**0.5 * depth.sqrt() / problem.inverse_depth
     torch.testing.assert_close(found.relative_depth.double(), expected, rtol=2e-3, atol=1e-12)
     assert float(found.pose[:2].abs().max()) == 0
 
@@ -81,7 +81,7 @@ def test_depth_is_open_when_the_camera_only_turns():
 @pytest.mark.parametrize("sideways", [0.05, 0.02])
 def test_noise_spreads_poses_and_depths_as_foretold(sideways):
     grid, truth = turning(sideways)
-    foretold = marginals(grid, truth, EXACT, alike=1.0)
+    foretold = marginals(grid, truth, EXACT)
     poses, depths = [], []
     for seed in range(24):
         g = torch.Generator().manual_seed(seed)
@@ -96,11 +96,12 @@ def test_noise_spreads_poses_and_depths_as_foretold(sideways):
         poses.append(se3_log(T @ se3_inverse(truth.T_cw)))
         depths.append(found.inverse_depth * scale / truth.inverse_depth - 1)
     spread = torch.stack(poses).square().mean(0)[1:]
-    expected = foretold.pose.diagonal(dim1=-2, dim2=-1)[1:]
+    # These errors are independent of each other.
+    expected = foretold.pose.diagonal(dim1=-2, dim2=-1)[1:] / ALIKE
     ratio = spread.sum(0) / expected.sum(0)
     assert float(ratio[3:].min()) > 0.5
     assert float(ratio[3:].max()) < 2.0
-    square = torch.stack(depths).square().mean(0) / foretold.relative_depth.square()
+    square = torch.stack(depths).square().mean(0) / (foretold.relative_depth.square() / ALIKE)
     assert 0.6 < float(square.median()) < 1.5
 
 

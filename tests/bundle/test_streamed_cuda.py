@@ -96,7 +96,8 @@ def test_steps_that_are_not_finite_are_refused(device):
     pixels = problem.pixels.clone()
     pixels[0, 0] = torch.nan
     bad = streamed(replace(problem, pixels=pixels), device)
-    result = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device)).solve(bad)
+    solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
+    result = solver.solve(bad, BundleOptions())
     assert not result.finite
     assert torch.equal(result.T_cw, problem.T_cw)
     assert torch.equal(result.inverse_depth.cpu(), problem.inverse_depth)

@@ -14,7 +14,6 @@ from geogs.tracking.flow.droid_network import (
     DroidNetwork,
     DroidSize,
     EdgeOutput,
-    FrameOutput,
     cell_positions,
     on_cells,
 )
@@ -54,10 +53,9 @@ class KnowingUpdate:
         pixels = project(CAMERA, GRID.rays, T, self.inverse_depth[a][None]).pixels
         return ((pixels - 4) / 8).reshape(ROWS, COLUMNS, 2)
 
-    def agg(self, hidden, source) -> FrameOutput:
+    def agg(self, hidden, source) -> torch.Tensor:
         found = source.unique()
-        damping = torch.full((len(found), ROWS, COLUMNS), 1e-6)
-        return FrameOutput(found, damping)
+        return torch.full((len(found), ROWS, COLUMNS), 1e-6)
 
 
 class KnowingNetwork:

@@ -30,9 +30,9 @@ class DenseBundle:
     def __init__(self, grid: SampleGrid) -> None:
         self.flow = PinholeFlow(grid.camera, grid.rays)
 
-    def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
+    def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         """As in the protocol."""
-        return DenseSchur(problem, self.flow, options or BundleOptions()).adjusted()
+        return DenseSchur(problem, self.flow, options).adjusted()
 
 
 @dataclass(frozen=True)

@@ -31,20 +31,15 @@ class SourceFlow:
     edges: HyperEdge
     """With equations of the source's depths."""
     residual: Float[Tensor, "k"]
-    """Of each edge, as in ``BundleResult``."""
+    """Residual of each edge, as in ``BundleResult``."""
     diagonal: Float[Tensor, "c"] | None = None
-    """Of the chained equations before any depth is eliminated, where that is asked for."""
-
-    @property
-    def depth(self) -> DepthEquations:
-        """Of the source's depths."""
-        assert self.edges.depth is not None
-        return self.edges.depth
+    """Diagonal of the chained equations before any depth is eliminated, where it is asked for."""
 
     @property
     def information(self) -> Float[Tensor, "p"]:
-        """Of the source's inverse depths."""
-        return self.depth.information
+        """Information of the source's inverse depths."""
+        assert self.edges.depth is not None
+        return self.edges.depth.information
 
 
 @runtime_checkable

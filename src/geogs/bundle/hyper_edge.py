@@ -32,7 +32,7 @@ class DepthEquations:
         gradient: Float[Tensor, "p"] | None = None,
         information: Float[Tensor, "p"] | None = None,
     ) -> "DepthEquations":
-        """Of depths that nothing else is tied to; no gradient or information is none."""
+        """Equations of depths that nothing else is tied to; a part not given is zero."""
         none, zero = curvature.new_zeros(0, len(curvature)), torch.zeros_like(curvature)
         return DepthEquations(
             none,
@@ -165,7 +165,7 @@ class RelativeEdges(HyperEdge):
     """
 
     adjoint: Float[Tensor, "e 6 6"]
-    """Of the motion T_ji of each edge."""
+    """Adjoint of the motion T_ji of each edge."""
 
     @property
     def chain(self) -> Float[Tensor, "m c"]:
@@ -176,7 +176,7 @@ class RelativeEdges(HyperEdge):
         return torch.cat([eye[:, :at], source, eye[:, at:]], 1)
 
     def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
-        """Of the source's depths."""
+        """Equations of the source's depths, by the relative motions alone."""
         if self.shared or self.depth is None:
             return super().depth_after(step, frames)
         xi = step[: 6 * frames].reshape(frames, 6)

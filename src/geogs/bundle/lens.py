@@ -41,7 +41,7 @@ class LensBlock:
 
     lens: RadialLens
     pixels: Float[Tensor, "p 2"]
-    """Of the cells."""
+    """Pixels of the cells."""
     focal: bool = True
     """Whether the focal length is a variable."""
     radial: bool = False
@@ -55,7 +55,7 @@ class LensBlock:
 
     @cached_property
     def rays(self) -> "LensRays":
-        """Of the cells."""
+        """Rays of the cells."""
         return lens_rays(self.lens, self.pixels)
 
     def moved(self, step: Float[Tensor, "2"]) -> "LensBlock":

@@ -55,8 +55,7 @@ class Marginals:
 def marginals(
     grid: SampleGrid,
     problem: AnyProblem,
-    options: BundleOptions | None = None,
-    alike: float = ALIKE,
+    options: BundleOptions,
     cells: int = 1024,
 ) -> Marginals:
     """Marginal variances at the present state of a problem, its matches as good as they say.
@@ -65,14 +64,13 @@ def marginals(
         grid: where the depths are.
         problem: at its solution; a large one is linearised in parts, twice.
         options: Huber's limit and the damping of depths.
-        alike: multiplies all variances.
         cells: most cells of a frame that are looked at, evenly spread; the others' matches are
             taken to be as good.
 
     Where at most one pose is fixed, lengths are relative to the distances of the cameras from it.
     """
-    options, part = options or BundleOptions(), _Thinned(grid, problem, cells)
-    covariance = alike * _pose_covariance(problem, part, options)
+    part = _Thinned(grid, problem, cells)
+    covariance = ALIKE * _pose_covariance(problem, part, options)
     n = len(problem.T_cw)
     pose = torch.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)])
     relative = torch.zeros(n, part.count)
@@ -80,7 +78,7 @@ def marginals(
     for source in part.sources(options):
         frame = source.frame
         if bool(problem.free_depth[frame]):
-            sigma = _depth_variance(source.edges, covariance, alike).sqrt()
+            sigma = _depth_variance(source.edges, covariance).sqrt()
             relative[frame] = sigma / part.inverse_depth[frame].clamp(min=1e-12)
     return Marginals(pose, relative, _normalised_residual(problem, part, options))
 
@@ -102,7 +100,7 @@ class _Thinned:
             yield from linearised_sources(self._flow, part, part.start, options)
 
     def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
-        """Of each source in order: norms of its matches' residuals in standard deviations."""
+        """Each source in order, and norms of its matches' residuals in standard deviations."""
         for part in self._parts(options):
             i, j = part.source, part.target
             T_ji = relative_motion(part.T_cw, i, j)
@@ -183,13 +181,11 @@ def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
     return along / along.norm().clamp(min=1e-12)
 
 
-def _depth_variance(
-    edges: HyperEdge, covariance: Float[Tensor, "m m"], alike: float
-) -> Float[Tensor, "c"]:
-    """Of the inverse depths of a source, by its own matches and the covariance of its poses."""
+def _depth_variance(edges: HyperEdge, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
+    """Variance of a source's inverse depths, by its matches and the covariance of its poses."""
     depth, rows = edges.depth, edges.rows(len(covariance) // 6)
     assert depth is not None
     E = edges.chained_coupling()
     among = covariance[rows[:, None], rows].to(E)
     through_poses = (E * (among @ E)).sum(0) / depth.curvature.square()
-    return torch.where(depth.information > 0, alike / depth.curvature + through_poses, torch.inf)
+    return torch.where(depth.information > 0, ALIKE / depth.curvature + through_poses, torch.inf)

@@ -21,13 +21,13 @@ class Problem:
     """float64."""
     inverse_depth: Float[Tensor, "n p"]
     source: Int[Tensor, "e"]
-    """Of the edges that are matched, which are sorted by it."""
+    """Source of each edge that is matched; edges are sorted by it."""
     target: Int[Tensor, "e"]
     free_pose: Bool[Tensor, "n"]
     free_depth: Bool[Tensor, "n"]
     """Only those of sources are adjusted."""
     depth_terms: tuple[DepthTerm, ...] = ()
-    """Of frames that are sources of edges."""
+    """What is said of the depths of frames that are sources of edges."""
     pose_terms: tuple[PoseTerm, ...] = ()
     block: SharedBlock | None = None
     """Unknowns of these terms beside poses and depths; of problems with few frames only."""
@@ -99,7 +99,7 @@ class MotionProblem:
     T_cw: Float[Tensor, "n 4 4"]
     """float64."""
     inverse_depth: Float[Tensor, "e p"]
-    """Of the keyframe of each edge."""
+    """Inverse depths of the keyframe of each edge."""
     T_source: Float[Tensor, "e 4 4"]
     """World to the keyframe of each edge."""
     frame: Int[Tensor, "e"]

@@ -54,7 +54,7 @@ class BundleResult:
 class BundleSolver(Protocol[P]):
     """What adjusts one kind of problem."""
 
-    def solve(self, problem: P, options: BundleOptions | None = None) -> BundleResult:
+    def solve(self, problem: P, options: BundleOptions) -> BundleResult:
         """Take ``options.iterations`` damped Gauss-Newton steps, or fewer (``tolerance``).
 
         A step that is not finite is not taken, and ``finite`` is False in the result.

@@ -39,7 +39,7 @@ from geogs.geometry.robust import huber_cost
 B = TypeVar("B", bound=ProjectingBlock)
 
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
-"""Of an adjustment with shared unknowns; its iterations are linearisations at most."""
+"""How shared unknowns are adjusted; the iterations are linearisations at most."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
 
@@ -56,7 +56,8 @@ class SharedResult(Generic[B]):
     cost: float
     """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
     covariance: Float[Tensor, "m m"]
-    """Of the block's unknowns (zero for those that are no variables), see :func:`solve_shared`."""
+    """Covariance of the block's unknowns, zero for those that are no variables; see
+    :func:`solve_shared`."""
     finite: bool
 
 
@@ -184,7 +185,7 @@ def _source(
 
 
 def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:
-    """Of the block's unknowns, see :func:`solve_shared`."""
+    """Covariance of the block's unknowns, see :func:`solve_shared`."""
     system, sources = linear.system, linear.sources
     H, free, first = system.hessian, system.free, 6 * system.frames
     out = H.new_zeros(len(H) - first, len(H) - first)

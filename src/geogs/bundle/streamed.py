@@ -32,9 +32,9 @@ class StreamedBundle:
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
 
-    def solve(self, problem: StreamedProblem, options: BundleOptions | None = None) -> BundleResult:
+    def solve(self, problem: StreamedProblem, options: BundleOptions) -> BundleResult:
         """As in the protocol."""
-        return StreamedSchur(problem, self.grid, options or BundleOptions()).adjusted()
+        return StreamedSchur(problem, self.grid, options).adjusted()
 
 
 class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):

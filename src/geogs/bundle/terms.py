@@ -82,7 +82,7 @@ class SharedBlock(Protocol):
 
     @property
     def free(self) -> Sequence[bool]:
-        """Of each unknown, whether it is a variable."""
+        """Whether each unknown is a variable."""
         ...
 
     @property

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.world.keyframes import Keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,15 +129,6 @@ def depth_images(
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
     small = cv2.resize(grey, (render.width, render.height), interpolation=cv2.INTER_AREA)
     return small, cv2.GaussianBlur(grey, (0, 0), 0.7)
-
-
-def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:
-    """The view of a keyframe for depths at the size of ``render``."""
-    image = keyframe.image
-    T_cw = keyframe.T_cw.numpy()
-    return DepthView(
-        keyframe.id, T_cw, *depth_images(image, render), image, *keyframe.depth_field()
-    )
 
 
 def homographies(

@@ -63,7 +63,7 @@ def _device_kernels(source: Path, index: int) -> Mapping[str, Kernel]:
 
 def find_cubin(text: str, name: str, architecture: str) -> tuple[bytes, str]:
     """Machine code of a source for an architecture such as ``sm_90``, and its key in the cache."""
-    key = cache_key(text, architecture, *OPTIONS, _compiler_version())
+    key = cache_key(text, architecture, *OPTIONS, str(torch.version.cuda))
     cubin = read_cubin(key)
     if cubin is None:
         cubin = compile_cubin(text, name, architecture)
@@ -81,16 +81,7 @@ def compiler() -> "Nvrtc":
     """The run-time compiler that belongs to PyTorch; raises DeviceError where there is none."""
     from geogs.gpu.nvrtc import load_nvrtc
 
-    return load_nvrtc(_cuda_major())
-
-
-def _cuda_major() -> str:
     version = torch.version.cuda
     if version is None:
         raise DeviceError("This PyTorch was built without CUDA; install a CUDA build of PyTorch.")
-    return version.split(".")[0]
-
-
-def _compiler_version() -> str:
-    """The toolkit's version, without loading the compiler."""
-    return str(torch.version.cuda)
+    return load_nvrtc(version.split(".")[0])

@@ -33,7 +33,7 @@ def test_channels_are_level_then_x_then_y():
     first, second = features()
     coords = positions()
     radius, levels, side = 2, 3, 5
-    found = CorrelationVolume(first, second, levels, radius)(coords)
+    found = CorrelationVolume(first, second, levels, radius, 12**-0.5)(coords)
     assert found.shape == (2, levels * side * side, 11, 18)
     for b, row, column in ((0, 0, 0), (1, 5, 9), (1, 10, 17), (0, 3, 16)):
         products = torch.einsum("d,dhw->hw", first[b, :, row, column], second[b]) / 12**0.5
@@ -59,7 +59,7 @@ def test_far_away_and_not_a_number_are_zero():
     coords = positions()
     coords[0, 0, 0] = torch.tensor([1e9, -1e9])
     coords[0, 0, 1] = torch.nan
-    found = CorrelationVolume(first, second, 3, 2)(coords)
+    found = CorrelationVolume(first, second, 3, 2, 12**-0.5)(coords)
     assert bool(torch.isfinite(found).all())
     assert float(found[0, :, 0, :2].abs().max()) == 0.0
     assert float(found[0, :, 1, :2].abs().max()) > 0.1
@@ -67,7 +67,7 @@ def test_far_away_and_not_a_number_are_zero():
 
 def test_maps_smaller_than_the_pyramid_have_empty_levels():
     first, second = features(4, 5)
-    found = CorrelationVolume(first, second, 4, 1)(positions(4, 5))
+    found = CorrelationVolume(first, second, 4, 1, 12**-0.5)(positions(4, 5))
     assert found.shape == (2, 36, 4, 5)
     assert float(found[:, 27:].abs().max()) == 0.0
     assert float(found[:, 18:27].abs().max()) > 0.01
@@ -75,6 +75,6 @@ def test_maps_smaller_than_the_pyramid_have_empty_levels():
 
 def test_gradients_reach_both_features():
     first, second = (f.requires_grad_() for f in features(6, 7, 4, 1))
-    CorrelationVolume(first, second, 2, 1)(positions(6, 7, 1)).square().sum().backward()
+    CorrelationVolume(first, second, 2, 1, 0.5)(positions(6, 7, 1)).square().sum().backward()
     assert float(first.grad.abs().max()) > 0.1
     assert float(second.grad.abs().max()) > 0.1

@@ -15,8 +15,9 @@ from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.networks.tensor_files import read_tensors
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
-from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
+from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize, load_droid
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
@@ -59,7 +60,7 @@ def test_the_public_weights_load_from_their_file(tmp_path: Path):
     path = tmp_path / "droid.pth"
     torch.save(public_state(), path)
     grid = SampleGrid(Camera(fx=40.0, fy=40.0, cx=24.0, cy=20.0, width=48, height=40))
-    operator = DroidFlow(grid, path)
+    operator = DroidFlow(grid, load_droid(read_tensors(path)))
     assert isinstance(operator, FlowOperator)
     image = np.random.default_rng(0).integers(0, 255, (40, 48, 3), np.uint8)
     encoded = operator.encode(image)
@@ -69,7 +70,7 @@ def test_the_public_weights_load_from_their_file(tmp_path: Path):
     assert torch.isfinite(there.pixels).all()
     (tmp_path / "short.pth").write_bytes(path.read_bytes()[:1000])
     with pytest.raises(InputError, match="is damaged"):
-        DroidFlow(grid, tmp_path / "short.pth")
+        read_tensors(tmp_path / "short.pth")
 
 
 @pytest.mark.parametrize("width", [144, 149, 151])
@@ -137,8 +138,8 @@ def test_damping_and_weights_stand_in_the_proportion_of_droid(operator, views):
     J = projection.depth_jacobian[0] / 8
     curvature = (0.001 * w * J.square()).sum(-1)
     with torch.no_grad():
-        out = operator.network.update.agg(there.memory[0].hidden[None], torch.tensor([0]))
-    eta = out.damping.reshape(-1)
+        damping = operator.network.update.agg(there.memory[0].hidden[None], torch.tensor([0]))
+    eta = damping.reshape(-1)
     expected = curvature / (0.2 * eta + 1e-7)
     assert float(expected.median()) > 0
     torch.testing.assert_close(ours / there.damping[0], expected, rtol=1e-3, atol=1e-6)

@@ -133,14 +133,14 @@ def test_aggregation_groups_edges_by_source(network):
     agg = network.update.agg
     hidden = torch.randn(5, 128, 6, 7, generator=torch.Generator().manual_seed(4))
     out = agg(hidden, torch.tensor([7, 2, 7, 2, 7]))
-    assert out.frames.tolist() == [2, 7]
+    assert len(out) == 2
     for n, edges in enumerate(([1, 3], [0, 2, 4])):
         mean = F.relu(agg.conv1(hidden[edges])).mean(0, keepdim=True)
         joined = F.relu(agg.conv2(mean))
         eta = 0.01 * F.softplus(agg.eta[0](joined))[0, 0]
-        torch.testing.assert_close(out.damping[n], eta, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(out[n], eta, rtol=1e-4, atol=1e-6)
     alone = agg(hidden[[1, 3]], torch.tensor([0, 0]))
-    torch.testing.assert_close(alone.damping[0], out.damping[0])
+    torch.testing.assert_close(alone[0], out[0])
 
 
 def test_motion_is_flow_and_last_error_cut_off():

@@ -167,12 +167,11 @@ class CudaDenseBundle:
         self.solvers = kernels_for(Path(__file__).with_name("solve.cu"), device)
         self._last: tuple[tuple[bytes, ...], _Structure] | None = None
 
-    def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
+    def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         """As in the protocol; poses are returned where they were given.
 
         Whether a step is small nobody waits for, so that ``tolerance`` plays no part.
         """
-        options = options or BundleOptions()
         device = problem.inverse_depth.device
         w = _Workspace(problem, self._structure_of(problem, device), self.kernels)
         steps = _DenseSteps(self, problem, options)
@@ -205,8 +204,10 @@ class _DenseSteps:
     def linearise(self, state: _Workspace) -> None:
         """Edges, summed up by source."""
         w, terms = state, state.depth_terms
-        w.edges.fill(self.grid, w.T, w.inverse_depth, self.matches, self.options, terms)
-        w.edges.add_terms(terms, range(w.structure.frames), w.state)
+        w.edges.fill(
+            self.grid, w.T, w.inverse_depth, self.matches, self.options, terms,
+            range(w.structure.frames), w.state,
+        )  # fmt: skip
 
     def step(self, state: _Workspace, linear: None, damping: float) -> Step[_Workspace]:
         """All moves on the device, which keeps in mind whether one was not finite."""

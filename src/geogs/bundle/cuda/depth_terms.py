@@ -43,7 +43,7 @@ class KernelDepthTerms:
 
     @property
     def arguments(self) -> tuple[Tensor | None, Tensor | None, Tensor | None, float]:
-        """Of ``sum_sources``."""
+        """What ``sum_sources`` takes."""
         damping = None if self.damping is None else self.damping.curvature.contiguous()
         if self.measured is None:
             return damping, None, None, MEASURED_HUBER

@@ -15,7 +15,7 @@ from geogs.world.keyframes import Keyframe
 
 SOURCE = Path(__file__).with_name("fields.cu")
 MOST_THREADS = 1024
-"""Of a block."""
+"""Threads of a block, at most."""
 
 
 def _pyramid_size(grid: SampleGrid) -> int:

@@ -59,7 +59,7 @@ class EdgeArrays:
     first: Tensor
     """First edge of each source, and the end."""
     free_depth: Tensor
-    """Of each source."""
+    """Whether each source's depth may move."""
     pair_a: Tensor
     """Pairs a <= b of edges of one source that the elimination joins."""
     pair_b: Tensor
@@ -86,7 +86,7 @@ class LinearisedEdges:
 
     @property
     def cells(self) -> int:
-        """Of a source."""
+        """Cells of a source."""
         return self.information.shape[1]
 
     def fill(
@@ -97,8 +97,13 @@ class LinearisedEdges:
         matches: tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]],
         options: BundleOptions,
         terms: KernelDepthTerms,
+        frames: Iterable[int],
+        state: BundleState,
     ) -> None:
-        """Linearise all edges and sum up what they say of each source's depths."""
+        """Linearise all edges; sum up what they and all terms say of each source's depths.
+
+        ``frames`` are the sources by their numbers in ``state``.
+        """
         a, c, (curvature, gradient) = self.arrays, grid.camera, self.per_edge
         self.kernels["linearise_edges"](
             len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
@@ -110,9 +115,6 @@ class LinearisedEdges:
             len(depth), self.block, a.first, curvature, gradient, self.cells,
             options.depth_damping, damping, depth, *measured, self.information, *self.depths,
         )  # fmt: skip
-
-    def add_terms(self, terms: KernelDepthTerms, frames: Iterable[int], state: BundleState) -> None:
-        """Add what terms without a kernel say of the depths of the sources, which are frames."""
         terms.add_others(frames, state, self.information, *self.depths)
 
     def eliminate(self, blocks: Tensor, vectors: Tensor) -> None:

@@ -16,7 +16,7 @@ from geogs.world.keyframes import KNOWN, Keyframe
 SOURCE = Path(__file__).with_name("motion.cu")
 
 MOST_THREADS = 512
-"""Of a block: the launch bound of these kernels."""
+"""Threads of a block, at most: the launch bound of these kernels."""
 
 
 class CudaMotion:

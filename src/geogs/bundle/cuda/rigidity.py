@@ -13,7 +13,7 @@ from geogs.gpu.transfer import to_device
 
 SOURCE = Path(__file__).with_name("rigidity.cu")
 MOST_THREADS = 512
-"""Of a block: the launch bound of the kernel."""
+"""Threads of a block, at most: the launch bound of the kernel."""
 
 
 def best_residuals(

@@ -36,7 +36,7 @@ class _Chunk:
 
     edges: slice
     sources: Tensor
-    """Of all frames, on the CPU."""
+    """Their numbers among all frames, on the CPU."""
     frames: Tensor
     """Sources, then the other frames that their edges reach."""
     arrays: EdgeArrays
@@ -64,9 +64,9 @@ class CudaStreamedBundle:
         source = Path(__file__).with_name("linearise.cu")
         self.kernels = kernels_for(source, torch.device(grid.device))
 
-    def solve(self, problem: StreamedProblem, options: BundleOptions | None = None) -> BundleResult:
+    def solve(self, problem: StreamedProblem, options: BundleOptions) -> BundleResult:
         """As in the protocol."""
-        return _CudaStreamedSchur(problem, self, options or BundleOptions()).adjusted()
+        return _CudaStreamedSchur(problem, self, options).adjusted()
 
 
 class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
@@ -126,9 +126,11 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         pixels, weight = (m.contiguous() for m in self.problem.matches(chunk.edges))
         own = chunk.sources.to(d.device)
         depth, poses = d[own], to_device(state.T_cw[chunk.frames].reshape(-1), d.device)
-        edges, terms = LinearisedEdges(self.kernels, chunk.arrays, depth), self.depth_terms
-        edges.fill(self.grid, poses, depth, (pixels, weight), self.options, terms.of_rows(own))
-        edges.add_terms(terms, chunk.sources.tolist(), state)
+        edges = LinearisedEdges(self.kernels, chunk.arrays, depth)
+        edges.fill(
+            self.grid, poses, depth, (pixels, weight), self.options, self.depth_terms.of_rows(own),
+            chunk.sources.tolist(), state,
+        )  # fmt: skip
         return edges
 
 

@@ -16,9 +16,9 @@ class StereoViews:
     """
 
     image: Float[Tensor, "b 3 h w"]
-    """Of the keyframe, RGB in [0, 1]."""
+    """The keyframes, RGB in [0, 1]."""
     others: Float[Tensor, "b k 3 h w"]
-    """Of the neighbours."""
+    """The neighbours."""
     intrinsics: Float[Tensor, "b 4"]
     """fx fy cx cy of the keyframe in pixels, pixel centres at integers."""
     other_intrinsics: Float[Tensor, "b k 4"]
@@ -51,13 +51,13 @@ class DepthPrediction:
     normal: Float[Tensor, "b 3 h w"]
     """Unit, camera frame, facing the camera."""
     concentration: Float[Tensor, "b h w"]
-    """Of the angular von Mises-Fisher distribution around the normal."""
+    """Concentration of the angular von Mises-Fisher distribution around the normal."""
     at_half: Float[Tensor, "b h2 w2"]
     """``log_depth`` at 1/2; cell i covers the pixels 2 i and 2 i + 1."""
     at_quarter: Float[Tensor, "b h4 w4"]
     """``log_depth`` at 1/4 before it was refined."""
     plane_logits: Float[Tensor, "b d h4 w4"]
-    """Of the planes at 1/4."""
+    """Logits of the planes at 1/4."""
     plane_scores: Float[Tensor, "b d h4 w4"]
     """The same as the neighbours' features alone have it."""
     log_planes: Float[Tensor, "b d"]

@@ -146,10 +146,6 @@ class CudaClassicalFlow:
         width, height = self._layout.sizes[0]
         return encoded.data[: width * height].reshape(height, width)
 
-    def structure(self, encoded: CudaImage) -> Float[Tensor, "p"]:
-        """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
-        return encoded.data[self._layout.structure :]
-
     def measure(
         self,
         first: Sequence[CudaImage],

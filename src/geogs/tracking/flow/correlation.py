@@ -26,9 +26,9 @@ class CorrelationVolume:
         self,
         first: Float[Tensor, "b d h w"],
         second: Float[Tensor, "b d h w"],
-        levels: int = 4,
-        radius: int = 4,
-        scale: float | None = None,
+        levels: int,
+        radius: int,
+        scale: float,
     ) -> None:
         """Multiply all pairs of features.
 
@@ -37,10 +37,10 @@ class CorrelationVolume:
             second: features of the images they are looked for in.
             levels: levels of the pyramid.
             radius: window radius, pixels of a level.
-            scale: factor on the products; 1 / sqrt(d) if None, as RAFT has it (DROID-SLAM: 1/16).
+            scale: factor on the products.
         """
         self.radius = radius
-        root = _scale(first, scale) ** 0.5
+        root = scale**0.5
         # Half of the factor to each side: products of half-precision features stay in range.
         a, b = (first * root).flatten(2), (second * root).flatten(2)
         volume = (a.mT @ b).reshape(-1, 1, *second.shape[-2:])
@@ -52,10 +52,6 @@ class CorrelationVolume:
             for k, level in enumerate(self._levels)
         ]
         return torch.cat(windows, 1)
-
-
-def _scale(features: Float[Tensor, "b d h w"], scale: float | None) -> float:
-    return features.shape[1] ** -0.5 if scale is None else scale
 
 
 def _pyramid(image: Float[Tensor, "n c h w"], levels: int) -> list[Tensor]:

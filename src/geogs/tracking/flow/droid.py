@@ -15,7 +15,6 @@ What the network speaks is translated here.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,7 +22,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.gpu.transfer import to_device
-from geogs.networks.tensor_files import read_tensors
 from geogs.tracking.flow.cell_texture import grey_levels, textured_fraction
 from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
@@ -31,7 +29,6 @@ from geogs.tracking.flow.droid_network import (
     LEVELS,
     RADIUS,
     DroidNetwork,
-    load_droid,
     motion_features,
     on_cells,
 )
@@ -102,15 +99,11 @@ class DroidFlow:
     """DROID-SLAM's network on one grid, on the grid's device."""
 
     def __init__(
-        self, grid: SampleGrid, weights: Path | DroidNetwork, options: DroidOptions | None = None
+        self, grid: SampleGrid, network: DroidNetwork, options: DroidOptions | None = None
     ) -> None:
-        """``weights`` is the file of public weights, ``droid.pth``, or a network."""
         self.grid = grid
         self.options = options or DroidOptions()
         self.device = torch.device(grid.device)
-        network = (
-            weights if isinstance(weights, DroidNetwork) else load_droid(read_tensors(weights))
-        )
         self.network = network.to(self.device).eval()
 
     @torch.no_grad()
@@ -216,7 +209,7 @@ class DroidFlow:
         place = [number.setdefault(id(image), len(number)) for image in source]
         index = to_device(torch.tensor(place), self.device)
         with self._precision():
-            eta = self.network.update.agg(hidden, index).damping.float()
+            eta = self.network.update.agg(hidden, index).float()
         factor = STRIDE**2 / (WEIGHT_SCALE * self.options.deviation**2)
         return factor * (DAMPING_FACTOR * eta.flatten(1) + DAMPING_FLOOR)[index]
 

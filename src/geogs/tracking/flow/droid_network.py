@@ -142,16 +142,6 @@ class ConvGru(nn.Module):
         return (1 - z) * hidden + z * proposed.tanh()
 
 
-@dataclass(frozen=True)
-class FrameOutput:
-    """What the edges that leave a frame say about it together."""
-
-    frames: Int[Tensor, "n"]
-    """Which frames, ascending."""
-    damping: Float[Tensor, "n h w"]
-    """Damping of inverse depth, in the units of the network's own weights and cells."""
-
-
 class GraphAggregation(nn.Module):
     """Mean over the edges of a source frame, read out as damping of its depth.
 
@@ -166,14 +156,17 @@ class GraphAggregation(nn.Module):
         self.eta = nn.Sequential(nn.Conv2d(hidden, 1, 3, 1, 1), nn.Softplus())
         self.upmask = nn.Sequential(nn.Conv2d(hidden, 9 * UPSAMPLING**2, 1))
 
-    def forward(self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]) -> FrameOutput:
+    def forward(
+        self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]
+    ) -> Float[Tensor, "n h w"]:
+        """Damping of inverse depth for each source, ascending; in the network's own units."""
         frames, place, count = source.unique(return_inverse=True, return_counts=True)
         edges = F.relu(self.conv1(hidden))
         # A product, not scattered sums: always in the same order, summed in single precision.
         fraction = F.one_hot(place, len(frames)).mT / count[:, None]
         mean = (fraction.to(edges) @ edges.flatten(1)).unflatten(1, edges.shape[1:])
         joined = F.relu(self.conv2(mean))
-        return FrameOutput(frames, DAMPING_SCALE * self.eta(joined)[:, 0])
+        return DAMPING_SCALE * self.eta(joined)[:, 0]
 
 
 @dataclass(frozen=True)

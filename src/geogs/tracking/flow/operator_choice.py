@@ -35,9 +35,11 @@ def _operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
         from geogs.tracking.flow.own import OwnFlow
 
         return OwnFlow(grid, find_weights("own", config.weights), _classical(grid))
+    from geogs.networks.tensor_files import read_tensors
     from geogs.tracking.flow.droid import DroidFlow
+    from geogs.tracking.flow.droid_network import load_droid
 
-    return DroidFlow(grid, find_weights("droid", config.weights))
+    return DroidFlow(grid, load_droid(read_tensors(find_weights("droid", config.weights))))
 
 
 def _classical(grid: SampleGrid) -> FlowOperator:
