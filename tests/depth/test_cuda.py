@@ -29,7 +29,7 @@ from geogs.depth.cuda import refinement as refine_module
 from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.cuda.images import KeyframeImages, packed
 from geogs.depth.cuda.plane_sweep import PlaneSlots, SweptDepth
-from geogs.depth.cuda.refinement import PixelPlaces, SlantedMaps, TrackerMaps
+from geogs.depth.cuda.refinement import PixelPositions, SlantedMaps, TrackerMaps
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth, homographies
 from geogs.depth.evidence import (
     TrackerEvidence,
@@ -201,7 +201,7 @@ def _maps(setting: Setting) -> TrackerMaps:
 def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
     view = setting.scene.views[0]
     grids = np.stack([_random(*view.inverse_depth.shape, seed=s) for s in range(3)])
-    places = PixelPlaces.of(setting.render, setting.working, setting.device)
+    places = PixelPositions.of(setting.render, setting.working, setting.device)
     maps = TrackerMaps.of(_to(setting, grids), places)
     upsampled = (maps.inverse_depth, maps.prior_weight, maps.precision)
     # Before version 5, OpenCV interpolates with weights rounded to 1/32.

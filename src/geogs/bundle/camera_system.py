@@ -107,7 +107,7 @@ class SparseCameraSystem:
         """Number of blocks."""
         return len(self._keys)
 
-    def places(
+    def block_indices(
         self, row: Int[np.ndarray, "k"], column: Int[np.ndarray, "k"]
     ) -> Int[np.ndarray, "k"]:
         """Which block belongs to each pair of frames; -1 above the diagonal and for fixed poses."""

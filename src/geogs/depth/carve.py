@@ -30,12 +30,14 @@ def look_up(
 
     ``T_view`` takes the frame of the points to the view's camera. Finite input only.
     """
-    ratio, sure = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
+    ratio, confidence = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     rotation = np.ascontiguousarray(T_view[:3, :3], np.float32)
     translation = np.ascontiguousarray(T_view[:3, 3], np.float32)
-    relative_depths(points, rotation, translation, lens, depth.depth, depth.confidence, ratio, sure)
-    return ratio, sure
+    relative_depths(
+        points, rotation, translation, lens, depth.depth, depth.confidence, ratio, confidence
+    )
+    return ratio, confidence
 
 
 def count_votes(
@@ -54,8 +56,8 @@ def count_votes(
     points = np.ascontiguousarray(points, np.float32)
     surface, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for pose, depth in views:
-        ratio, sure = look_up(points, pose, depth, camera)
-        votes = sure > VOTE_CONFIDENCE
+        ratio, confidence = look_up(points, pose, depth, camera)
+        votes = confidence > VOTE_CONFIDENCE
         surface += votes & (np.abs(ratio - 1.0) < VOTE_SUPPORT)
         free += votes & (ratio < 1.0 - VOTE_VIOLATION)
     return surface, free

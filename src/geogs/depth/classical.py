@@ -76,13 +76,13 @@ class CpuDepthEngine:
             # One view after the other, so that not all are in memory at once.
             views = ((d.T_cw, d.depth.arrays()) for d in depths)
             return torch.from_numpy(vote(points.detach().numpy(), views, self.render))
-        held = list(depths)
-        poses = torch.from_numpy(np.stack([d.T_cw for d in held]))
+        posed = list(depths)
+        poses = torch.from_numpy(np.stack([d.T_cw for d in posed]))
         # No view has a say on the others, which may be most of a large map.
         seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
         kept = torch.ones_like(seen)
         if bool(seen.any()):
             some = points.detach()[seen].numpy()
-            views = ((d.T_cw, d.depth.arrays()) for d in held)
+            views = ((d.T_cw, d.depth.arrays()) for d in posed)
             kept[seen] = torch.from_numpy(vote(some, views, self.render))
         return kept

@@ -1,4 +1,4 @@
-"""The tracker's sparse, unevenly sure inverse depth, completed on its own grid."""
+"""The tracker's sparse, unevenly certain inverse depth, completed on its own grid."""
 
 import functools
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ EDGE_SHARPNESS = 48.0
 
 @dataclass(frozen=True)
 class CompletedDepth:
-    """Smooth inverse depth on the tracker's grid, and how sure the tracker was of it."""
+    """Smooth inverse depth on the tracker's grid, and how certain the tracker was of it."""
 
     inverse_depth: Float32[np.ndarray, "gh gw"]
     """Per map unit."""

@@ -37,9 +37,9 @@ def depth_confidence(
 ) -> Float32[np.ndarray, "h w"]:
     """Chance that each depth is right to 2 %.
 
-    Evidence: the margin of the sweep's winner; whether the tracker, where it is sure, agrees with
-    the refined inverse depth; depth jumps to the next pixels;
-    the support of the last plane fit.
+    Evidence: the margin of the sweep's winner; whether the tracker, where it is confident, agrees
+    with the refined inverse depth; depth jumps to the next pixels; the support of the last plane
+    fit.
     """
     w, depth = WEIGHTS, 1.0 / refined.inverse_depth
     kernel = np.ones((3, 3), np.uint8)

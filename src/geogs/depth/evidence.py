@@ -10,7 +10,7 @@ from geogs.depth.plane_sweep import SweepResult
 from geogs.geometry.camera import Camera
 
 CONFIDENT_DEVIATION = 0.05
-"""Relative deviation at which the tracker is half sure."""
+"""Relative deviation at which the confidence in the tracker is 1/2."""
 TRACKER_SCALE = 0.2
 """Real over expected relative deviation of the tracker's depth, as measured on rendered rooms."""
 UNKNOWN_DEVIATION = 10.0
@@ -26,7 +26,7 @@ class TrackerEvidence:
 
     inverse_depth: Float32[np.ndarray, "h w"]
     prior_weight: Float32[np.ndarray, "h w"]
-    """How sure it is, in [0, 1], for the sweep."""
+    """Confidence in [0, 1], for the sweep."""
     precision: Float32[np.ndarray, "h w"]
     """Relative precision, for the refinement."""
 
@@ -60,13 +60,13 @@ def choose_start(
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """The inverse depth to refine, and how much each pixel counts in the first plane fits.
 
-    It is the sweep's, or the tracker's where that is sure and the sweep is not better.
+    It is the sweep's, or the tracker's where that is confident and the sweep is not better.
     """
-    prior, sure = tracker.inverse_depth, tracker.prior_weight
+    prior, confidence = tracker.inverse_depth, tracker.prior_weight
     unique = np.clip(0.5 * sweep.margin - 0.25, 0.0, 1.0) * (sweep.cost < 0.8)
     agree = np.abs(sweep.inverse_depth / prior - 1.0) < 0.05
-    taken = (agree & (sure > 0.3)) | ((sure > 0.5) & (unique < 0.3))
-    both = np.where(agree, np.maximum(sure, unique), sure)
+    taken = (agree & (confidence > 0.3)) | ((confidence > 0.5) & (unique < 0.3))
+    both = np.where(agree, np.maximum(confidence, unique), confidence)
     inverse_depth = np.where(taken, prior, sweep.inverse_depth).astype(np.float32)
     weight = np.where(taken, both, 0.7 * unique).astype(np.float32)
     return inverse_depth, weight + np.float32(0.02)

@@ -47,11 +47,11 @@ def check_depth(
 ) -> KeyframeDepth:
     """A keyframe's depth repaired, averaged and judged by those of other keyframes.
 
-    Unsure pixels on whose depth several others agree take it. Then each pixel's point is looked up
-    in the other views: surfaces within ``AVERAGE_REACH`` (relative, Gaussian) are averaged
-    by confidence; those near support the pixel; sure ones that are clearly behind the point violate
-    it, since they see free space where it stands. Meant to be called once per estimate: votes
-    counted twice make it surer than it is.
+    Pixels of low confidence on whose depth several others agree take it. Then each pixel's point is
+    looked up in the other views: surfaces within ``AVERAGE_REACH`` (relative, Gaussian) are
+    averaged by confidence; those near support the pixel; confident ones that are clearly behind the
+    point violate it, since they see free space where it stands. Meant to be called once per
+    estimate: votes counted twice raise the confidence too far.
     """
     if not others:
         return depth
@@ -60,13 +60,13 @@ def check_depth(
     points = depth.depth.reshape(-1, 1) * camera.rays().numpy().reshape(-1, 3)
     shift, votes, support, violation = (np.zeros(len(points), np.float32) for _ in range(4))
     for other, pose in zip(others, other_poses, strict=True):
-        ratio, sure = look_up(points, pose @ T_wc, other, camera)
+        ratio, confidence = look_up(points, pose @ T_wc, other, camera)
         error = ratio - np.float32(1.0)
-        near = sure * np.exp(-0.5 * (error / np.float32(AVERAGE_REACH)) ** 2)
+        near = confidence * np.exp(-0.5 * (error / np.float32(AVERAGE_REACH)) ** 2)
         shift += near * error
         votes += near
-        support += sure * np.exp(-0.5 * (error / np.float32(AGREEMENT_REACH)) ** 2)
-        violation += sure * (error < -VIOLATION_DISTANCE)
+        support += confidence * np.exp(-0.5 * (error / np.float32(AGREEMENT_REACH)) ** 2)
+        violation += confidence * (error < -VIOLATION_DISTANCE)
     shape = depth.depth.shape
     averaged = depth.depth / (1.0 + shift / (votes + np.float32(0.5))).reshape(shape)
     own = np.clip(depth.confidence, 1e-3, 1.0 - 1e-3)
@@ -82,7 +82,7 @@ def _repair(
     other_poses: Sequence[Float64[np.ndarray, "4 4"]],
     camera: Camera,
 ) -> KeyframeDepth:
-    """Unsure pixels replaced by what the sure pixels of the other views show there."""
+    """Pixels of low confidence replaced by what the confident ones of other views show there."""
     shape = (len(others), *depth.depth.shape)
     seen, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     rays = camera.rays().numpy().reshape(-1, 3)
@@ -98,7 +98,7 @@ def _repair(
     best, score = np.empty_like(depth.depth), np.empty_like(depth.depth)
     reach, clearance = np.float32(AGREEMENT_REACH), np.float32(VIOLATION_DISTANCE)
     agree_on_depth(seen, weight, reach, clearance, np.float32(OCCLUSION_PENALTY), best, score)
-    unsure = depth.confidence < REPAIR_BELOW
-    taken = unsure & (score > REPAIR_VOTES)
+    uncertain = depth.confidence < REPAIR_BELOW
+    taken = uncertain & (score > REPAIR_VOTES)
     confidence = np.where(taken, np.float32(REPAIR_CONFIDENCE), depth.confidence)
     return KeyframeDepth(np.where(taken, best, depth.depth), confidence)

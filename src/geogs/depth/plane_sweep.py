@@ -23,7 +23,7 @@ SUPPORT_RADIUS = 3
 SUPPORT_SHARPNESS = 400.0
 """How fast that average forgets pixels of another colour (RGB in 0 to 1, squared)."""
 PRIOR_PULL = 0.3
-"""Cost of a plane far from the tracker's depth where the tracker is sure."""
+"""Cost of a plane far from the tracker's depth where the tracker is confident."""
 PRIOR_TOLERANCE = 0.03
 """Relative distance from the tracker's inverse depth at which the pull is full."""
 SMALL_JUMP = 0.1
@@ -63,8 +63,8 @@ def sweep_planes(
     shifts = [0.0]
     if neighbours:
         relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
-        turned = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
-        ends = [turned + relative[:, None, :3, 3] / z for z in (near, far)]
+        rotated = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
+        ends = [rotated + relative[:, None, :3, 3] / z for z in (near, far)]
         seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
         p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
         moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)

@@ -31,7 +31,7 @@ FIT_DEVIATION = 0.01
 FIT_TOLERANCE = 0.01
 """Relative distance from the plane at which a pixel counts half in it."""
 FIT_STIFFNESS = 0.5
-"""Weight of the previous slopes in it, in sure pixels at distance 1."""
+"""Weight of the previous slopes in it, in confident pixels at distance 1."""
 GUIDE_CONTRAST = 200.0
 """How fast a pixel's weight in it falls with its colour difference, squared."""
 PLANE_DEVIATION = 0.003
@@ -52,7 +52,7 @@ class SlantedDepth:
     slope_y: Float32[np.ndarray, "h w"]
     """Change of inverse depth per pixel down."""
     support: Float32[np.ndarray, "h w"]
-    """Sum of weights of the last plane fit: sure pixels of like colour on the same plane."""
+    """Sum of weights of the last plane fit: confident pixels of like colour on the same plane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,20 +73,20 @@ def refine_depth(
     render: Camera,
     working: Camera,
     rho: Float32[np.ndarray, "h w"],
-    sure: Float32[np.ndarray, "h w"],
+    confidence: Float32[np.ndarray, "h w"],
     tracker: TrackerEvidence,
 ) -> SlantedDepth:
     """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
 
-    They begin at the inverse depth ``rho``; ``sure`` (0 to 1) says which pixels make the first
-    planes. After each step a pixel's inverse depth is the precision-weighted mean of the
+    They begin at the inverse depth ``rho``; ``confidence`` (0 to 1) says which pixels make the
+    first planes. After each step a pixel's inverse depth is the precision-weighted mean of the
     photometric optimum, the tracker's value (robust) and the local plane.
     """
     patches = _gather_patches(reference, neighbours, render, working)
     guide = _colour_guide(reference, render)
     state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
-        _fit_planes(state, sure, guide, radius, tolerance, 0.0)
+        _fit_planes(state, confidence, guide, radius, tolerance, 0.0)
     state.inverse_depth = rho.copy()
     for _ in range(REFINE_STEPS):
         photo_precision = _photometric_step(state, patches)
@@ -96,9 +96,9 @@ def refine_depth(
         precision = photo_precision + tracker_precision
         data = (photo_precision * rho + tracker_precision * tracker.inverse_depth) / precision
         state.inverse_depth = data
-        sure = 1.0 / (1.0 + 1.0 / (precision * np.float32(FIT_DEVIATION**2)))
-        sure += np.float32(1e-3)
-        _fit_planes(state, sure, guide, FIT_RADIUS, FIT_TOLERANCE, FIT_STIFFNESS)
+        confidence = 1.0 / (1.0 + 1.0 / (precision * np.float32(FIT_DEVIATION**2)))
+        confidence += np.float32(1e-3)
+        _fit_planes(state, confidence, guide, FIT_RADIUS, FIT_TOLERANCE, FIT_STIFFNESS)
         plane = np.minimum(state.support / np.float32(FULL_SUPPORT), np.float32(1.0))
         plane *= np.float32(1.0 / PLANE_DEVIATION**2)
         state.inverse_depth = (precision * data + plane * state.inverse_depth) / (precision + plane)
@@ -129,7 +129,7 @@ def _photometric_step(state: SlantedDepth, patches: _Patches) -> Float32[np.ndar
 
 def _fit_planes(
     state: SlantedDepth,
-    sure: Float32[np.ndarray, "h w"],
+    confidence: Float32[np.ndarray, "h w"],
     guide: Float32[np.ndarray, "3 h w"],
     radius: int,
     tolerance: float,
@@ -140,7 +140,7 @@ def _fit_planes(
     settings = [np.float32(x) for x in (GUIDE_CONTRAST, tolerance, stiffness)]
     over_rows(
         lambda *rows: kernels.fit_planes(
-            *rows, state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius,
+            *rows, state.inverse_depth, state.slope_x, state.slope_y, confidence, guide, radius,
             *settings, rho, slope_x, slope_y, state.support,
         ),
         len(rho),

@@ -37,9 +37,9 @@ def joined(
     theirs = (RIGHT / (math.sqrt(2) * torch.erfinv(chance))).clamp(min=SEARCHED)
     step = searched.depth / measured - 1
     agree = step.abs() < OUTVOTED * torch.hypot(own, theirs)
-    share = torch.where(known & agree, own.square() / (own.square() + theirs.square()), 0.0)
-    depth = torch.where(known, measured * (1 + share * step), searched.depth)
-    deviation = own * (1 - share).sqrt()
+    fraction = torch.where(known & agree, own.square() / (own.square() + theirs.square()), 0.0)
+    depth = torch.where(known, measured * (1 + fraction * step), searched.depth)
+    deviation = own * (1 - fraction).sqrt()
     right = torch.erf(RIGHT / (math.sqrt(2) * deviation)).clamp(max=SUREST)
     confidence = torch.where(known, right, searched.confidence)
     median = depth.median().cpu()

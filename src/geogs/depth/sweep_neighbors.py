@@ -45,10 +45,10 @@ def _angles(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "n 3"]) -> Float
 
 
 def misfit(
-    parallax: Float64[np.ndarray, "n"], turn: Float64[np.ndarray, "n"], best: float
+    parallax: Float64[np.ndarray, "n"], rotation: Float64[np.ndarray, "n"], best: float
 ) -> Float64[np.ndarray, "n"]:
     """How far pairs are from ``best`` degrees of parallax (log scale) and from looking alike."""
-    return np.abs(np.log(np.maximum(parallax, 0.05) / best)) + (turn / 20.0) ** 2
+    return np.abs(np.log(np.maximum(parallax, 0.05) / best)) + (rotation / 20.0) ** 2
 
 
 def select_sweep_neighbours(
@@ -64,10 +64,10 @@ def select_sweep_neighbours(
     others = np.array([i for i, v in enumerate(candidates) if v.id != reference.id], int)
     if len(others) == 0:
         return []
-    parallax, turn = parallax_degrees(reference, [candidates[i] for i in others], depth)
+    parallax, rotation = parallax_degrees(reference, [candidates[i] for i in others], depth)
     usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
-    usable &= turn < MAX_VIEW_ANGLE_DEG
-    order = np.lexsort((misfit(parallax, turn, BEST_PARALLAX_DEG), ~usable))
+    usable &= rotation < MAX_VIEW_ANGLE_DEG
+    order = np.lexsort((misfit(parallax, rotation, BEST_PARALLAX_DEG), ~usable))
     ranked: list[int] = others[order].tolist()
     count = int(usable.sum())
     if count == 0:
@@ -93,7 +93,7 @@ def depth_range(
 ) -> tuple[float, float]:
     """Nearest and farthest depth to search in the reference view.
 
-    From the surest half of what the tracker knows in this and the other views (and all whose
+    From the more certain half of what the tracker knows in this and the other views (and all whose
     relative deviation is below ``RANGE_DEVIATION``), seen from the reference and widened by
     ``RANGE_MARGIN`` on both sides. (0.1, 10) if the tracker knows next to nothing.
     """
@@ -107,7 +107,7 @@ def depth_range(
 def seen_inverse_depth(
     reference: DepthView, views: Sequence[DepthView], working: Camera
 ) -> Float64[np.ndarray, "n"]:
-    """Inverse depths, in the reference view, of the views' sure cells that it can see."""
+    """Inverse depths, in the reference view, of the views' confident cells that it can see."""
     grid = np.stack([v.inverse_depth for v in views]).astype(np.float64)
     information = np.stack([v.information for v in views])
     known = np.isfinite(grid) & (grid > 0) & (information > 0)
@@ -115,13 +115,13 @@ def seen_inverse_depth(
     deviation = z / np.sqrt(np.where(known, information, np.float32(1.0)))
     medians = [np.median(d[k]) if k.any() else 0.0 for d, k in zip(deviation, known, strict=True)]
     limits = np.maximum(RANGE_DEVIATION, medians)
-    sure = known & (deviation <= limits[:, None, None])
+    confident = known & (deviation <= limits[:, None, None])
     x = (OFFSET + STRIDE * np.arange(grid.shape[2]) - working.cx) / working.fx * z
     y = (OFFSET + STRIDE * np.arange(grid.shape[1])[:, None] - working.cy) / working.fy * z
     relative = reference.T_cw @ np.linalg.inv(np.stack([v.T_cw for v in views]))
     camera = np.stack([x, y, z], 1).reshape(len(views), 3, -1)
     point = relative[:, :3, :3] @ camera + relative[:, :3, 3:]
-    point = point.transpose(1, 0, 2).reshape(3, -1).take(np.flatnonzero(sure), 1)
+    point = point.transpose(1, 0, 2).reshape(3, -1).take(np.flatnonzero(confident), 1)
     point = point.take(np.flatnonzero(point[2] > 1e-6), 1)
     u = point[0] / point[2] * working.fx + working.cx
     v = point[1] / point[2] * working.fy + working.cy

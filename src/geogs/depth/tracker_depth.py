@@ -23,12 +23,12 @@ def enlarged_depth(view: DepthView, working: Camera, render: Camera) -> Keyframe
     grid, information = view.inverse_depth, view.information
     valid = known_cells(grid, information)
     valid &= (VALID_DEVIATION * grid) ** 2 * information > 1
-    share = upsample_grid(valid.astype(np.float32), working, render)
+    fraction = upsample_grid(valid.astype(np.float32), working, render)
     total = upsample_grid(np.where(valid, grid, np.float32(0)), working, render)
-    sure = share > 0.5
+    is_valid = fraction > 0.5
     typical = np.median(grid[valid]) if valid.any() else np.float32(1)
-    inverse = np.where(sure, total / np.where(sure, share, 1), typical)
-    return KeyframeDepth((1 / inverse).astype(np.float32), sure.astype(np.float32))
+    inverse = np.where(is_valid, total / np.where(is_valid, fraction, 1), typical)
+    return KeyframeDepth((1 / inverse).astype(np.float32), is_valid.astype(np.float32))
 
 
 class TrackerDepthEngine(AlternativeSearch):

@@ -148,7 +148,7 @@ def _chunk(
     a, b = joined_edges(first, free)
     row = np.stack([target[a], target[a], source[a], source[a]], 1).reshape(-1)
     column = np.stack([target[b], source[a], target[b], source[a]], 1).reshape(-1)
-    place, mirror = system.places(row, column), system.places(column, row)
+    place, mirror = system.block_indices(row, column), system.block_indices(column, row)
     mirror[np.repeat(a == b, 4)] = -1  # the elimination gives both sides
     added, mirrored = np.flatnonzero(place >= 0), np.flatnonzero(mirror >= 0)
     same = np.flatnonzero(a == b)

@@ -15,7 +15,7 @@ from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.fusion import check, vote
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed, upload
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
-from geogs.depth.cuda.refinement import PixelPlaces, TrackerMaps, choose_start, judge, refine
+from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
 from geogs.depth.depth_engine import Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
 from geogs.depth.evidence import prior_weight, relative_precision
@@ -61,7 +61,7 @@ class CudaDepthEngine:
         self.render = render
         self.working = working
         self.planes = planes
-        self._places = PixelPlaces.of(render, working, device)
+        self._positions = PixelPositions.of(render, working, device)
         self._images: LruCache[int, KeyframeImages] = LruCache(
             resident, lambda id, _: self._edges.pop(id, None)
         )
@@ -161,7 +161,7 @@ class CudaDepthEngine:
     ) -> tuple[Tensor, Tensor]:
         """Depth and confidence of one keyframe."""
         device, own = self.device, self._images_of(reference)
-        tracker = TrackerMaps.of(grids, self._places)
+        tracker = TrackerMaps.of(grids, self._positions)
         if not neighbours:
             return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
         others = [self._images_of(v) for v in neighbours]
@@ -172,7 +172,7 @@ class CudaDepthEngine:
             PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight,
         )  # fmt: skip
         refined = refine(
-            own, torch.stack([o.fine for o in others]), upload(finely, device), self._places,
+            own, torch.stack([o.fine for o in others]), upload(finely, device), self._positions,
             *choose_start(tracker, swept), tracker,
         )  # fmt: skip
         return judge(refined, swept.margin, tracker, plan.near, plan.far)

@@ -56,12 +56,12 @@ def vote(
     keep = torch.empty(len(points), dtype=torch.bool, device=device)
     votes = torch.zeros(len(points), 2, dtype=torch.int32, device=device)
     for start in range(0, len(depths), VOTERS_TOGETHER):
-        held = list(depths[start : start + VOTERS_TOGETHER])  # the kernel reads where they lie
-        T_cw = np.stack([d.T_cw for d in held])
+        batch = list(depths[start : start + VOTERS_TOGETHER])  # the kernel reads where they lie
+        T_cw = np.stack([d.T_cw for d in batch])
         matrices = upload(packed(T_cw[:, :3, :3], T_cw[:, :3, 3]), device)
         kernels_for(SOURCE, device)["vote_on_points"](
-            -(-len(points) // 128), 128, points, upload(_addresses(held), device), matrices,
-            len(points), len(held), *held[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
+            -(-len(points) // 128), 128, points, upload(_addresses(batch), device), matrices,
+            len(points), len(batch), *batch[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
             camera.cy, carve.VOTE_CONFIDENCE, carve.VOTE_SUPPORT, carve.VOTE_VIOLATION,
             carve.VOTE_FREE_VIEWS, votes, keep,
         )  # fmt: skip

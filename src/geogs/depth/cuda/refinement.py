@@ -35,7 +35,7 @@ SOURCE = Path(__file__).with_name("refinement.cu")
 
 
 @dataclass(frozen=True, eq=False)
-class PixelPlaces:
+class PixelPositions:
     """Where render pixels lie on the tracker's grid, and their patch samples in the fine image."""
 
     grid_columns: Float32[Tensor, "w"]
@@ -44,14 +44,14 @@ class PixelPlaces:
     fine_rows: Float32[Tensor, "5 h"]
 
     @staticmethod
-    def of(render: Camera, working: Camera, device: torch.device) -> "PixelPlaces":
+    def of(render: Camera, working: Camera, device: torch.device) -> "PixelPositions":
         """Those of two sizes of a camera."""
         reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)[:, None]
         u = (np.arange(render.width) - render.cx + reach) * (working.fx / render.fx) + working.cx
         v = (np.arange(render.height) - render.cy + reach) * (working.fy / render.fy) + working.cy
         columns, rows = (u[PATCH_REACH] - OFFSET) / STRIDE, (v[PATCH_REACH] - OFFSET) / STRIDE
-        places = (columns, rows, u, v)
-        return PixelPlaces(*(upload(x.astype(np.float32), device) for x in places))
+        positions = (columns, rows, u, v)
+        return PixelPositions(*(upload(x.astype(np.float32), device) for x in positions))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +60,17 @@ class TrackerMaps:
 
     inverse_depth: Float32[Tensor, "h w"]
     prior_weight: Float32[Tensor, "h w"]
-    """How sure it is, in [0, 1], for the sweep."""
+    """Confidence in [0, 1], for the sweep."""
     precision: Float32[Tensor, "h w"]
     """Relative precision, for the refinement."""
 
     @staticmethod
-    def of(grids: Float32[Tensor, "3 gh gw"], places: PixelPlaces) -> "TrackerMaps":
+    def of(grids: Float32[Tensor, "3 gh gw"], positions: PixelPositions) -> "TrackerMaps":
         """Bilinear values of the three grids at the render pixels."""
-        h, w = len(places.grid_rows), len(places.grid_columns)
+        h, w = len(positions.grid_rows), len(positions.grid_columns)
         out = grids.new_empty(3, h, w)
         kernels_for(SOURCE, grids.device)["upsample_grids"](
-            (-(-w // 128), h, 3), 128, grids, places.grid_columns, places.grid_rows,
+            (-(-w // 128), h, 3), 128, grids, positions.grid_columns, positions.grid_rows,
             *grids.shape[1:], h, w, out,
         )  # fmt: skip
         return TrackerMaps(*out)
@@ -88,22 +88,22 @@ class SlantedMaps:
 
 def choose_start(tracker: TrackerMaps, swept: SweptDepth) -> tuple[Tensor, Tensor]:
     """The inverse depth to refine, and how much each pixel counts in the first plane fits."""
-    rho, sure = torch.empty_like(swept.cost), torch.empty_like(swept.cost)
+    rho, confidence = torch.empty_like(swept.cost), torch.empty_like(swept.cost)
     kernels_for(SOURCE, rho.device)["choose_start"](
         -(-rho.numel() // 256), 256, tracker.inverse_depth, tracker.prior_weight,
-        swept.inverse_depth, swept.cost, swept.margin, rho.numel(), rho, sure,
+        swept.inverse_depth, swept.cost, swept.margin, rho.numel(), rho, confidence,
     )  # fmt: skip
-    return rho, sure
+    return rho, confidence
 
 
 def gather_patches(
-    fine: Float32[Tensor, "fh fw"], places: PixelPlaces
+    fine: Float32[Tensor, "fh fw"], positions: PixelPositions
 ) -> Float32[Tensor, "25 h w"]:
     """The fine reference image around every render pixel."""
-    h, w = len(places.grid_rows), len(places.grid_columns)
+    h, w = len(positions.grid_rows), len(positions.grid_columns)
     samples = fine.new_empty((2 * PATCH_REACH + 1) ** 2, h, w)
     kernels_for(SOURCE, fine.device)["gather_patches"](
-        (-(-w // 128), h, len(samples)), 128, fine, places.fine_columns, places.fine_rows,
+        (-(-w // 128), h, len(samples)), 128, fine, positions.fine_columns, positions.fine_rows,
         *fine.shape, h, w, samples,
     )  # fmt: skip
     return samples
@@ -118,21 +118,21 @@ def photometric_step(
 ) -> tuple[Tensor, Tensor]:
     """Move ``state`` one step, averaged with the tracker; returns precision and plane weight."""
     h, w = state.inverse_depth.shape
-    data, precision, sure = (torch.empty_like(state.inverse_depth) for _ in range(3))
+    data, precision, confidence = (torch.empty_like(state.inverse_depth) for _ in range(3))
     kernels_for(SOURCE, samples.device)["photometric_step"](
         (-(-w // 32), h), (32, len(images)), samples, images, homographies, state.inverse_depth,
         state.slope_x, state.slope_y, tracker.inverse_depth, tracker.precision, h, w,
         *images.shape[1:], PATCH_CONTRAST, 0.5 * VARIANCE_FLOOR, STEP_LIMIT,
         PHOTO_DEVIATION**2, FLOOR_DEVIATION**2, FIT_DEVIATION**2, data, precision,
-        sure,
+        confidence,
     )  # fmt: skip
     state.inverse_depth = data
-    return precision, sure
+    return precision, confidence
 
 
 def fit_planes(
     state: SlantedMaps,
-    sure: Float32[Tensor, "h w"],
+    confidence: Float32[Tensor, "h w"],
     colours: Float32[Tensor, "3 h w"],
     radius: int,
     tolerance: float,
@@ -140,11 +140,11 @@ def fit_planes(
     precision: Float32[Tensor, "h w"] | None = None,
 ) -> None:
     """Replace ``state`` by local planes, averaged with it by ``precision`` if that is given."""
-    h, w = sure.shape
-    out = [torch.empty_like(sure) for _ in range(4)]
-    kernels_for(SOURCE, sure.device)["fit_planes"](
+    h, w = confidence.shape
+    out = [torch.empty_like(confidence) for _ in range(4)]
+    kernels_for(SOURCE, confidence.device)["fit_planes"](
         (-(-w // 32), -(-h // 4)), (32, 4), state.inverse_depth, state.slope_x, state.slope_y,
-        sure, colours, precision, h, w, radius, GUIDE_CONTRAST, tolerance, stiffness,
+        confidence, colours, precision, h, w, radius, GUIDE_CONTRAST, tolerance, stiffness,
         FULL_SUPPORT, 1.0 / PLANE_DEVIATION**2, *out,
     )  # fmt: skip
     state.inverse_depth, state.slope_x, state.slope_y, state.support = out
@@ -154,22 +154,22 @@ def refine(
     reference: KeyframeImages,
     images: Float32[Tensor, "n fh fw"],
     homographies: Float32[Tensor, "n 12"],
-    places: PixelPlaces,
+    positions: PixelPositions,
     rho: Float32[Tensor, "h w"],
-    sure: Float32[Tensor, "h w"],
+    confidence: Float32[Tensor, "h w"],
     tracker: TrackerMaps,
 ) -> SlantedMaps:
     """``refine_depth`` from the inverse depth ``rho`` with the fine images of the neighbours."""
-    samples = gather_patches(reference.fine, places)
+    samples = gather_patches(reference.fine, positions)
     zero = torch.zeros_like(rho)
     state = SlantedMaps(rho, zero, zero, zero)
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
-        fit_planes(state, sure, reference.colours, radius, tolerance, 0.0)
+        fit_planes(state, confidence, reference.colours, radius, tolerance, 0.0)
     state.inverse_depth = rho
     for _ in range(REFINE_STEPS):
-        precision, sure = photometric_step(state, samples, images, homographies, tracker)
+        precision, confidence = photometric_step(state, samples, images, homographies, tracker)
         fit_planes(
-            state, sure, reference.colours, FIT_RADIUS, FIT_TOLERANCE,
+            state, confidence, reference.colours, FIT_RADIUS, FIT_TOLERANCE,
             FIT_STIFFNESS, precision,
         )  # fmt: skip
     return state

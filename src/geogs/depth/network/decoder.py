@@ -20,7 +20,7 @@ LEAST_LOG_SCALE, MOST_LOG_SCALE = -6.5, 0.0
 """Bounds of the logarithm of the Laplace scale of log depth."""
 MOST_CONCENTRATION = 500.0
 _LIKELY = -3.0
-"""Logit of the share of outliers that an untrained network expects."""
+"""Logit of the fraction of outliers that an untrained network expects."""
 
 
 class VolumeNetwork(nn.Module):

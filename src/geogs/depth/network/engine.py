@@ -132,8 +132,8 @@ class NetworkDepthEngine(AlternativeSearch):
     def _at_render(self, found: DepthPrediction) -> tuple[Tensor, Tensor, Tensor]:
         """Depth over the typical depth, confidence, and normals at the size of the render."""
         confidence = self.network.calibration.confidence(found.log_scale, found.outlier)
-        sure = 2 / found.concentration < MOST_ANGLE
-        normal = found.normal * sure[:, None]
+        known = 2 / found.concentration < MOST_ANGLE
+        normal = found.normal * known[:, None]
         maps = torch.cat([found.log_depth[:, None], confidence[:, None], normal], 1)
         maps = resampled(maps, (self.render.height, self.render.width))[0]
         length = maps[2:].norm(dim=0)
@@ -150,5 +150,5 @@ def resampled(maps: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Te
         return maps
     smooth = functional.interpolate(maps, size, mode="bilinear", align_corners=False)
     near = functional.interpolate(maps, size, mode="nearest-exact")
-    apart = (smooth[:, :1] - near[:, :1]).abs() > _EDGE
-    return torch.where(apart, near, smooth)
+    differ = (smooth[:, :1] - near[:, :1]).abs() > _EDGE
+    return torch.where(differ, near, smooth)

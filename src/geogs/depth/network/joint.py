@@ -15,8 +15,8 @@ WINDOW = 7
 """Pixels across and down over whose mean confidences it is decided who is right elsewhere."""
 AGREE, APART = (0.8, 0.2, 0.75), (0.85, -0.3, -0.35)
 """Logit of the chance that the result is right, from those of what was chosen and of the other and
-a constant: where both agree (the surer one is what was chosen) and where not. A logistic regression
-on four keyframes of two rendered rooms."""
+a constant: where both agree (the more confident one is what was chosen) and where not. A logistic
+regression on four keyframes of two rendered rooms."""
 _BOUND = 0.02
 
 
@@ -52,8 +52,8 @@ def joined(first: DenseDepth, second: DenseDepth) -> DenseDepth:
 
     Where they differ by less than ``REACH`` it is the mean of their logarithms, weighted by the
     squared precision of normal errors that are below 2 % with the chance that the confidences say;
-    elsewhere that which is surer around the pixel. Squared, because the surest are more precise
-    than a chance tells.
+    elsewhere that which is more confident around the pixel. Squared, because the most confident are
+    more precise than a chance tells.
     """
     confidence = torch.stack([first.confidence, second.confidence])
     logs = torch.stack([first.depth, second.depth]).log()

@@ -36,8 +36,8 @@ def log_planes(
     near: Float[Tensor, "b"], far: Float[Tensor, "b"], count: int
 ) -> Float[Tensor, "b d"]:
     """Logarithms of depths from near to far, evenly spaced."""
-    share = torch.linspace(0, 1, count, dtype=near.dtype, device=near.device)
-    return torch.lerp(near.log()[:, None], far.log()[:, None], share)
+    fraction = torch.linspace(0, 1, count, dtype=near.dtype, device=near.device)
+    return torch.lerp(near.log()[:, None], far.log()[:, None], fraction)
 
 
 def cell_rays(
@@ -65,18 +65,18 @@ def see_planes(
     ``T`` takes points of the keyframe's camera to the neighbour's; its translation and the depths
     are over the typical depth.
     """
-    turned = T[:, :3, :3] @ rays
+    rotated = T[:, :3, :3] @ rays
     z = depths[:, None, :, None]
-    point = z * turned[:, :, None] + T[:, :3, 3, None, None]
+    point = z * rotated[:, :, None] + T[:, :3, 3, None, None]
     focal, centre = (intrinsics[:, k, None, None] for k in (slice(0, 2), slice(2, 4)))
     depth = point[:, 2]
     safe = depth.clamp_min(LEAST_Z)
     pixels = focal * (point[:, :2] / safe[:, None]) + centre
     # d pixel / d log z is z d pixel / dz.
-    slope = turned[:, :2, None] - point[:, :2] / safe[:, None] * turned[:, 2:, None]
+    slope = rotated[:, :2, None] - point[:, :2] / safe[:, None] * rotated[:, 2:, None]
     step = torch.diff(depths.log(), dim=1).mean(1)[:, None, None]
     moved = (focal * slope * (z / safe[:, None])).square().sum(1).sqrt() * step
-    cosine = (turned[:, :, None] * point).sum(1) / (
+    cosine = (rotated[:, :, None] * point).sum(1) / (
         rays.norm(dim=1)[:, None] * point.square().sum(1).sqrt().clamp_min(1e-6)
     )
     cells = (pixels - (CELL - 1) / 2) / CELL

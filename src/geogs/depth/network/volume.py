@@ -69,7 +69,7 @@ class PlaneVolume(nn.Module):
         views: StereoViews,
         log_planes: Float[Tensor, "b d"],
     ) -> Float[Tensor, "b d1 h w"]:
-        """A score for each plane, and the share of planes and neighbours that see a cell.
+        """A score for each plane, and the fraction of planes and neighbours that see a cell.
 
         ``log_planes`` are over the typical depth.
         """
