@@ -1,5 +1,8 @@
 """From the host's memory to a GPU without waiting."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
@@ -17,3 +20,13 @@ def to_device(
         tensor = tensor if dtype is None else tensor.to(dtype)
         return tensor.pin_memory().to(device, non_blocking=True)
     return tensor.to(device, dtype or tensor.dtype)
+
+
+def upload(array: Shaped[np.ndarray, "*n"], device: torch.device) -> Shaped[Tensor, "*n"]:
+    """The array on the device, without waiting for what runs there; on a CPU the same memory."""
+    return to_device(torch.from_numpy(np.ascontiguousarray(array)), device)
+
+
+def upload_indices(parts: Sequence[np.ndarray], device: torch.device) -> tuple[Tensor, ...]:
+    """Index arrays of any length as int32 on the device, sent there in one piece."""
+    return upload(np.concatenate(parts).astype(np.int32), device).split([len(p) for p in parts])

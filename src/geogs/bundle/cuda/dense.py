@@ -17,7 +17,7 @@ from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.gpu.kernels import Kernel, kernels_for
-from geogs.gpu.transfer import to_device
+from geogs.gpu.transfer import to_device, upload_indices
 from geogs.world.grid import SampleGrid
 
 MAX_FEW = 16
@@ -60,8 +60,7 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
     poses = int(free_pose.sum())
     system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, poses)
     parts = [source, target, first, free_depth, a, b, slot, *system]
-    sent = to_device(torch.from_numpy(np.concatenate(parts).astype(np.int32)), device)
-    pieces = sent.split([len(p) for p in parts])
+    pieces = upload_indices(parts, device)
     return _Structure(poses, EdgeArrays(*pieces[:6]), *pieces[6:])
 
 

@@ -23,7 +23,7 @@ from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.schur import SchurBundle
 from geogs.bundle.terms import BundleState
 from geogs.gpu.kernels import kernels_for
-from geogs.gpu.transfer import to_device
+from geogs.gpu.transfer import to_device, upload_indices
 from geogs.world.grid import SampleGrid
 
 EDGES_TOGETHER = 1024
@@ -156,8 +156,7 @@ def _chunk(
     pulled_to = np.concatenate([target[a[same]], source[a[same]]])
     parts = [number[source], number[target], first, free, a, b, added, place[added], mirrored,
              mirror[mirrored], pulled, pulled_to]  # fmt: skip
-    sent = to_device(torch.from_numpy(np.concatenate(parts).astype(np.int32)), device)
-    pieces = sent.split([len(p) for p in parts])
+    pieces = upload_indices(parts, device)
     return _Chunk(
         edges, torch.from_numpy(own), torch.from_numpy(frames), EdgeArrays(*pieces[:6]), *pieces[6:]
     )

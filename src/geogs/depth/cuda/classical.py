@@ -13,7 +13,7 @@ from torch import Tensor
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.fusion import check, vote
-from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed, upload
+from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
 from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
 from geogs.depth.depth_engine import Limits, Progress, silent
@@ -22,6 +22,7 @@ from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
+from geogs.gpu.transfer import upload
 from geogs.threads import worker_count
 from geogs.world.lru import LruCache
 

@@ -10,8 +10,8 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from geogs.depth import completion, evidence
-from geogs.depth.cuda.images import upload
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import upload
 
 SOURCE = Path(__file__).with_name("completion.cu")
 _PANEL = 8

@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
 from geogs.depth import carve, fusion
-from geogs.depth.cuda.images import packed, upload
+from geogs.depth.cuda.images import packed
 from geogs.depth.depth_view import PosedDepth
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import upload
 
 SOURCE = Path(__file__).with_name("reprojection.cu")
 VOTERS_TOGETHER = 256

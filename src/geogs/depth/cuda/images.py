@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from geogs.depth.depth_view import DepthView
-from geogs.gpu.transfer import to_device
+from geogs.gpu.transfer import upload
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +46,6 @@ def image_pixels(view: DepthView) -> Float32[np.ndarray, "n"]:
     smooth = cv2.GaussianBlur(view.grey, (0, 0), 0.7)
     grey = np.concatenate([x.ravel() for x in (view.grey, smooth, view.fine)]) - np.float32(0.5)
     return np.concatenate([grey, colours.ravel()])
-
-
-def upload(array: np.ndarray, device: torch.device) -> Tensor:
-    """The array on the device, without waiting for what runs there."""
-    return to_device(torch.from_numpy(np.ascontiguousarray(array)), device)
 
 
 def packed(

@@ -9,8 +9,9 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from geogs.depth import plane_sweep
-from geogs.depth.cuda.images import KeyframeImages, upload
+from geogs.depth.cuda.images import KeyframeImages
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import upload
 
 MATCHING = Path(__file__).with_name("matching.cu")
 AGGREGATION = Path(__file__).with_name("aggregation.cu")

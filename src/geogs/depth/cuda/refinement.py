@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from geogs.depth.confidence import WEIGHTS
-from geogs.depth.cuda.images import KeyframeImages, upload
+from geogs.depth.cuda.images import KeyframeImages
 from geogs.depth.cuda.plane_sweep import SweptDepth
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
 from geogs.depth.refinement import (
@@ -29,6 +29,7 @@ from geogs.depth.refinement import (
 )
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import upload
 from geogs.world.grid import OFFSET, STRIDE
 
 SOURCE = Path(__file__).with_name("refinement.cu")

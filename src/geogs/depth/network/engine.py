@@ -20,7 +20,7 @@ from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.sweep_neighbors import seen_inverse_depth
 from geogs.geometry.camera import Camera
 from geogs.gpu.recorded import Recorded
-from geogs.gpu.transfer import to_device
+from geogs.gpu.transfer import to_device, upload
 from geogs.world.lru import LruCache
 
 EDGE = 512
@@ -125,7 +125,7 @@ class NetworkDepthEngine(AlternativeSearch):
 
         def bring() -> Tensor:
             small = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
-            return to_device(torch.from_numpy(small), self.device)
+            return upload(small, self.device)
 
         return self._images.get(view.id, bring)
 

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from geogs.gpu.transfer import to_device
+from geogs.gpu.transfer import to_device, upload
 from geogs.tracking.flow.cell_texture import grey_levels, textured_fraction
 from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
@@ -113,7 +113,7 @@ class DroidFlow:
             features = self.network.features(shown)
             hidden, static = self.network.context(shown)
         grey = grey_levels(image)
-        kept = to_device(torch.from_numpy(grey), self.device)
+        kept = upload(grey, self.device)
         return DroidImage(features[0], hidden[0], static[0], kept, textured_fraction(grey))
 
     def texture(self, encoded: DroidImage) -> float:
@@ -159,8 +159,7 @@ class DroidFlow:
 
     def _shown(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "1 3 h8 w8"]:
         check_image_size(image, self.grid.camera)
-        sent = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
-        rgb = sent.permute(2, 0, 1)[None]
+        rgb = upload(image, self.device).permute(2, 0, 1)[None]
         return on_cells(rgb.float() / 255)
 
     def _revise(

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.gpu.recorded import Maps, Recorded
-from geogs.gpu.transfer import to_device
+from geogs.gpu.transfer import to_device, upload
 from geogs.threads import opencv_on_one_thread
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator, Memories, check_image_size
@@ -96,7 +96,7 @@ class OwnFlow:
     @torch.inference_mode()
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> OwnImage:
         check_image_size(image, self.grid.camera)
-        pixels = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
+        pixels = upload(image, self.device)
         source, descriptors, hidden, context = self._encoded(pixels)
         pyramid = DescriptorPyramid(descriptors, self._levels)
         features = FlowFeatures(source, pyramid, hidden, context)
