@@ -14,7 +14,7 @@ from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.fusion import check, vote
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
-from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
+from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
 from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
 from geogs.depth.depth_engine import Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
@@ -83,7 +83,7 @@ class CudaDepthEngine:
         progress: Progress = silent,
         limits: Sequence[Limits | None] | None = None,
     ) -> list[DenseDepth]:
-        """As in the protocol; at most 16 neighbours and 256 planes are used."""
+        """As in the protocol; at most 16 neighbours are used."""
         usable = [list(n[:MAX_NEIGHBOURS]) for n in neighbours]
         for view in (*references, *(v for group in usable for v in group)):
             if view.id not in self._edges:
@@ -140,8 +140,6 @@ class CudaDepthEngine:
             return SearchPlan(grids, typical, 0.0, 0.0, np.empty(0, np.float32))
         near, far = limits or depth_range(reference, neighbours, self.working)
         planes = sweep_planes(reference, neighbours, self.render, near, far, self.planes)
-        if len(planes) > MAX_PLANES:
-            planes = np.linspace(planes[0], planes[-1], MAX_PLANES, dtype=np.float32)
         return SearchPlan(grids, typical, near, far, planes)
 
     def _complete(self, plans: list[SearchPlan]) -> Float32[Tensor, "k 3 gh gw"]:

@@ -44,38 +44,32 @@ DEVIATION = (0.06, 0.8, 3.4)
 
 As :func:`geogs.tracking.flow.classical_flow.match_deviation`, fitted to this operator.
 """
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """How the dense flow is found."""
-
-    warm_levels: int = 4
-    """Pyramid levels searched where the start is right to a few pixels."""
-    iterations: int = 6
-    """Gauss-Newton steps of a patch."""
-    cold_reaches: tuple[int, ...] = (4, 2, 1)
-    """Passes in which a patch tries its neighbours' motions, so many patches away; cold starts."""
-    refinements: int = 5
-    """Linearisations of the variational refinement at the finest level."""
-    coarse_refinements: int = 3
-    """The same at the other levels."""
-    sweeps: int = 10
-    """Relaxation sweeps of each."""
-    coarse_sweeps: int = 20
-    """The same at the other levels."""
-    smoothness: float = 10.0
-    """Weight alpha of the smoothness term; less lets more noise in, more bends depth steps."""
-    gradients: float = 10.0
-    """Weight gamma of gradient constancy."""
-    brightness: float = 1.0
-    """Weight delta of brightness constancy."""
-    zeta: float = 0.1
-    """Added to the norms that divide the data terms, grey levels / pixel."""
-    epsilon: float = 0.001
-    """Where the penalty turns from quadratic to linear."""
-    relaxation: float = 1.6
-    """Over-relaxation of the sweeps."""
+WARM_LEVELS = 4
+"""Pyramid levels searched where the start is right to a few pixels."""
+ITERATIONS = 6
+"""Gauss-Newton steps of a patch."""
+COLD_REACHES = (4, 2, 1)
+"""Passes in which a patch tries its neighbours' motions, so many patches away; cold starts."""
+REFINEMENTS = 5
+"""Linearisations of the variational refinement at the finest level."""
+COARSE_REFINEMENTS = 3
+"""The same at the other levels."""
+SWEEPS = 10
+"""Relaxation sweeps of each."""
+COARSE_SWEEPS = 20
+"""The same at the other levels."""
+SMOOTHNESS = 10.0
+"""Weight alpha of the smoothness term; less lets more noise in, more bends depth steps."""
+GRADIENTS = 10.0
+"""Weight gamma of gradient constancy."""
+BRIGHTNESS = 1.0
+"""Weight delta of brightness constancy."""
+ZETA = 0.1
+"""Added to the norms that divide the data terms, grey levels / pixel."""
+EPSILON = 0.001
+"""Where the penalty turns from quadratic to linear."""
+RELAXATION = 1.6
+"""Over-relaxation of the sweeps."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +107,8 @@ class _Layout:
 class CudaClassicalFlow:
     """The dense-inverse-search operator on one grid, on the grid's device."""
 
-    def __init__(self, grid: SampleGrid, options: SearchOptions | None = None) -> None:
+    def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
-        self.options = options or SearchOptions()
         self.device = torch.device(grid.device)
         self._layout = _Layout(grid)
         self._kernels: dict[str, Kernel] = {}
@@ -218,19 +211,19 @@ class CudaClassicalFlow:
         self, table: Int[Tensor, "d"], warped: Float[Tensor, "d n"], cold: bool, finest: int
     ) -> Float[Tensor, "d q 2"]:
         """Dense flow of the finest level that is asked for, row by row, in its pixels."""
-        layout, options, directed = self._layout, self.options, len(table)
+        layout, directed = self._layout, len(table)
         w, h, stride = layout.width, layout.height, layout.pyramid
-        coarsest = layout.coarsest if cold else min(options.warm_levels - 1, layout.coarsest)
+        coarsest = layout.coarsest if cold else min(WARM_LEVELS - 1, layout.coarsest)
         flow: Tensor | None = None
         for level in range(coarsest, finest - 1, -1):
             width, height = layout.sizes[level]
             count = layout.patches(level)
             patches: Tensor | None = None
-            for reach in (0, *(options.cold_reaches if cold else ())):
+            for reach in (0, *(COLD_REACHES if cold else ())):
                 found = torch.empty(directed, count, 2, device=self.device)
                 self._kernels["flow_search"](
                     (-(-count * PATCH // 256), directed), 256, table, warped, flow, patches, found,
-                    stride, w, h, level, reach, options.iterations,
+                    stride, w, h, level, reach, ITERATIONS,
                 )  # fmt: skip
                 patches = found
             flow = torch.empty(directed, width * height, 2, device=self.device)
@@ -240,8 +233,8 @@ class CudaClassicalFlow:
                 flow, stride, w, h, level,
             )  # fmt: skip
             last = level == finest
-            sweeps = options.sweeps if last else options.coarse_sweeps
-            for _ in range(options.refinements if last else options.coarse_refinements):
+            sweeps = SWEEPS if last else COARSE_SWEEPS
+            for _ in range(REFINEMENTS if last else COARSE_REFINEMENTS):
                 self._refine(table, warped, flow, other, level, sweeps)
                 flow, other = other, flow
         assert flow is not None
@@ -250,13 +243,13 @@ class CudaClassicalFlow:
     def _refine(
         self, table: Tensor, warped: Tensor, flow: Tensor, refined: Tensor, level: int, sweeps: int
     ) -> None:
-        layout, o = self._layout, self.options
+        layout = self._layout
         width, height = layout.sizes[level]
         blocks = (-(-width // REFINE_INNER), -(-height // REFINE_INNER), len(table))
         self._kernels["flow_refine"](
             blocks, (32, 8), table, warped, flow, refined, layout.pyramid, layout.width,
-            layout.height, level, sweeps, o.smoothness, o.gradients, o.brightness,
-            o.zeta**2, o.epsilon**2, o.relaxation,
+            layout.height, level, sweeps, SMOOTHNESS, GRADIENTS, BRIGHTNESS,
+            ZETA**2, EPSILON**2, RELAXATION,
         )  # fmt: skip
 
 
