@@ -17,7 +17,7 @@ from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
-from geogs.depth.depth_view import Viewpoint
+from geogs.depth.depth_view import ViewPose
 from geogs.depth.estimate import estimate_depth
 from geogs.errors import InputError
 from geogs.io.pose_files import read_tum_trajectory
@@ -290,7 +290,7 @@ def test_poses_that_show_nothing_are_refused():
 
 
 def test_where_depth_is_searched_follows_from_the_points():
-    view = Viewpoint(0, np.eye(4))
+    view = ViewPose(0, np.eye(4))
     z = np.linspace(2.0, 4.0, 401)
     seen = np.stack([0 * z, 0 * z, z], 1)
     beside, behind = seen + np.array([50.0, 0, 0]), -10 * seen

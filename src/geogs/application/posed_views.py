@@ -6,7 +6,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.depth.depth_view import Viewpoint
+from geogs.depth.depth_view import ViewPose
 from geogs.errors import InputError
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import read_side_by_side
@@ -59,7 +59,7 @@ class PosedViews:
             image = source[index]
             return image.image, image.mask
 
-        places = [Viewpoint(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+        places = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
         with self._scene.stopwatch("first look"):
             return first_points(
                 places, image_at, source.camera,
@@ -109,5 +109,5 @@ def usual_depths(
 ) -> Float64[np.ndarray, "v"]:
     """Median depth of the points that each image sees."""
     some = points[:: 1 + len(points) // _MAX_DEPTH_POINTS]
-    places = [Viewpoint(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+    places = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
     return np.array([depth_search(p, some, source.camera, 1.0).typical for p in places])

@@ -13,7 +13,7 @@ from geogs.geometry.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Viewpoint:
+class ViewPose:
     """Where a keyframe was taken."""
 
     id: int
@@ -33,7 +33,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DepthView(Viewpoint):
+class DepthView(ViewPose):
     """One keyframe: images, pose, and the tracker's depth on its grid."""
 
     grey: Float32[np.ndarray, "h w"]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.depth.depth_view import DepthView, Viewpoint
+from geogs.depth.depth_view import DepthView, ViewPose
 from geogs.geometry.camera import Camera
 from geogs.world.grid import OFFSET, STRIDE
 
@@ -27,7 +27,7 @@ RANGE_DEVIATION = 0.1
 
 
 def parallax_degrees(
-    reference: Viewpoint, others: Sequence[Viewpoint], depth: float
+    reference: ViewPose, others: Sequence[ViewPose], depth: float
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Angles between the two rays to the point ``depth`` ahead, and between the two directions."""
     poses = np.stack([v.T_cw for v in others])
@@ -52,7 +52,7 @@ def misfit(
 
 
 def select_sweep_neighbours(
-    reference: Viewpoint, candidates: Sequence[Viewpoint], depth: float, most: int = NEIGHBOURS
+    reference: ViewPose, candidates: Sequence[ViewPose], depth: float, most: int = NEIGHBOURS
 ) -> list[int]:
     """Indices of the at most ``most`` best candidates, best first.
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
 
-from geogs.depth.depth_view import DepthView, Viewpoint
+from geogs.depth.depth_view import DepthView, ViewPose
 from geogs.depth.plane_sweep import SweepResult, plane_sweep
 from geogs.depth.sweep_neighbors import (
     MAX_PARALLAX_DEG,
@@ -52,7 +52,7 @@ SmallImage = tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "mh mw"] | None]
 """An image, of any size of the same view, and which of its pixels count; none where all do."""
 
 
-def distances_to_try(views: Sequence[Viewpoint]) -> Float64[np.ndarray, "n"]:
+def distances_to_try(views: Sequence[ViewPose]) -> Float64[np.ndarray, "n"]:
     """Typical depths that images from these places could show, in a geometric series.
 
     None where all cameras stand in the same place: then no depth shows.
@@ -70,7 +70,7 @@ def distances_to_try(views: Sequence[Viewpoint]) -> Float64[np.ndarray, "n"]:
 
 
 def first_points(
-    places: Sequence[Viewpoint],
+    places: Sequence[ViewPose],
     image_at: Callable[[int], SmallImage],
     working: Camera,
     progress: Callable[[float], None],
@@ -138,7 +138,7 @@ class _FirstLook:
 
     def __init__(
         self,
-        places: Sequence[Viewpoint],
+        places: Sequence[ViewPose],
         image_at: Callable[[int], SmallImage],
         working: Camera,
     ) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, Viewpoint, depth_images
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, ViewPose, depth_images
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.light import same_light
 from geogs.losses.multi_view import PhotoView
@@ -44,9 +44,9 @@ class MapView:
         return se3_inverse(self.T_cw)
 
     @property
-    def place(self) -> Viewpoint:
+    def place(self) -> ViewPose:
         """Where it was taken."""
-        return Viewpoint(self.id, self.T_cw.numpy())
+        return ViewPose(self.id, self.T_cw.numpy())
 
     @property
     def mask(self) -> Bool[Tensor, "h w"] | None:

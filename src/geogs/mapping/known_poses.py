@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from geogs.depth.depth_view import Viewpoint
+from geogs.depth.depth_view import ViewPose
 from geogs.geometry.camera import Camera
 from geogs.mapping.keyframe_views import MapView
 from geogs.world.map import DepthSearch
@@ -24,7 +24,7 @@ _CONFIDENT = 0.7
 
 
 def depth_search(
-    view: Viewpoint, points: Float64[np.ndarray, "n 3"], camera: Camera, margin: float
+    view: ViewPose, points: Float64[np.ndarray, "n 3"], camera: Camera, margin: float
 ) -> DepthSearch:
     """Where a view's depth may lie: where the points do that it sees, widened by ``margin``.
 
