@@ -55,7 +55,8 @@ def test_steps_that_are_not_finite_are_refused():
     grid, problem = scene()
     pixels = problem.pixels.clone()
     pixels[0, 0] = torch.nan
-    result = StreamedBundle(grid).solve(streamed(replace(problem, pixels=pixels)))
+    bad = streamed(replace(problem, pixels=pixels))
+    result = StreamedBundle(grid).solve(bad, BundleOptions())
     assert not result.finite
     assert torch.equal(result.T_cw, problem.T_cw)
     assert torch.equal(result.inverse_depth, problem.inverse_depth)
