@@ -34,8 +34,8 @@ from geogs.evaluation.trajectory_errors import TrajectoryErrors, evaluate_trajec
 from geogs.geometry.camera import Camera
 from geogs.types import Trajectory
 from geogs_fleet.cluster import ray_cluster
-from geogs_fleet.run import run_fleet
-from geogs_fleet.settings import FleetSettings
+from geogs_fleet.fleet_options import FleetOptions
+from geogs_fleet.fleet_run import run_fleet
 from geogs_synth.sequence.location import centred_camera
 from long_walk import render
 from portals import SuiteRaycaster
@@ -97,7 +97,7 @@ def tiny(options: argparse.Namespace) -> None:
     """Sources that end at once: seconds from one to the next, and the driver's processor and
     memory."""
     given = texts(options.folder / "tiny", options.sources, "ok")
-    settings = FleetSettings((str(given),), output=str(options.folder / "tiny-out"), gpus=0.0)
+    settings = FleetOptions((str(given),), output=str(options.folder / "tiny-out"), gpus=0.0)
     with ray_cluster("local"):
         memory = most_memory()
         began, spent = time.perf_counter(), time.process_time()
@@ -119,7 +119,7 @@ def kills(options: argparse.Namespace) -> None:
 
     given = texts(options.folder / "kills", options.sources, f"steps {STEPS}")
     out, lost = options.folder / "kills-out", 0
-    settings = FleetSettings((str(given),), output=str(out), gpus=0.0, attempts=20)
+    settings = FleetOptions((str(given),), output=str(out), gpus=0.0, attempts=20)
     with simulated_cluster(cpus=1) as cluster, ThreadPoolExecutor(1) as pool:
         nodes, rng = [add_node(cluster) for _ in range(options.nodes)], random.Random(0)
         fleet = pool.submit(run_fleet, settings, None, STAND_IN)

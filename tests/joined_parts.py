@@ -15,7 +15,7 @@ from geogs.io.writers.keyframe_folder import image_path, write_image
 from geogs.io.writers.map_file import MapViews, save_map_with_views
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import MapSnapshot, Trajectory
-from geogs_fleet.join.disks import transformed
+from geogs_fleet.join.joined_disks import transformed
 
 CAMERA = Camera(160.0, 160.0, 127.5, 95.5, 256, 192)
 DEPTH_CAMERA = CAMERA.with_long_edge(128)

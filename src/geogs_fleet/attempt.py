@@ -16,10 +16,10 @@ from typing import Any
 from geogs.application.run_settings import RunSettings
 from geogs.errors import GeogsError
 from geogs.evaluation.duration import duration
-from geogs_fleet.places import Place
 from geogs_fleet.row import FILE, Row, State, numbers_of, row_text
 from geogs_fleet.sources import FleetSource
-from geogs_fleet.supervise import Ending, Limits, supervise
+from geogs_fleet.storage import StoragePath
+from geogs_fleet.supervise import Limits, ProcessEnd, supervise
 from geogs_fleet.work_folder import WorkFolder, fetched
 
 LOG = "run.log"
@@ -27,7 +27,7 @@ CHILD = (sys.executable, "-m", "geogs_fleet.child")
 
 
 @dataclass(frozen=True)
-class Job:
+class FleetJob:
     """What a node is to do."""
 
     source: FleetSource
@@ -43,7 +43,7 @@ class Job:
     threads: int = 1
 
 
-def attempt(job: Job) -> Row:
+def attempt(job: FleetJob) -> Row:
     """Compute a source, going on from its checkpoint if there is one; its row is stored last.
 
     Errors become a row that says them.
@@ -65,18 +65,18 @@ def attempt(job: Job) -> Row:
     )  # fmt: skip
     if state == "done":
         try:
-            (Place(job.output) / FILE).write(row_text(row))
+            (StoragePath(job.output) / FILE).write(row_text(row))
         except GeogsError as error:
             return replace(row, state="failed", sentence=str(error))
     return row
 
 
-def _attempt(job: Job) -> tuple[State, str, dict[str, Any]]:
+def _attempt(job: FleetJob) -> tuple[State, str, dict[str, Any]]:
     """How it ended, why, and the summary of what there is."""
-    place = Place(job.output)
+    place = StoragePath(job.output)
     (place / FILE).delete()  # of a previous result, which is about to be replaced
     folder = WorkFolder(place)
-    source = Place(job.source.address).path or fetched(job.source, folder.scratch)
+    source = StoragePath(job.source.address).path or fetched(job.source, folder.scratch)
     settings = replace(job.settings, source=(source,), output=folder.path)
     environment = os.environ | {"OMP_NUM_THREADS": str(job.threads)}
     log = folder.path / LOG
@@ -97,7 +97,7 @@ def _attempt(job: Job) -> tuple[State, str, dict[str, Any]]:
     return state, sentence, summary
 
 
-def judged(ending: Ending, limits: Limits, log: str) -> tuple[State, str]:
+def judged(ending: ProcessEnd, limits: Limits, log: str) -> tuple[State, str]:
     """What the ending of a process means: a state, and a sentence unless it is done."""
     if ending.exceeded == "time":
         limit = duration(limits.seconds or 0)

@@ -2,46 +2,15 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, cast
+from typing import cast
 
-from geogs.cli.options import Given, parse_options, record
+from geogs.cli.options import Given, parse_options
 from geogs.config import Preset, preset
-from geogs.config.setting import Basic
 from geogs.errors import InputError
-from geogs_fleet.join_run import JoinSettings
-from geogs_fleet.settings import FleetSettings
+from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 
 EXIT_FAILED = 1
 """Exit code where all has been tried, and a source failed."""
-
-
-@dataclass(frozen=True)
-class FleetOptions(FleetSettings):
-    """Reconstruct many videos, each on its own, on one machine or many: geogs fleet run clips/.
-
-    Needs pip install 'geogs[fleet]' (Ray) on every machine. Started again, it does what is missing,
-    and goes on from the checkpoints of what was under way.
-    """
-
-    preset: Preset = "default"
-    """Group of settings; single ones given beside it win."""
-    quiet: Annotated[bool, Basic("-q")] = False
-    """Say nothing but errors."""
-
-
-@dataclass(frozen=True)
-class JoinOptions(JoinSettings):
-    """Make one place of many videos that overlap: geogs fleet join a.mp4 b.mp4 c.mp4.
-
-    Each is run by itself, on one machine or many; where keyframes of two show the same, they are
-    joined. Needs pip install 'geogs[fleet]' (Ray) on every machine.
-    """
-
-    preset: Preset = "default"
-    """Group of settings; single ones given beside it win."""
-    quiet: Annotated[bool, Basic("-q")] = False
-    """Say nothing but errors."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -58,12 +27,11 @@ def main(argv: Sequence[str]) -> int:
         words = words[1:]
     options = parse(words)
 
-    from geogs_fleet.run import run_fleet
-    from geogs_fleet.terminal import TerminalFleet, closing_message
+    from geogs_fleet.fleet_run import run_fleet
+    from geogs_fleet.fleet_terminal import TerminalFleet, closing_message
 
     begin = time.perf_counter()
-    settings = record(FleetSettings, options)
-    result = run_fleet(settings, TerminalFleet(options.quiet))
+    result = run_fleet(options, TerminalFleet(options.quiet))
     seconds = time.perf_counter() - begin
     if not options.quiet:
         print(closing_message(result.rows, result.computed, result.output, seconds))
@@ -73,11 +41,11 @@ def main(argv: Sequence[str]) -> int:
 def _join(words: Sequence[str]) -> int:
     options = parse_options(JoinOptions, words, "fleet join", _join_defaults)
 
+    from geogs_fleet.fleet_terminal import TerminalFleet
     from geogs_fleet.join_run import run_join
-    from geogs_fleet.terminal import TerminalFleet
 
     progress = TerminalFleet(options.quiet)
-    joint = run_join(record(JoinSettings, options), progress, progress.say)
+    joint = run_join(options, progress, progress.say)
     if not options.quiet:
         print(f"{joint.sentence}\nOpen {joint.output}/report/index.html in a browser.")
     return EXIT_FAILED if joint.unjoined else 0

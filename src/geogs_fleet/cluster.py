@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from geogs.errors import InputError
-from geogs_fleet.settings import FleetSettings
+from geogs_fleet.fleet_options import FleetOptions
 
 _OBJECTS = 80 << 20
 """Bytes of the object store of a local cluster; rows are small."""
@@ -52,7 +52,7 @@ def ray_cluster(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-def allocation_for(ray: Any, settings: FleetSettings) -> Allocation:
+def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
     """What each source gets of the cluster, where settings leave that open.
 
     Raises:

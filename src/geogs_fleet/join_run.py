@@ -1,21 +1,21 @@
 """``geogs fleet join``: parts of one place, run where they are not yet, then joined."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from geogs.application.results.output_folder import only_writer
-from geogs.config.setting import Basic, Positional
+from geogs.cli.options import record
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs_fleet.cluster import allocation_for, ray_cluster
-from geogs_fleet.places import Place
-from geogs_fleet.progress import FleetProgress
-from geogs_fleet.run import run_fleet
-from geogs_fleet.settings import FleetSettings
+from geogs_fleet.fleet_options import FleetOptions, JoinOptions
+from geogs_fleet.fleet_progress import FleetProgress
+from geogs_fleet.fleet_run import run_fleet
 from geogs_fleet.sources import find_sources
+from geogs_fleet.storage import StoragePath
 from geogs_fleet.workers import RayWorkers
 
 if TYPE_CHECKING:
@@ -26,23 +26,8 @@ PARTS = "parts"
 """Folder for the results of parts that had to be run."""
 
 
-@dataclass(frozen=True)
-class JoinSettings(FleetSettings):
-    """All that the making of one place from many videos is given."""
-
-    source: Annotated[tuple[str, ...], Positional()] = ()
-    """Parts of one place that overlap: videos and folders of images, as of geogs fleet run, which
-    are run first; results of geogs run, or of geogs fleet run."""
-    output: Annotated[str, Basic("-o")] = "out/joined"
-    """Folder for the joint result, with one for each part that is run in parts/; every machine has
-    to see it under this name."""
-    adjust: Annotated[bool, Basic()] = True
-    """Adjust the keyframes with the matches of overlapping parts; else the parts, and the pairs of
-    keyframes that show one place, alone say where they are."""
-
-
 def run_join(
-    settings: JoinSettings,
+    settings: JoinOptions,
     progress: FleetProgress | None = None,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> "Joint":
@@ -52,7 +37,7 @@ def run_join(
         InputError: a part is none, no two of them show one place, or Ray is missing.
         OutputError: the result cannot be written.
     """
-    path = Place(settings.output).path if settings.output else None
+    path = StoragePath(settings.output).path if settings.output else None
     if path is None:
         raise InputError("The joint result needs a folder that all machines see; give one (-o).")
     output = prepare_output_folder(path.absolute())
@@ -68,7 +53,7 @@ def run_join(
 
 
 def _parts(
-    settings: JoinSettings,
+    settings: JoinOptions,
     output: Path,
     progress: FleetProgress | None,
     say: Callable[[str], None],
@@ -83,9 +68,9 @@ def _parts(
     videos = list(dict.fromkeys(address for address in found if isinstance(address, str)))
     made: dict[str, Path] = {}
     if videos:
-        given = {f.name: getattr(settings, f.name) for f in fields(FleetSettings)}
-        place = {"source": tuple(videos), "output": str(output / PARTS)}
-        for row in run_fleet(FleetSettings(**{**given, **place}), progress).rows:
+        each = record(FleetOptions, settings)
+        each = replace(each, source=tuple(videos), output=str(output / PARTS))
+        for row in run_fleet(each, progress).rows:
             if row.state == "done":
                 made[row.source] = output / PARTS / row.name
             else:
@@ -102,7 +87,7 @@ def _parts(
 
 def finished_results(word: str) -> list[Path]:
     """Folders of the results that a word names: one, or those of a fleet; none if it is neither."""
-    path = Place(word).path
+    path = StoragePath(word).path
     if path is None or not path.is_dir():
         return []
     if (path / "map.safetensors").is_file():

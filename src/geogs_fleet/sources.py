@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from geogs.errors import InputError
-from geogs_fleet.places import Place
+from geogs_fleet.storage import StoragePath
 
 VIDEOS = frozenset({
     ".3gp", ".avi", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
@@ -52,7 +52,7 @@ def find_sources(given: Sequence[str]) -> list[FleetSource]:
 
 
 def _meant(word: str) -> Iterator[str]:
-    place = Place(word)
+    place = StoragePath(word)
     path = place.path
     if path is not None and path.is_file() and path.suffix.lower() == ".txt":
         yield from _lines(place, path.absolute().parent)
@@ -69,17 +69,17 @@ def _meant(word: str) -> Iterator[str]:
         yield from _inside(place) or [_absolute(word)]
 
 
-def _lines(place: Place, folder: Path | None) -> Iterator[str]:
+def _lines(place: StoragePath, folder: Path | None) -> Iterator[str]:
     text = place.read()
     if text is None:
         raise InputError(f"{place.address} does not exist; give a list that does.")
     for line in map(str.strip, text.splitlines()):
         if line and not line.startswith("#"):
-            path = Place(line).path
+            path = StoragePath(line).path
             yield line if path is None or folder is None else str((folder / path).absolute())
 
 
-def _inside(place: Place) -> list[str]:
+def _inside(place: StoragePath) -> list[str]:
     """Sources in a folder; nothing if it is a source itself."""
     listed = {name: kind for name, kind in place.listed().items() if not name.startswith(".")}
     videos = [n for n, is_folder in listed.items() if not is_folder and _suffix(n) in VIDEOS]
@@ -92,13 +92,13 @@ def _inside(place: Place) -> list[str]:
 
 
 def _absolute(address: str) -> str:
-    path = Place(address).path
+    path = StoragePath(address).path
     return address if path is None else str(path.absolute())
 
 
 def _stem(address: str) -> str:
     """A plain name for a folder, from the last part of an address."""
-    name = Place(address.rstrip("/")).name
+    name = StoragePath(address.rstrip("/")).name
     stem = name[: -len(_suffix(name))] if _suffix(name) in VIDEOS else name
     return re.sub(r"[^\w.-]+", "_", stem).strip("._-") or "source"
 

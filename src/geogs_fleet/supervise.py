@@ -24,7 +24,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Ending:
+class ProcessEnd:
     """How a process ended."""
 
     code: int
@@ -41,7 +41,7 @@ def supervise(
     limits: Limits,
     environment: Mapping[str, str],
     meanwhile: Callable[[], None] = lambda: None,
-) -> Ending:
+) -> ProcessEnd:
     """Run a command until it ends, or has to.
 
     Args:
@@ -78,7 +78,7 @@ def supervise(
             process.wait()
             process.stdin.close()
         said.seek(0)
-        return Ending(process.returncode, said.read().decode("utf-8", "replace"), exceeded)
+        return ProcessEnd(process.returncode, said.read().decode("utf-8", "replace"), exceeded)
 
 
 def resident(process: int) -> int:

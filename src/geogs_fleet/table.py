@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 from geogs.evaluation.duration import duration
 from geogs.evaluation.pages.page import FiguresSection, HtmlSection, Section, write_page
-from geogs_fleet.places import Place
 from geogs_fleet.row import Row
+from geogs_fleet.storage import StoragePath
 
 _HEAD = ("", "source", "verdict", "frames", "lost", "keyframes", "triangles", "time", "attempts")
 _STYLE = """<style>
@@ -22,7 +22,7 @@ _STYLE = """<style>
 </style>"""
 
 
-def write_table(output: Place, rows: Sequence[Row], waiting: int, seconds: float) -> None:
+def write_table(output: StoragePath, rows: Sequence[Row], waiting: int, seconds: float) -> None:
     """Write ``fleet.json`` and ``index.html`` into the folder of the results.
 
     Args:

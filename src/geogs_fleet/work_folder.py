@@ -13,8 +13,8 @@ from pathlib import Path
 from secrets import token_hex
 
 from geogs.errors import InputError, OutputError
-from geogs_fleet.places import Place
 from geogs_fleet.sources import FleetSource
+from geogs_fleet.storage import StoragePath
 
 _MANIFEST = "manifest.json"  # of geogs.application.checkpoints.folder, which loads PyTorch
 
@@ -22,7 +22,7 @@ _MANIFEST = "manifest.json"  # of geogs.application.checkpoints.folder, which lo
 class WorkFolder:
     """The folder of one source's results, as a run on this node sees it."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: StoragePath) -> None:
         self._place = place
         mark = sha256(place.address.encode("utf-8", "backslashreplace")).hexdigest()[:16]
         user = os.getuid() if hasattr(os, "getuid") else ""
@@ -79,7 +79,7 @@ class WorkFolder:
 
 def fetched(source: FleetSource, scratch: Path) -> Path:
     """A copy of a source that is elsewhere. Raises InputError if it cannot be had."""
-    place = Place(source.address)
+    place = StoragePath(source.address)
     target = scratch / "source" / (place.name or "source")
     if not target.exists():
         unfinished = target.with_name(f"{target.name}.{token_hex(6)}.part")

@@ -13,6 +13,7 @@ from geogs.config.setting import Positional
 from geogs.errors import GeogsError, InputError
 from geogs_bench.bench_options import BenchOptions
 from geogs_fleet import cli as fleet
+from geogs_fleet.fleet_options import FleetOptions
 from geogs_synth import cli as synth
 from geogs_train.cli import TrainDepthOptions, TrainOptions
 
@@ -37,7 +38,7 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
         synth.SynthOptions, argv, "synth", synth._defaults), ["out"]),
     "demo": (demo.DemoOptions, plain(demo.DemoOptions, "demo"), []),
     "doctor": (doctor.DoctorOptions, plain(doctor.DoctorOptions, "doctor"), []),
-    "fleet": (fleet.FleetOptions, fleet.parse, ["v.mp4"]),
+    "fleet": (FleetOptions, fleet.parse, ["v.mp4"]),
     "view": (view.ViewSettings, plain(view.ViewSettings, "view"), ["out"]),
     "bench": (BenchOptions, plain(BenchOptions, "bench"), ["replica"]),
     "train flow": (TrainOptions, plain(TrainOptions, "train"), ["flow", "out"]),

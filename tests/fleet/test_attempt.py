@@ -10,11 +10,11 @@ import pytest
 from geogs.application.checkpoints import folder as checkpoint_folder
 from geogs.application.run_settings import RunSettings
 from geogs_fleet import work_folder
-from geogs_fleet.attempt import Job, attempt, judged
-from geogs_fleet.places import Place
+from geogs_fleet.attempt import FleetJob, attempt, judged
 from geogs_fleet.row import FILE, read_row
 from geogs_fleet.sources import FleetSource
-from geogs_fleet.supervise import Ending, Limits
+from geogs_fleet.storage import StoragePath
+from geogs_fleet.supervise import Limits, ProcessEnd
 
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_child.py")))
 
@@ -24,8 +24,8 @@ def scratch(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
 
-def job(source: str, output: str) -> Job:
-    return Job(FleetSource(source, "clip"), output, RunSettings(), "d", Limits(), FAKE)
+def job(source: str, output: str) -> FleetJob:
+    return FleetJob(FleetSource(source, "clip"), output, RunSettings(), "d", Limits(), FAKE)
 
 
 def test_results_here_have_their_row_last(tmp_path):
@@ -48,7 +48,7 @@ def test_two_attempts_at_a_time_leave_one_result(tmp_path):
 
 def test_source_and_results_may_be_elsewhere(tmp_path):
     pytest.importorskip("fsspec", reason="fsspec is not installed")
-    far = Place(f"memory://{uuid.uuid4().hex}")
+    far = StoragePath(f"memory://{uuid.uuid4().hex}")
     (far / "clip.mp4").write("ok")
     row = attempt(job((far / "clip.mp4").address, (far / "out").address))
     assert row.state == "done"
@@ -76,12 +76,12 @@ def test_a_source_that_is_gone_is_a_row():
 @pytest.mark.parametrize(
     ("ending", "state", "said"),
     [
-        (Ending(0, '{"state": "done", "sentence": ""}'), "done", ""),
-        (Ending(0, '{"state": "failed", "sentence": "No."}'), "failed", "No."),
-        (Ending(-11, ""), "crashed", "SIGSEGV"),
-        (Ending(1, "nonsense"), "failed", "error of the program"),
-        (Ending(-9, "", "time"), "failed", "longer than 1 min 30 s"),
-        (Ending(-9, "", "memory"), "failed", "more than 2 GiB"),
+        (ProcessEnd(0, '{"state": "done", "sentence": ""}'), "done", ""),
+        (ProcessEnd(0, '{"state": "failed", "sentence": "No."}'), "failed", "No."),
+        (ProcessEnd(-11, ""), "crashed", "SIGSEGV"),
+        (ProcessEnd(1, "nonsense"), "failed", "error of the program"),
+        (ProcessEnd(-9, "", "time"), "failed", "longer than 1 min 30 s"),
+        (ProcessEnd(-9, "", "memory"), "failed", "more than 2 GiB"),
     ],
 )
 def test_what_an_ending_means(ending, state, said):
@@ -95,7 +95,7 @@ def test_the_name_of_the_manifest_is_that_of_checkpoints():
 
 def test_a_checkpoint_elsewhere_moves_between_nodes_and_its_manifest_comes_last(tmp_path):
     pytest.importorskip("fsspec", reason="fsspec is not installed")
-    far = Place(f"memory://{uuid.uuid4().hex}")
+    far = StoragePath(f"memory://{uuid.uuid4().hex}")
     first = work_folder.WorkFolder(far)
     (first.path / "checkpoint").mkdir()
     for name in ("manifest.json", "state-1.json", ".manifest.json.part"):

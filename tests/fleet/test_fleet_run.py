@@ -10,9 +10,9 @@ import pytest
 
 from cluster_nodes import add_node, simulated_cluster
 from geogs.errors import InputError
-from geogs_fleet.progress import FleetProgress
-from geogs_fleet.run import run_fleet
-from geogs_fleet.settings import FleetSettings
+from geogs_fleet.fleet_options import FleetOptions
+from geogs_fleet.fleet_progress import FleetProgress
+from geogs_fleet.fleet_run import run_fleet
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'geogs[fleet]'")
 pytestmark = [
@@ -38,7 +38,7 @@ def sources(folder: Path, **texts: str) -> Path:
 
 def fleet(source: Path, output: Path, **more):
     progress = more.pop("progress", None)
-    settings = FleetSettings((str(source),), output=str(output), gpus=0.0, **more)
+    settings = FleetOptions((str(source),), output=str(output), gpus=0.0, **more)
     return run_fleet(settings, progress, FAKE)
 
 

@@ -5,7 +5,8 @@ import json
 import pytest
 
 from geogs.errors import InputError
-from geogs_fleet.join_run import JoinSettings, _names, finished_results, run_join
+from geogs_fleet.fleet_options import JoinOptions
+from geogs_fleet.join_run import _names, finished_results, run_join
 
 
 def test_a_result_is_one_and_a_fleet_is_all_that_are_done(tmp_path):
@@ -33,4 +34,4 @@ def test_equal_names_are_told_apart(tmp_path):
 @pytest.mark.parametrize("output", ["", "s3://bucket/joined"])
 def test_the_joint_result_needs_a_folder(output):
     with pytest.raises(InputError, match="needs a folder that all machines see"):
-        run_join(JoinSettings(("a", "b"), output=output))
+        run_join(JoinOptions(("a", "b"), output=output))

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from geogs_fleet.places import Place
-from geogs_fleet.progress import Pace
+from geogs_fleet.fleet_progress import Pace
 from geogs_fleet.row import Row, read_row, row_text
+from geogs_fleet.storage import StoragePath
 from geogs_fleet.table import write_table
 
 ROWS = [
@@ -18,7 +18,7 @@ ROWS = [
 
 
 def test_trouble_comes_first_and_all_text_is_escaped(tmp_path):
-    write_table(Place(str(tmp_path)), ROWS, 2, 10.0)
+    write_table(StoragePath(str(tmp_path)), ROWS, 2, 10.0)
     document = json.loads((tmp_path / "fleet.json").read_text())
     assert [row["name"] for row in document["sources"]] == ["<b>", "doubt", "lost", "good"]
     assert (document["done"], document["failed"], document["waiting"]) == (3, 1, 2)

@@ -18,10 +18,10 @@ from geogs.world.loops import RelativePoses
 from geogs_fleet.join import adjust
 from geogs_fleet.join.adjust import adjusted
 from geogs_fleet.join.gauge import Gauge
-from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.links import Link, loaded_keyframes
 from geogs_fleet.join.matches import Matches
 from geogs_fleet.join.part import Part, PartViews, describe, opened
+from geogs_fleet.join.part_graph import Placement
 from geogs_fleet.join.records import read_record, write_record
 from joined_parts import CAMERA, make_part
 from one_process import OneProcess

@@ -8,7 +8,7 @@ import torch
 from geogs.geometry.lie import quaternion_to_matrix, se3_exp, sim3_exp, sim3_inverse, sim3_scale
 from geogs.types import MapSnapshot
 from geogs.world.loops import Features
-from geogs_fleet.join.disks import is_covered, joined_disks, kept, overall, transformed
+from geogs_fleet.join.joined_disks import is_covered, joined_disks, kept, overall, transformed
 from geogs_fleet.join.part import PartViews
 
 

@@ -32,9 +32,9 @@ from geogs.world.edges import PackedEdge
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs_fleet.join.gauge import Gauge
-from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.matches import Depths, Directed, Matches, Member, match
 from geogs_fleet.join.part import Node, Part
+from geogs_fleet.join.part_graph import Placement
 from geogs_fleet.join.records import read_record, write_record
 from geogs_fleet.workers import Workers
 
@@ -195,7 +195,7 @@ class _Adjustment:
         return said
 
     def poses(self) -> Float[Tensor, "m 4 4"]:
-        """Of all keyframes."""
+        """Poses of all keyframes."""
         return torch.cat([member.T_cw for member in self.members.values()])
 
     def _new(self, name: str) -> Path:

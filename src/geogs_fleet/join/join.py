@@ -25,22 +25,22 @@ from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot
 from geogs.version import __version__
 from geogs_fleet.join.adjust import adjusted
-from geogs_fleet.join.disks import joined_disks, kept, merge_disks, move_disks
-from geogs_fleet.join.files import (
+from geogs_fleet.join.gauge import Gauge, common_gauge
+from geogs_fleet.join.joined_disks import joined_disks, kept, merge_disks, move_disks
+from geogs_fleet.join.joined_files import (
     JoinedPart,
     fingerprint,
     write_map,
     write_poses,
     write_summary,
 )
-from geogs_fleet.join.gauge import Gauge, common_gauge
-from geogs_fleet.join.graph import Placement, placed
+from geogs_fleet.join.joined_surface import SpacePlan, coloured, joint_mesh, plan_space
+from geogs_fleet.join.joined_trajectory import spans_of
 from geogs_fleet.join.links import Link, candidates, links_of
 from geogs_fleet.join.part import Part, PartViews, describe, opened
+from geogs_fleet.join.part_graph import Placement, placed
 from geogs_fleet.join.records import read_record
 from geogs_fleet.join.stored_views import equal_runs, render_views
-from geogs_fleet.join.surface import SpacePlan, coloured, joint_mesh, plan_space
-from geogs_fleet.join.trajectory import spans_of
 from geogs_fleet.workers import Workers
 
 _PAIRS = 24

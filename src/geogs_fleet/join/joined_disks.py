@@ -15,8 +15,8 @@ from geogs.mapping.similarity_field import CovisibleKeyframe, blended_similariti
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot
 from geogs.world.disks import DiskParameters, GaussianMap
-from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.part import Part, PartViews, opened
+from geogs_fleet.join.part_graph import Placement
 from geogs_fleet.join.records import read_record
 
 _NEAREST = 8

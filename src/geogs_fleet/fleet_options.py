@@ -1,15 +1,19 @@
-"""Settings of a fleet: which sources, where they are computed, what each may take."""
+"""Options of a fleet and of a join: which sources, where they are computed, what each may take."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from geogs.config import Config
+from geogs.config import Config, Preset
 from geogs.config.setting import Basic, Positional, Range, Settings, Time, Unnamed, Weight
 
 
 @dataclass(frozen=True)
-class FleetSettings(Settings):
-    """All that a fleet of runs is given."""
+class FleetOptions(Settings):
+    """Reconstruct many videos, each on its own, on one machine or many: geogs fleet run clips/.
+
+    Needs pip install 'geogs[fleet]' (Ray) on every machine. Started again, it does what is missing,
+    and goes on from the checkpoints of what was under way.
+    """
 
     source: Annotated[tuple[str, ...], Positional()] = ()
     """Videos and folders of images, patterns such as 'clips/*.mp4', folders of such, or text files
@@ -37,3 +41,26 @@ class FleetSettings(Settings):
     """Seconds between two checkpoints of a source, from which another machine goes on."""
     keyframe_images: bool = True
     """Keep the images of the keyframes, which geogs mesh and geogs export use."""
+    preset: Preset = "default"
+    """Group of settings; single ones given beside it win."""
+    quiet: Annotated[bool, Basic("-q")] = False
+    """Say nothing but errors."""
+
+
+@dataclass(frozen=True)
+class JoinOptions(FleetOptions):
+    """Make one place of many videos that overlap: geogs fleet join a.mp4 b.mp4 c.mp4.
+
+    Each is run by itself, on one machine or many; where keyframes of two show the same, they are
+    joined. Needs pip install 'geogs[fleet]' (Ray) on every machine.
+    """
+
+    source: Annotated[tuple[str, ...], Positional()] = ()
+    """Parts of one place that overlap: videos and folders of images, as of geogs fleet run, which
+    are run first; results of geogs run, or of geogs fleet run."""
+    output: Annotated[str, Basic("-o")] = "out/joined"
+    """Folder for the joint result, with one for each part that is run in parts/; every machine has
+    to see it under this name."""
+    adjust: Annotated[bool, Basic()] = True
+    """Adjust the keyframes with the matches of overlapping parts; else the parts, and the pairs of
+    keyframes that show one place, alone say where they are."""

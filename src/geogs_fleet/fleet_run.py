@@ -10,14 +10,14 @@ from geogs.application.results.output_folder import only_writer
 from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs_fleet.attempt import CHILD, Job
+from geogs_fleet.attempt import CHILD, FleetJob
 from geogs_fleet.cluster import Allocation, allocation_for, ray_cluster
-from geogs_fleet.places import Place
-from geogs_fleet.progress import FleetProgress, Pace
+from geogs_fleet.fleet_options import FleetOptions
+from geogs_fleet.fleet_progress import FleetProgress, Pace
+from geogs_fleet.ray_schedule import rows_of
 from geogs_fleet.row import FILE, Row, read_row
-from geogs_fleet.schedule import rows_of
-from geogs_fleet.settings import FleetSettings
 from geogs_fleet.sources import FleetSource, find_sources
+from geogs_fleet.storage import StoragePath
 from geogs_fleet.supervise import Limits
 from geogs_fleet.table import write_table
 
@@ -37,7 +37,7 @@ class FleetResult:
 
 
 def run_fleet(
-    settings: FleetSettings,
+    settings: FleetOptions,
     progress: FleetProgress | None = None,
     command: Sequence[str] = CHILD,
 ) -> FleetResult:
@@ -82,9 +82,13 @@ def run_fleet(
 
 
 def _job(
-    settings: FleetSettings, source: FleetSource, output: Place, allocation: Allocation, digest: str
-) -> Job:
-    return Job(
+    settings: FleetOptions,
+    source: FleetSource,
+    output: StoragePath,
+    allocation: Allocation,
+    digest: str,
+) -> FleetJob:
+    return FleetJob(
         source,
         (output / source.name).address,
         _run_settings(settings, "cuda" if allocation.gpus else "cpu"),
@@ -94,7 +98,7 @@ def _job(
     )
 
 
-def _run_settings(settings: FleetSettings, device: str) -> RunSettings:
+def _run_settings(settings: FleetOptions, device: str) -> RunSettings:
     return RunSettings(
         config=settings.config,
         device=device,
@@ -109,7 +113,7 @@ def _digest(settings: RunSettings) -> str:
     return sha256(repr(deciding).encode()).hexdigest()[:16]
 
 
-def _done(output: Place, source: FleetSource, digest: str) -> Row | None:
+def _done(output: StoragePath, source: FleetSource, digest: str) -> Row | None:
     """The row of an earlier result of this source with these settings."""
     row = read_row((output / source.name / FILE).read())
     same = row is not None and (row.source, row.settings) == (source.address, digest)
@@ -117,19 +121,19 @@ def _done(output: Place, source: FleetSource, digest: str) -> Row | None:
 
 
 def _write(
-    output: Place, rows: dict[str, Row], sources: Sequence[FleetSource], seconds: float
+    output: StoragePath, rows: dict[str, Row], sources: Sequence[FleetSource], seconds: float
 ) -> None:
     write_table(output, list(rows.values()), len(sources) - len(rows), seconds)
 
 
-def _absolute(address: str) -> Place:
+def _absolute(address: str) -> StoragePath:
     if not address:
         raise InputError("The results need a folder; give one (-o).")
-    path = Place(address).path
-    return Place(address if path is None else str(path.absolute()))
+    path = StoragePath(address).path
+    return StoragePath(address if path is None else str(path.absolute()))
 
 
-def _alone(output: Place) -> AbstractContextManager[None]:
+def _alone(output: StoragePath) -> AbstractContextManager[None]:
     """One fleet at a time in a folder, where that can have locks."""
     path = output.path
     return nullcontext() if path is None else only_writer(prepare_output_folder(path))

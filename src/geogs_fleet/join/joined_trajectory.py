@@ -10,8 +10,8 @@ from torch import Tensor
 from geogs.geometry.lie import se3_inverse, sim3_scale, so3_exp, so3_log
 from geogs.io.sources.frame_source import PAUSE
 from geogs.types import Trajectory
-from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.part import PartViews
+from geogs_fleet.join.part_graph import Placement
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from geogs.errors import GeogsError, InputError, OutputError
 from geogs.io.writers.atomic import write_text
 
 
-class Place:
+class StoragePath:
     """A file or a folder, here or elsewhere."""
 
     def __init__(self, address: str) -> None:
         self.address = address
 
-    def __truediv__(self, name: str) -> "Place":
-        return Place(f"{self.address.rstrip('/')}/{name}")
+    def __truediv__(self, name: str) -> "StoragePath":
+        return StoragePath(f"{self.address.rstrip('/')}/{name}")
 
     @property
     def path(self) -> Path | None:

@@ -22,9 +22,14 @@ from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mapping.map_frame import WORLD
 from geogs.types import MapSnapshot, SeenRows, Trajectory
-from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.joined_trajectory import (
+    Span,
+    joined_trajectory,
+    keyframe_poses,
+    moved_trajectory,
+)
 from geogs_fleet.join.part import PartViews, image_of
-from geogs_fleet.join.trajectory import Span, joined_trajectory, keyframe_poses, moved_trajectory
+from geogs_fleet.join.part_graph import Placement
 
 
 @dataclass(frozen=True)

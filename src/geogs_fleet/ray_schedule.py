@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from geogs_fleet.attempt import Job, attempt
+from geogs_fleet.attempt import FleetJob, attempt
 from geogs_fleet.cluster import Allocation, as_task
 from geogs_fleet.row import Row
 
@@ -17,7 +17,7 @@ _LOOK = 0.5
 
 
 def rows_of(
-    ray: Any, jobs: Iterable[Job], allocation: Allocation, attempts: int
+    ray: Any, jobs: Iterable[FleetJob], allocation: Allocation, attempts: int
 ) -> Generator[Row, None, None]:
     """The row of every job, in the order in which they end; each job has exactly one.
 
@@ -25,7 +25,7 @@ def rows_of(
     ``attempts`` times in all. When the caller stops listening, what is out is ended.
     """
     task = as_task(ray, attempt, allocation)
-    out: dict[Any, Job] = {task.remote(job): job for job in jobs}
+    out: dict[Any, FleetJob] = {task.remote(job): job for job in jobs}
     try:
         while out:
             ended, _ = ray.wait(list(out), num_returns=len(out), timeout=_LOOK)
@@ -43,7 +43,7 @@ def rows_of(
                 ray.cancel(reference, force=True)
 
 
-def _row(ray: Any, reference: Any, job: Job) -> Row:
+def _row(ray: Any, reference: Any, job: FleetJob) -> Row:
     """What came back; a crash where Ray lost the task."""
     try:
         row: Row = ray.get(reference)

@@ -3,7 +3,7 @@
 from rich.console import Console
 
 from geogs.evaluation.duration import duration
-from geogs_fleet.progress import FleetProgress
+from geogs_fleet.fleet_progress import FleetProgress
 from geogs_fleet.row import Row
 
 
