@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from geogs.io.sources.calibration import Calibration
-from geogs_photos.features import Features
-from geogs_photos.library import load_colmap
-from geogs_photos.pairs import Pairs
+from geogs_photos.photo_features import PhotoFeatures
+from geogs_photos.photo_pairs import Pairs
+from geogs_photos.pycolmap_library import load_colmap
 
 ROUND = 40
 """Pairs that are matched between two reports of progress."""
@@ -36,7 +36,7 @@ class Entry:
     name: str
     camera: int
     """Place of its camera."""
-    features: Features
+    features: PhotoFeatures
 
 
 def write_database(path: Path, cameras: Sequence[SharedCamera], entries: Sequence[Entry]) -> None:

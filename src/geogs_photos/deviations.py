@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from geogs_photos.library import load_colmap
+from geogs_photos.pycolmap_library import load_colmap
 
 
 def pose_deviations(

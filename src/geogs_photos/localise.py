@@ -8,8 +8,8 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from geogs.application.photos import PlacedVideo
 from geogs.geometry.camera import Camera
 from geogs.types import Frame
-from geogs_photos.features import find_features
-from geogs_photos.library import load_colmap
+from geogs_photos.photo_features import find_features
+from geogs_photos.pycolmap_library import load_colmap
 
 NEIGHBOURS = 2
 """Frames with a pose before and after one, whose points it is matched with."""

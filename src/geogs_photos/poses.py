@@ -15,11 +15,11 @@ from geogs.io.sources.known_intrinsics import calibration_from_exif, resolve_int
 from geogs.io.sources.posed.stored_pictures import read_picture
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
-from geogs_photos.features import Features, find_features
-from geogs_photos.library import load_colmap
-from geogs_photos.pairs import Pairs, choose_pairs
+from geogs_photos.incremental_mapping import put_together, refine
+from geogs_photos.photo_features import PhotoFeatures, find_features
+from geogs_photos.photo_pairs import Pairs, choose_pairs
 from geogs_photos.photograph import Lens, PhotoFolder, Photograph
-from geogs_photos.structure import put_together, refine
+from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.upright import upright_rotation
 
 Progress = Callable[[str, float], None]
@@ -160,12 +160,12 @@ def reasons(entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]
     return left_out
 
 
-def _features(photograph: Photograph, root: Path) -> Features:
+def _features(photograph: Photograph, root: Path) -> PhotoFeatures:
     """Features of a photograph, inside its mask where there is one; none where it is damaged."""
     try:
         picture = read_picture(photograph.path)
     except InputError:
-        return Features.none()
+        return PhotoFeatures.none()
     mask = mask_beside(root, photograph.name)
     return find_features(picture, None if mask is None else read_mask(mask, picture.shape[:2]))
 

@@ -17,12 +17,12 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
-from geogs_photos.features import find_features
-from geogs_photos.library import load_colmap
-from geogs_photos.pairs import choose_pairs
+from geogs_photos.incremental_mapping import refine
+from geogs_photos.photo_features import find_features
+from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.poses import Progress, structure_of
+from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
-from geogs_photos.structure import refine
 from geogs_photos.upright import upright_rotation
 
 NEXT = 6

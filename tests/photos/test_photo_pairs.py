@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from geogs_photos import pairs as pairs_module
-from geogs_photos.features import Features
-from geogs_photos.pairs import choose_pairs, mutual_matches, vlad
+from geogs_photos import photo_pairs as pairs_module
+from geogs_photos.photo_features import PhotoFeatures
+from geogs_photos.photo_pairs import choose_pairs, mutual_matches, vlad
 
 
 def descriptors(random: np.random.Generator, count: int) -> np.ndarray:
@@ -12,9 +12,9 @@ def descriptors(random: np.random.Generator, count: int) -> np.ndarray:
     return np.round(512 * np.sqrt(raw / raw.sum(1, keepdims=True))).clip(0, 255).astype(np.uint8)
 
 
-def features(some: np.ndarray) -> Features:
+def features(some: np.ndarray) -> PhotoFeatures:
     keypoints = np.ones((len(some), 4), np.float32)
-    return Features(keypoints, some)
+    return PhotoFeatures(keypoints, some)
 
 
 def walk(random: np.random.Generator, pictures: int, step: int = 20, window: int = 60):

@@ -11,10 +11,10 @@ from geogs.cli.main import main
 from geogs.errors import InputError
 from geogs.geometry.umeyama import umeyama
 from geogs.io.sources.formats.colmap import open_colmap
-from geogs_photos.features import Features, find_features
-from geogs_photos.library import load_colmap
+from geogs_photos.photo_features import PhotoFeatures, find_features
 from geogs_photos.photograph import find_photographs
 from geogs_photos.poses import Entry, find_poses, reasons
+from geogs_photos.pycolmap_library import load_colmap
 from io_samples import write_image
 from posed_layouts import render_room
 
@@ -98,7 +98,7 @@ def test_the_command_goes_from_photographs_to_a_mesh(photographs, tmp_path, capf
 
 
 def test_reasons_say_what_was_missing():
-    some = Features(np.ones((200, 4), np.float32), np.zeros((200, 128), np.uint8))
+    some = PhotoFeatures(np.ones((200, 4), np.float32), np.zeros((200, 128), np.uint8))
     entries = [Entry(f"{k}.jpg", 0, some) for k in range(8)]
     kept = np.zeros((8, 8), int)
     kept[:3, :3] = kept[3:6, 3:6] = 80

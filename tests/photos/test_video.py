@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from geogs.application.photos import PlacedVideo
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
-from geogs_photos.features import find_features
 from geogs_photos.localise import Localiser, matches_to_points
+from geogs_photos.photo_features import find_features
 from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, sharpness, stretch_length
 from geogs_photos.video import place_frames
 from lit_rooms import lit_room

@@ -14,9 +14,9 @@ from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
 from geogs_bench.appearance.training_views import TrainingView
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
-from geogs_photos.features import find_features
-from geogs_photos.library import load_colmap
-from geogs_photos.pairs import choose_pairs
+from geogs_photos.photo_features import find_features
+from geogs_photos.photo_pairs import choose_pairs
+from geogs_photos.pycolmap_library import load_colmap
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from geogs_photos.database import SharedCamera
-from geogs_photos.library import load_colmap
+from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_IMAGES = 3
 """Fewest pictures of a part that counts as one."""

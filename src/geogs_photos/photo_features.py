@@ -16,7 +16,7 @@ _SIFT_RADIUS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Features:
+class PhotoFeatures:
     """Features of a picture, in pixels of the stored picture."""
 
     keypoints: Float32[np.ndarray, "n 4"]
@@ -25,7 +25,7 @@ class Features:
     """Square roots of the fractions of the gradients, times 512 (Arandjelovic & Zisserman 2012)."""
 
     @classmethod
-    def none(cls) -> "Features":
+    def none(cls) -> "PhotoFeatures":
         """The features of a picture without any."""
         return cls(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
 
@@ -40,7 +40,7 @@ class Features:
 
 def find_features(
     picture: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
-) -> Features:
+) -> PhotoFeatures:
     """Features of an RGB picture, where its mask, if there is one, is true."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
@@ -58,7 +58,7 @@ def find_features(
     )
     found, raw = sift.detectAndCompute(grey, used)
     if not found:
-        return Features.none()
+        return PhotoFeatures.none()
     factor = np.array([width / grey.shape[1], height / grey.shape[0]])
     rows = [
         (*((np.array(p.pt) + 0.5) * factor - 0.5), _SIFT_RADIUS * p.size * factor[0], p.angle)
@@ -66,7 +66,7 @@ def find_features(
     ]
     keypoints = np.array(rows, np.float32)
     keypoints[:, 3] = np.radians(keypoints[:, 3])
-    return Features(keypoints, _root_sift(raw))
+    return PhotoFeatures(keypoints, _root_sift(raw))
 
 
 def _root_sift(raw: Float32[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from geogs.threads import thread_map
-from geogs_photos.features import Features
+from geogs_photos.photo_features import PhotoFeatures
 
 ALL_PAIRS = 20
 """Most pictures of which every pair is matched in full."""
@@ -37,7 +37,7 @@ Pairs = list[tuple[int, int]]
 
 
 def choose_pairs(
-    features: Sequence[Features],
+    features: Sequence[PhotoFeatures],
     seed: int = 0,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Pairs:
@@ -80,7 +80,7 @@ def _best(count: int, pairs: Pairs, alike: Sequence[int]) -> Pairs:
     return sorted(kept)
 
 
-def _candidates(features: Sequence[Features], seed: int) -> Pairs:
+def _candidates(features: Sequence[PhotoFeatures], seed: int) -> Pairs:
     """Pairs of pictures whose features are spread alike."""
     appearance = vlad([f.largest(PREVIEW) for f in features], seed)
     likeness = appearance @ appearance.T
