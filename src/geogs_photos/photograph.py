@@ -1,7 +1,7 @@
 """Photographs in a folder: which there are, how large, and by which camera."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,10 +72,10 @@ def find_photographs(folder: str | Path) -> PhotoFolder:
     return PhotoFolder(root, good, damaged)
 
 
-def _pictures(paths: object) -> list[Path]:
+def _pictures(paths: Iterable[Path]) -> list[Path]:
     kept = [
         path
-        for path in paths  # type: ignore[attr-defined]
+        for path in paths
         if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
     ]
     return sorted(kept, key=lambda path: (natural_key(str(path)), str(path)))

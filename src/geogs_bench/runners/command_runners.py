@@ -15,7 +15,7 @@ _NO_SETTINGS = ("source", "output", "resume", "checkpoint_every")
 
 
 class CommandRunner:
-    """Runs tasks by what is behind the two commands."""
+    """Runs tasks by what is behind the two commands, or by a part of it."""
 
     def settings(self, task: Task) -> dict[str, object]:
         """Every setting of the command but its output. Raises InputError for a wrong option."""
@@ -24,41 +24,24 @@ class CommandRunner:
         return {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
 
     def run(self, task: Task) -> None:
-        """Run the command."""
+        """Run the command; what ``geogs run`` does but for the map; or move one map, as the stream
+        has left it, by the rule that the options name."""
         from geogs.application.reconstruct import reconstruct_to_folder
         from geogs.application.run import run
-
-        settings = replace(settings_of(task), checkpoint_every=0.0)
-        with TerminalProgress() as progress:
-            if isinstance(settings, RunSettings):
-                run(settings, progress, Interruption())
-            else:
-                reconstruct_to_folder(settings, progress, Interruption())
-
-
-class TrackingRunner(CommandRunner):
-    """What ``geogs run`` does but for the map; the options are the same."""
-
-    def run(self, task: Task) -> None:
-        """Track, and write the trajectory."""
+        from geogs_bench.runners.saved_map import correct_saved_map
         from geogs_bench.runners.tracking_only import track_to_folder
 
-        settings = settings_of(task)
-        assert isinstance(settings, RunSettings)
-        track_to_folder(settings, task.output)
-
-
-class UpdateRunner(CommandRunner):
-    """Moves one map, as the stream has left it, by the rule that the options name."""
-
-    def run(self, task: Task) -> None:
-        """Run the stream unless its map is kept, correct that, and write the result."""
-        from geogs_bench.runners.saved_map import correct_saved_map
-
-        settings = settings_of(task)
-        assert isinstance(settings, RunSettings)
+        settings = replace(settings_of(task), checkpoint_every=0.0)
+        if isinstance(settings, RunSettings) and task.command == "track":
+            track_to_folder(settings, task.output)
+            return
         with TerminalProgress() as progress:
-            correct_saved_map(settings, task.output, progress)
+            if not isinstance(settings, RunSettings):
+                reconstruct_to_folder(settings, progress, Interruption())
+            elif task.command == "update":
+                correct_saved_map(settings, task.output, progress)
+            else:
+                run(settings, progress, Interruption())
 
 
 def runners() -> dict[Command, Runner]:
@@ -68,8 +51,8 @@ def runners() -> dict[Command, Runner]:
     command = CommandRunner()
     return {
         "run": command,
-        "track": TrackingRunner(),
-        "update": UpdateRunner(),
+        "track": command,
+        "update": command,
         "reconstruct": command,
         "colour-2dgs": BaselineRunner(),
     }

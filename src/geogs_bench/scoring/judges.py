@@ -20,7 +20,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses
 from geogs_bench.results.record import SurfaceScore
 from geogs_bench.results.result_folder import ResultFolder
-from geogs_bench.scoring.surface_scores import Comparison, read_true_surface, score_surface
+from geogs_bench.scoring.room_scores import Comparison, read_true_surface, score_surface
 
 Judge = Callable[[Surface], tuple[tuple[SurfaceScore, ...], Comparison]]
 """Scores of a mesh (the one to plot last) and where it is wrong."""

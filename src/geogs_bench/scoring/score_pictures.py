@@ -8,8 +8,8 @@ from jaxtyping import Float
 from geogs.evaluation.pages import plots
 from geogs.evaluation.pages.shading import viewpoints
 from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.room_scores import Comparison
 from geogs_bench.scoring.slam_scores import StageErrors
-from geogs_bench.scoring.surface_scores import Comparison
 
 PICTURES = {
     "bench_surface.png": "surface, truth and error",

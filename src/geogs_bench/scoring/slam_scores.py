@@ -11,7 +11,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses
 from geogs_bench.results.record import StageName, StageScore, SurfaceScore, TrajectoryScore
 from geogs_bench.results.result_folder import ResultFolder
-from geogs_bench.scoring.surface_scores import (
+from geogs_bench.scoring.room_scores import (
     Comparison,
     TrueSurface,
     read_true_surface,
