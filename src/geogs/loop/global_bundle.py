@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 from geogs.bundle.protocols import BundleOptions
 from geogs.loop.row_correction import correct_rows
 from geogs.tracking.graph.frame_graph import HUBER
-from geogs.tracking.graph.proximity import RADIUS, Pair, proximity_pairs
+from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
+from geogs.world.edges import Pair
 
 ROUNDS = 4
 """Most rounds of flow and adjustment: each sharpens the next, later ones by little."""

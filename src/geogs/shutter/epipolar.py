@@ -16,7 +16,7 @@ class RelativePose:
     R: Float[np.ndarray, "3 3"]
     """A point at X in the first view is at ``R X + t`` in the second."""
     t: Float[np.ndarray, "3"]
-    """Of length one."""
+    """Its length is one."""
 
 
 def relative_pose(

@@ -12,7 +12,7 @@ from geogs.shutter.epipolar import RelativePose, relative_pose
 ROUNDS = 5
 """Gauss-Newton steps to the pose of an image."""
 LEAST_FRACTION = 0.5
-"""Of the points, which both of the two views have to see."""
+"""Fraction of the points that both of the two views have to see."""
 _FEWEST = 8
 """Points that tell a pose; an image with fewer has that of the image before."""
 

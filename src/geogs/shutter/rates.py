@@ -13,7 +13,7 @@ from geogs.shutter.angular_motion import rotated
 from geogs.shutter.rolling_camera import RollingCamera
 
 LONG_EDGE = 256
-"""Of the images that flow is measured on, at most, pixels."""
+"""Pixels, at most, of the images that flow is measured on."""
 STEP = 8
 """Pixels of these between two cells."""
 BORDER = 2

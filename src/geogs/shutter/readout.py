@@ -89,14 +89,14 @@ class _Adjusted:
 
 
 @dataclass(frozen=True)
-class _Clips:
+class _AdjustedClips:
     """What is adjusted: several clips and the readout that they have in common."""
 
     clips: list[_Adjusted]
     readout: float = 0.0
     """Seconds."""
     equations: list[ReadoutEquation] = field(default_factory=list)
-    """Of these clips, where they were linearised last."""
+    """One of each of these clips, where it was linearised last."""
 
     @property
     def finite(self) -> list[_Adjusted]:
@@ -111,19 +111,21 @@ class _CommonReadout:
     tolerance: float
     """Fraction of the focal length."""
 
-    def linearise(self, state: _Clips) -> _Clips:
+    def linearise(self, state: _AdjustedClips) -> _AdjustedClips:
         """The clips that one readout may explain, with their equations; none if too few."""
         clips = state.finite
         if len(clips) < LEAST_CLIPS:
-            return _Clips([])
+            return _AdjustedClips([])
         equations = thread_map(functools.partial(self._equation, state.readout), clips)
         clips, equations = _fitting(clips, equations)
-        return _Clips(clips, state.readout, equations)
+        return _AdjustedClips(clips, state.readout, equations)
 
     def _equation(self, readout: float, clip: _Adjusted) -> ReadoutEquation:
         return readout_equation(clip.tracks, clip.reconstruction, readout, self.tolerance)
 
-    def step(self, state: _Clips, linear: _Clips, damping: float) -> Step[_Clips] | None:
+    def step(
+        self, state: _AdjustedClips, linear: _AdjustedClips, damping: float
+    ) -> Step[_AdjustedClips] | None:
         """All clips after the step of the readout, which is limited."""
         if not linear.clips:
             return None
@@ -135,7 +137,7 @@ class _CommonReadout:
             _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
             for c, part in zip(linear.clips, parts, strict=True)
         ]
-        return Step(_Clips(moved, readout + step, parts), abs(step))
+        return Step(_AdjustedClips(moved, readout + step, parts), abs(step))
 
 
 def find_readout(
@@ -204,7 +206,7 @@ def _global_shutter_step(
 
 def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
     """The readout that fits all clips best, and whether it is believed."""
-    state = _Clips(clips)
+    state = _AdjustedClips(clips)
     for tolerance, steps in TOLERANCES:
         is_last = tolerance == TOLERANCES[-1][0]
         policy = Policy(steps, tolerance=CONVERGED if is_last else 0.0)
@@ -232,7 +234,7 @@ def _fitting(
 
 
 def _standard_error(parts: Sequence[ReadoutEquation]) -> float:
-    """Of the readout: by how much clips disagree, and what their matches have in common."""
+    """Seconds of the readout by what clips disagree, and what their matches have in common."""
     curvature = sum(part.curvature for part in parts) + 1e-12
     gradients = np.array([part.gradient for part in parts])
     count = len(parts)

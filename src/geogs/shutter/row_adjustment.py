@@ -28,11 +28,11 @@ class ReadoutEquation:
     """What a clip says of the readout, whatever its poses and points."""
 
     curvature: float
-    """Of the cost in the readout, 1 / s^2, poses and points being what is then best."""
+    """Curvature of the cost in the readout, 1 / s^2, poses and points being what is then best."""
     gradient: float
-    """Of what falls, 1 / s."""
+    """By how much the cost falls at first, 1 / s."""
     weight: float
-    """Of all that was measured, in the unit of the curvature's error^2."""
+    """Sum over all that was measured, in the unit of the curvature's error^2."""
     square: float
     """Weighted sum of squared errors."""
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]

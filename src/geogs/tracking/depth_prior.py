@@ -38,9 +38,9 @@ MAX_DEVIATION = 0.15
 MAX_DISAGREEMENT = 0.2
 """A prior that is off by more than this in a fifth of the matched cells is not used at all."""
 SCALE_DAMPING = 1e-4
-"""Of the scales, relative to the curvature of the prior's term."""
+"""Damping of the scales, relative to the curvature of the prior's term."""
 DEPTH_DAMPING = 1e-3
-"""Of inverse depth where there is no prior, relative to the mean curvature of its frame."""
+"""Damping of inverse depth without a prior, relative to the mean curvature of its frame."""
 REWEIGHTINGS = 3
 """Times that the prior is judged and fitted anew in one adjustment."""
 _CAUCHY = 2.0

@@ -12,7 +12,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import propagated
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, frame_distances, proximity_pairs
-from geogs.tracking.keyframes.measured_depth import stands_alone
+from geogs.tracking.keyframes.keyframe_depth_sensor import stands_alone
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import FrameMotion
 from geogs.tracking.start.start_up import MIN_KEYFRAMES

@@ -51,7 +51,7 @@ def orientations(
     return {n: R for n, R in found.items() if n not in known}
 
 
-def _earliest_of_largest(neighbours: Mapping[int, list]) -> dict[int, Tensor]:
+def _earliest_of_largest(neighbours: Mapping[int, list[tuple[int, Tensor]]]) -> dict[int, Tensor]:
     """The identity for the earliest frame of the largest group; nothing without links."""
     best: list[int] = []
     left = set(neighbours)

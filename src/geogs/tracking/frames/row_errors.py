@@ -72,7 +72,7 @@ class RowErrors:
 
     @property
     def doubt(self) -> float:
-        """Standard error of the readout, as a part of it; 0 where it was told, or nothing known."""
+        """Relative standard error of the readout; 0 where it was given, or nothing is known."""
         return next((rows.doubt for rows in self._rows.values()), 0.0)
 
     def with_readout(self, factor: float) -> "RowErrors":

@@ -13,7 +13,7 @@ from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.frames.frame_recorder import FrameRecorder
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.graph.measured_odometry import Odometry
-from geogs.tracking.keyframes.measured_depth import KeyframeDepthSensor
+from geogs.tracking.keyframes.keyframe_depth_sensor import KeyframeDepthSensor
 from geogs.tracking.keyframes.monocular_priors import KeyframePriors
 from geogs.types import Frame
 from geogs.world.frames import RelativeRotation
