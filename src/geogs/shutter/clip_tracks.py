@@ -1,20 +1,28 @@
 """Points followed through a few neighbouring images, as rays with the time of their row."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from geogs.shutter.neighbours import Image
 from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.tracks import followed_points
 
 MOST_POINTS = 160
 LEAST_POINTS = 30
 LEAST_IMAGES = 8
 """That a point is followed through."""
+POINTS, QUALITY, APART = 250, 0.005, 8
+"""Corners, at most; the least strength of one against the strongest; pixels between two."""
+WINDOW, LEVELS = 15, 3
+"""Pixels that are compared around a point; halvings at which it is looked for first."""
+RETURN = 0.3
+"""Pixels by which a point may miss its place on the way back."""
+_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.003)
+_Images = Sequence[UInt8[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True)
@@ -58,3 +66,79 @@ def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | No
     plane[seen], line_times[seen] = rays[:, :2] / rays[:, 2:], camera.line_times(pixels[seen])
     times = np.array([image.timestamp for image in clip])
     return ClipTracks(plane, line_times, seen, times - times[len(times) // 2])
+
+
+def followed_points(images: _Images) -> Float[np.ndarray, "k n 2"]:
+    """Where corners of the middle image are in every image, in pixels; nan where they are lost.
+
+    Each image is compared with the middle one itself, so that nothing adds up on the way (Lucas and
+    Kanade's method; Bouguet's pyramid finds the place from image to image first). A window that
+    shears or grows moves by what its gradients say, hence as the point amid its gradients does:
+    that is the point whose places are returned. The corner itself would be off in one direction all
+    over a floor, by a tenth of a pixel and more.
+    """
+    middle = len(images) // 2
+    corners = cv2.goodFeaturesToTrack(images[middle], POINTS, QUALITY, APART)
+    if corners is None:
+        return np.zeros((len(images), 0, 2))
+    corners = corners[_inside(corners[:, 0], images[middle])]
+    to_centre = _amid_gradients(images[middle], corners[:, 0])
+    places = np.full((len(images), len(corners), 2), np.nan)
+    places[middle] = corners[:, 0] + to_centre
+    for way in (range(middle, len(images)), range(middle, -1, -1)):
+        for k, seen in zip(way[1:], _followed(images, corners, way), strict=True):
+            places[k] = seen + to_centre
+    return places
+
+
+def _followed(
+    images: _Images, corners: Float32[np.ndarray, "n 1 2"], way: Sequence[int]
+) -> Iterable[Float[np.ndarray, "n 2"]]:
+    """Places of the corners of the first image of a way in all others."""
+    window, start = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
+    first, here, motion = images[way[0]], corners, np.zeros_like(corners)
+    left = np.arange(len(corners))  # those that are not lost yet
+    for before, after in itertools.pairwise(way):
+        places = np.full((len(corners), 2), np.nan)
+        if len(left):
+            from_first = corners[left]
+            there, _, _ = cv2.calcOpticalFlowPyrLK(
+                images[before], images[after], here, here + motion, None, None, window, LEVELS,
+                _STEPS, start,
+            )  # fmt: skip
+            there, found, _ = cv2.calcOpticalFlowPyrLK(
+                first, images[after], from_first, there, None, None, window, 0, _STEPS, start
+            )
+            back, returned, _ = cv2.calcOpticalFlowPyrLK(
+                images[after], first, there, from_first.copy(), None, None, window, 0, _STEPS, start
+            )
+            missed = np.linalg.norm((back - from_first)[:, 0], axis=1) > RETURN
+            kept = (found[:, 0] != 0) & (returned[:, 0] != 0) & ~missed
+            kept &= _inside(there[:, 0], images[after])
+            left, motion, here = left[kept], (there - here)[kept], there[kept]
+            places[left] = here[:, 0]
+        yield places
+
+
+def _inside(
+    pixels: Float[np.ndarray, "n 2"], image: UInt8[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "n"]:
+    """Whether the window around a point lies within the image."""
+    border, size = WINDOW // 2 + 2, np.array(image.shape[::-1])
+    return np.all((pixels >= border) & (pixels <= size - 1 - border), axis=1)
+
+
+def _amid_gradients(
+    image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """From the middle of each window to the mean of its pixels, weighted by squared gradient."""
+    across, down = (cv2.Sobel(image, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
+    weight = across**2 + down**2
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)
+    total, in_u, in_v = (
+        cv2.boxFilter(x, -1, (WINDOW, WINDOW), normalize=False)
+        for x in (weight, weight * u, weight * v)
+    )
+    column, row = np.rint(pixels).astype(int).T
+    most = np.maximum(total[row, column], 1e-6)
+    return np.stack([in_u[row, column] / most - column, in_v[row, column] / most - row], axis=1)

@@ -1,5 +1,8 @@
 """Where the adjustment of a clip begins: two views, then one image after the other."""
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -7,7 +10,6 @@ from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.robust import geman_mcclure_weight
 from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import LEAST_POINTS, ClipTracks
-from geogs.shutter.epipolar import RelativePose, relative_pose
 
 ROUNDS = 5
 """Gauss-Newton steps to the pose of an image."""
@@ -15,6 +17,18 @@ LEAST_FRACTION = 0.5
 """Fraction of the points that both of the two views have to see."""
 _FEWEST = 8
 """Points that tell a pose; an image with fewer has that of the image before."""
+_PROBABILITY, _TRIES = 0.9999, 1000
+"""How sure the motion between two views is to be found, and by how many tries at most."""
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """A motion of one view against another, up to the length of its translation."""
+
+    R: Float[np.ndarray, "3 3"]
+    """A point at X in the first view is at ``R X + t`` in the second."""
+    t: Float[np.ndarray, "3"]
+    """Its length is one."""
 
 
 def first_reconstruction(tracks: ClipTracks, tolerance: float) -> ClipReconstruction | None:
@@ -52,6 +66,26 @@ def first_reconstruction(tracks: ClipTracks, tolerance: float) -> ClipReconstruc
             here = _located(here, tracks.plane[k], tracks.seen[k], 3 * tolerance)
             R[k], t[k] = here.R[0], here.t[0]
     return ClipReconstruction(R, t, points)
+
+
+def relative_pose(
+    first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], tolerance: float
+) -> RelativePose | None:
+    """The motion that most matches agree on (MAGSAC, the same for the same matches).
+
+    Args:
+        first: x/z and y/z of the matches in the first view.
+        second: in the second view.
+        tolerance: error of an inlier, as a fraction of the focal length.
+    """
+    cv2.setRNGSeed(0)  # process-wide: OpenCV has no generator for one call
+    E, inliers = cv2.findEssentialMat(
+        first, second, np.eye(3), cv2.USAC_MAGSAC, _PROBABILITY, tolerance, _TRIES
+    )
+    if E is None or E.shape != (3, 3):
+        return None
+    _, R, t, _ = cv2.recoverPose(E, first, second, np.eye(3), mask=inliers.copy())
+    return RelativePose(R, t[:, 0] / np.linalg.norm(t))
 
 
 def inverse_depths(

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from geogs.shutter.tracks import followed_points
+from geogs.shutter.clip_tracks import followed_points
 
 SIZE = 160, 120
 STEP = np.array([[1.004, 0.012, 0.8], [-0.002, 1.002, -0.5]])
