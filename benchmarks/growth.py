@@ -27,7 +27,7 @@ from geogs.mapping.mapper import Mapper
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
-from geogs.world.loops import Features, RelativePoses
+from geogs.world.loops import ImageFeatures, RelativePoses
 from geogs_synth.sequence.location import centred_camera
 
 STEP = 0.15
@@ -103,9 +103,9 @@ def looks(count: int) -> dict[str, float]:
     random, index = np.random.default_rng(0), AppearanceIndex()
     words = random.integers(0, 256, (2000, 32), dtype=np.uint8)
 
-    def features() -> Features:
+    def features() -> ImageFeatures:
         chosen = random.choice(len(words), 300, replace=False)
-        return Features(np.zeros((300, 2), np.float32), words[chosen])
+        return ImageFeatures(np.zeros((300, 2), np.float32), words[chosen])
 
     for n in range(count):
         index.add(n, features())

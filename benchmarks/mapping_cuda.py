@@ -34,7 +34,7 @@ from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
 from geogs.splat.cuda import autograd
 from geogs.splat.cuda.autograd import RasterizeOnGpu
-from geogs.splat.init import NEIGHBOURS, initialise_disks
+from geogs.splat.init import initialise_disks
 from geogs.splat.render import NEAR, RenderOutput
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs.world.grid import SampleGrid
@@ -133,12 +133,8 @@ def _disks(
         points.append(seen @ T_wc[:3, :3].T + T_wc[:3, 3])
         spans.append((area / count) ** 0.5 * depth.flatten()[pixels] / camera.fx)
     centre = torch.stack([v.T_wc[:3, 3].float().cpu() for v in views]).mean(0)
-    disk = MappingConfig().disk
-    new = initialise_disks(
-        torch.cat(points), centre, torch.cat(spans), points[0][:0], neighbours=NEIGHBOURS,
-        scale_factor=SCALE, planarity_threshold=disk.planarity_threshold,
-        planarity_shrink=disk.planarity_shrink, opacity=OPACITY,
-    )  # fmt: skip
+    disk = replace(MappingConfig().disk, scale_factor=SCALE, opacity=OPACITY)
+    new = initialise_disks(torch.cat(points), centre, torch.cat(spans), points[0][:0], disk)
     assert len(new.position) == count
     return new
 

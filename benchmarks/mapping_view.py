@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from geogs.config import MappingConfig
+from geogs.config import DiskConfig, MappingConfig
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
@@ -70,8 +70,7 @@ def make_map(views: list[MapView], cameras: MapCameras, count: int) -> GaussianM
         spacing = (camera.width * camera.height / len(pixels)) ** 0.5
         new = initialise_disks(
             points, T_wc[:3, 3], spacing * depth.flatten()[pixels] / camera.fx, points[:0],
-            neighbours=12, scale_factor=0.6, planarity_threshold=0.05, planarity_shrink=0.5,
-            opacity=0.7,
+            DiskConfig(),
         )  # fmt: skip
         disks.append(new, view.id)
     disks.keep(torch.arange(len(disks)) < count)

@@ -15,7 +15,7 @@ def unwatched(stage: str, fraction: float) -> None:
 
 
 @dataclass
-class StageTimes:
+class StageSeconds:
     """Seconds that stages took so far; mutable."""
 
     seconds: dict[str, float] = field(default_factory=dict)
@@ -37,9 +37,9 @@ class Stopwatch:
     stages never overlap.
     """
 
-    def __init__(self, times: StageTimes | None = None) -> None:
+    def __init__(self, times: StageSeconds | None = None) -> None:
         """Adds to ``times``."""
-        self.times = times or StageTimes()
+        self.times = times or StageSeconds()
         self._is_running = False
         self._here = _Here()
 

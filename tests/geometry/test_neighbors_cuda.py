@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
+from geogs.config import DiskConfig
 from geogs.geometry import neighbors
 from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
 from geogs.splat import init
@@ -18,10 +19,7 @@ GPU = pytest.param(
         pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"),
     ],
 )
-SETTINGS = {
-    "neighbours": 12, "scale_factor": 0.6, "planarity_threshold": 0.05,
-    "planarity_shrink": 0.1, "opacity": 0.7,
-}  # fmt: skip
+CONFIG = DiskConfig(planarity_shrink=0.1)
 
 
 @pytest.fixture(params=["cpu", GPU])
@@ -124,10 +122,10 @@ def test_disks_are_those_of_the_cpu(device, monkeypatch):
     n = 2000 if device.type == "cuda" else 40
     points, context = cloud(n, 7) + 1, cloud(600, 8) + 1
     centre, footprint = torch.tensor([2.0, 2.0, 2.5]), torch.full((n,), 0.2)
-    expected = initialise_disks(points, centre, footprint, context, **SETTINGS)
+    expected = initialise_disks(points, centre, footprint, context, CONFIG)
     monkeypatch.setattr(init, "fit_local_planes", fit_local_planes_on_gpu)
     moved = (x.to(device) for x in (points, centre, footprint, context))
-    made = initialise_disks(*moved, **SETTINGS)
+    made = initialise_disks(*moved, CONFIG)
     assert made.position.device.type == device.type
     assert (made.log_scale.cpu() - expected.log_scale).abs().max() < 1e-4
     same = (made.quaternion.cpu() * expected.quaternion).sum(-1).abs()

@@ -14,8 +14,8 @@ from geogs.depth.cuda.completion import CompletionSettings
 from geogs.depth.cuda.fusion import CheckSettings
 from geogs.geometry.camera import Camera
 from geogs.losses.cuda.view_table import ViewField
-from geogs.losses.cuda.window import _Flags
-from geogs.losses.settings import (
+from geogs.losses.cuda.window_losses import _Flags
+from geogs.losses.kernel_settings import (
     PhotoSettings,
     SingleViewSettings,
     photo_settings,

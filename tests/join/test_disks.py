@@ -7,7 +7,7 @@ import torch
 
 from geogs.geometry.lie import quaternion_to_matrix, se3_exp, sim3_exp, sim3_inverse, sim3_scale
 from geogs.types import MapSnapshot
-from geogs.world.loops import Features
+from geogs.world.loops import ImageFeatures
 from geogs_fleet.join.joined_disks import is_covered, joined_disks, kept, overall, transformed
 from geogs_fleet.join.part import PartViews
 
@@ -64,7 +64,7 @@ def test_one_similarity_of_all_keyframes_is_found():
     steps = 0.2 * torch.randn(5, 6, generator=torch.Generator().manual_seed(5)).double()
     T_cw = se3_exp(steps)
     ones = np.full((5, 4), 0.5, np.float32)
-    none = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+    none = ImageFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
     views = PartViews(T_cw.numpy(), np.arange(5.0), ones, ones, (none,) * 5)
     S = sim3_exp(torch.tensor([0.5, -1.0, 0.2, 0.3, -0.2, 0.1, 0.4]).double())
     assert torch.allclose(overall(views, S.expand(5, 4, 4)), S, atol=1e-9)

@@ -4,14 +4,14 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_inverse, sim3_log, sim3_scale
-from geogs.world.loops import Features, RelativePoses
+from geogs.world.loops import ImageFeatures, RelativePoses
 from geogs_fleet.join.gauge import claim, common_gauge
 from geogs_fleet.join.links import Link
 from geogs_fleet.join.part import PartViews
 from geogs_fleet.join.part_graph import Placement, placed
 
 N = 10
-FEATURES = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+FEATURES = ImageFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
 
 
 def poses(seed: int) -> torch.Tensor:

@@ -8,7 +8,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.loop.orb_features import orb_features
 from geogs.world.grid import SampleGrid
-from geogs.world.loops import Features
+from geogs.world.loops import ImageFeatures
 from geogs_fleet.join.links import candidates
 from geogs_fleet.join.part import Part, PartViews, describe, opened, resampled
 from geogs_fleet.join.records import read_record
@@ -53,16 +53,16 @@ def test_results_that_cannot_be_joined_are_refused(tmp_path):
         opened(Part("x", tmp_path / "none"))
 
 
-def views_with(*features: Features) -> PartViews:
+def views_with(*features: ImageFeatures) -> PartViews:
     n = len(features)
     ones = np.ones((n, 4), np.float32)
     return PartViews(np.tile(np.eye(4), (n, 1, 1)), np.arange(n) * 1.0, ones, ones, features)
 
 
-def some_features(seed: int) -> Features:
+def some_features(seed: int) -> ImageFeatures:
     random = np.random.default_rng(seed)
     descriptors = random.integers(0, 256, (80, 32), dtype=np.uint8)
-    return Features(random.uniform(0, 100, (80, 2)).astype(np.float32), descriptors)
+    return ImageFeatures(random.uniform(0, 100, (80, 2)).astype(np.float32), descriptors)
 
 
 def test_alike_keyframes_of_different_parts_are_found_and_those_beside_them_ruled_out():

@@ -15,7 +15,7 @@ from geogs.loop.detect import LoopDetector
 from geogs.loop.orb_features import orb_features
 from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.world.keyframes import KeyframeSet
-from geogs.world.loops import Features
+from geogs.world.loops import ImageFeatures
 from geogs_synth.raycast.raycaster import RenderedView
 from lit_rooms import lit_room
 from loop_scenes import CAMERA, keyframes, orbit, room_views, stretched, views
@@ -67,7 +67,7 @@ def _views_of(store: KeyframeSet, *ids: int) -> list[FeatureView]:
     return [_depth_view(store, k, orb_features(store[k].image)) for k in ids]
 
 
-def _depth_view(store: KeyframeSet, id: int, features: Features) -> FeatureView:
+def _depth_view(store: KeyframeSet, id: int, features: ImageFeatures) -> FeatureView:
     state = store[id]
     return FeatureView.of(store.grid, state.inverse_depth, state.information, features)
 

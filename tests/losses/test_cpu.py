@@ -10,7 +10,7 @@ import torch
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses import PhotoView, multi_view, multi_view_loss, settings, single_view_loss
+from geogs.losses import PhotoView, kernel_settings, multi_view, multi_view_loss, single_view_loss
 from geogs.losses.cpu import fused_multi_view, fused_single_view
 from loss_scenes import ALL_TERMS, random_view
 
@@ -112,7 +112,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
     config = LossConfig(
         l1_weight=1.0, l1_huber=0.02, l1_cut=0.2, ncc_patch=7, ncc_texture=1e-4
     )  # fmt: skip
-    for module in (multi_view, settings):
+    for module in (multi_view, kernel_settings):
         monkeypatch.setattr(module, "NCC_MIN_VARIANCE", 1e-4)
     for d in (full, odd):
         (fast,) = leaves(d)

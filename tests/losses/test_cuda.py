@@ -18,7 +18,7 @@ from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
-from geogs.losses.cuda import ViewTable, WindowLosses, window
+from geogs.losses.cuda import ViewTable, WindowLosses, window_losses
 from geogs.losses.single_view import MIN_ALPHA
 from loss_scenes import random_view
 
@@ -38,7 +38,7 @@ def device(
             pytest.skip("there is no GPU")
         yield torch.device("cuda")
     else:
-        use_emulator(monkeypatch, window)
+        use_emulator(monkeypatch, window_losses)
         yield torch.device("cpu")
 
 

@@ -54,11 +54,6 @@ class BackgroundMapper:
         self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
         self._thread.start()
 
-    @property
-    def waiting(self) -> int:
-        """Things that it was told and has not done yet."""
-        return len(self._tasks)
-
     def giving_way(self) -> AbstractContextManager[None]:
         """While a frame is tracked, for whose pose somebody waits."""
         return self._gate.taken()

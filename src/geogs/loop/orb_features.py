@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from geogs.world.loops import Features
+from geogs.world.loops import ImageFeatures
 
 FEATURES = 800
 """Most of a keyframe, strongest of each image cell first: plain walls leave a few hundred."""
@@ -20,7 +20,7 @@ def orb_features(
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"] | None = None,
     most: int = FEATURES,
-) -> Features:
+) -> ImageFeatures:
     """Oriented FAST corners at eight scales, described by ORB; empty where nothing stands out.
 
     Outside a ``mask`` of the size of the image nothing is found. For any thread.
@@ -37,11 +37,11 @@ def orb_features(
             kept.append(points[n])
     described, descriptors = orb.compute(grey, kept)
     if descriptors is None:
-        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+        return ImageFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
     # Descriptors come back in another order: OpenCV sorts by scale.
     back = np.argsort([p.class_id for p in described], kind="stable")
     pixels = np.array([p.pt for p in described], np.float32)
-    return Features(pixels[back], descriptors[back])
+    return ImageFeatures(pixels[back], descriptors[back])
 
 
 def _spread(pixels: np.ndarray, strength: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from geogs.world.loops import Features, Vocabulary
+from geogs.world.loops import ImageFeatures, Vocabulary
 
 INDEXED = 300
 """Features of an image that are looked up and stored, strongest first; the rest serve to verify."""
@@ -69,13 +69,13 @@ class AppearanceIndex:
         self._row = {keyframe: row for row, keyframe in enumerate(v.keyframes)}
         for row, counts in enumerate(v.counts):
             self._post(row, counts)
-        self._recent: tuple[Features, np.ndarray, np.ndarray] | None = None
+        self._recent: tuple[ImageFeatures, np.ndarray, np.ndarray] | None = None
         """Features last looked up with their words: a keyframe is queried, then added."""
 
     def __len__(self) -> int:
         return len(self._vocabulary.keyframes)
 
-    def add(self, keyframe: int, features: Features) -> None:
+    def add(self, keyframe: int, features: ImageFeatures) -> None:
         """Enter a keyframe; what is new in it becomes words."""
         descriptors = features.descriptors[:INDEXED]
         words, distance = self._nearest(features)
@@ -95,7 +95,7 @@ class AppearanceIndex:
         self._post(row, v.counts[-1])
 
     def query(
-        self, features: Features, exclude: Collection[int] = (), count: int = 5
+        self, features: ImageFeatures, exclude: Collection[int] = (), count: int = 5
     ) -> list[SimilarKeyframe]:
         """The ``count`` keyframes most similar to an image that are not excluded, best first."""
         score = self._scores(features)
@@ -111,7 +111,7 @@ class AppearanceIndex:
         for word, count in counts.tolist():
             self._postings[word].add(row, count)
 
-    def _scores(self, features: Features) -> Float64[np.ndarray, "rows"]:
+    def _scores(self, features: ImageFeatures) -> Float64[np.ndarray, "rows"]:
         """Similarity of every row to an image."""
         rows = len(self)
         words, distance = self._nearest(features)
@@ -133,7 +133,9 @@ class AppearanceIndex:
         full = len(self._vocabulary.words) >= self._most_words
         return WORD_RADIUS + LOOSE * full
 
-    def _nearest(self, features: Features) -> tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]:
+    def _nearest(
+        self, features: ImageFeatures
+    ) -> tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]:
         """Nearest word of each indexed descriptor and its distance in bits; 256 without a word."""
         if self._recent is not None and self._recent[0] is features:
             return self._recent[1:]

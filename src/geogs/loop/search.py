@@ -15,7 +15,7 @@ from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.threads import worker_count
 from geogs.tracking.locate.frame_locator import Recognition
 from geogs.world.grid import SampleGrid
-from geogs.world.loops import Features, LoopCandidate, LoopTable, VerifiedCandidate
+from geogs.world.loops import ImageFeatures, LoopCandidate, LoopTable, VerifiedCandidate
 
 MIN_SCORE = 0.05
 """Least similarity of a candidate by appearance, of that of a keyframe with itself."""
@@ -34,7 +34,7 @@ class Query:
     """A keyframe to search loops for; nothing in it changes any more."""
 
     id: int
-    features: Future[Features]
+    features: Future[ImageFeatures]
     """Those of its image."""
     near: frozenset[int]
     """Keyframes that cannot be its loops, for being of the same time."""
@@ -70,7 +70,7 @@ class PlaceRecognition:
         )
         """Find features before their keyframe's turn, and hold several pairs together at once."""
 
-    def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Future[Features]:
+    def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Future[ImageFeatures]:
         """What a keyframe is remembered by, as soon as somebody has the time to find it."""
         return self._helpers.submit(orb_features, image, self._mask)
 
@@ -128,7 +128,7 @@ class PlaceRecognition:
                 chosen.append(p)
         return chosen[:VERIFIED]
 
-    def _similar(self, features: Features, excluded: frozenset[int]) -> list[int]:
+    def _similar(self, features: ImageFeatures, excluded: frozenset[int]) -> list[int]:
         """Keyframes that look alike, most alike first."""
         found = self.index.query(features, excluded, self.config.appearance)
         return [c.keyframe for c in found if c.score >= MIN_SCORE]

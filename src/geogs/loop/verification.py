@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
-from geogs.world.loops import Features, TwoViewMatch
+from geogs.world.loops import ImageFeatures, TwoViewMatch
 
 MATCH_RATIO = 0.87
 """A match must be this much nearer than the second nearest descriptor: looser than Lowe's 0.8,
@@ -46,7 +46,7 @@ ITERATIONS = 300
 class FeatureView:
     """A view's features and what is known of their depth."""
 
-    features: Features
+    features: ImageFeatures
     depth: Float32[np.ndarray, "n"] | None = None
     """z of each feature; 0 where unknown. None if nothing is known."""
 
@@ -55,7 +55,7 @@ class FeatureView:
         grid: SampleGrid,
         inverse_depth: Float[Tensor, "p"],
         information: Float[Tensor, "p"],
-        features: Features,
+        features: ImageFeatures,
     ) -> "FeatureView":
         """Depth of the features from a keyframe's; known where its nearest cell has information."""
         points = torch.from_numpy(features.pixels).to(grid.device)
@@ -111,7 +111,7 @@ class TwoViewVerifier:
             view = replace(view, scale=scale)
         return replace(view, accepted=not reason, reason=reason)
 
-    def _match(self, first: Features, second: Features) -> Int64[np.ndarray, "m 2"]:
+    def _match(self, first: ImageFeatures, second: ImageFeatures) -> Int64[np.ndarray, "m 2"]:
         """Mutual nearest descriptors that are clearly nearer than the second nearest."""
         if len(first) < 2 or len(second) < 2:
             return np.zeros((0, 2), np.int64)

@@ -222,14 +222,6 @@ def occlusion_mask(
     return warped.in_view & (share > 0.999) & ((z - seen).abs() < tolerance * z)
 
 
-def depth_tolerance(pixels: float, camera: Camera) -> float:
-    """Relative depth difference that moves a point by ``pixels`` between views 10 degrees apart.
-
-    So the occlusion test is as sharp as depths can be: a camera with a long lens sees finer steps.
-    """
-    return pixels / (camera.fx * math.tan(math.radians(_PARALLAX)))
-
-
 def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
     """Which of the ``planes`` of two views are compared, each with the weights it has.
 
@@ -245,8 +237,13 @@ def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
 
 
 def occlusion_tolerance(config: LossConfig, camera: Camera) -> float:
-    """Relative depth difference from which a pixel is hidden: tau, or what pixels come to."""
-    return config.occlusion_ratio or depth_tolerance(config.occlusion, camera)
+    """Relative depth difference from which a pixel is hidden: tau, or what moves a point by so many
+    pixels between views 10 degrees apart.
+
+    So the occlusion test is as sharp as depths can be: a camera with a long lens sees finer steps.
+    """
+    pixels = config.occlusion
+    return config.occlusion_ratio or pixels / (camera.fx * math.tan(math.radians(_PARALLAX)))
 
 
 def multi_view_loss(

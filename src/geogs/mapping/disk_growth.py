@@ -14,7 +14,7 @@ from geogs.splat.density import (
     worth_keeping,
     worth_splitting,
 )
-from geogs.splat.init import NEIGHBOURS, new_disks
+from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.world.map import MapTable
@@ -72,10 +72,10 @@ class DiskGrowth:
         if len(points) + len(disks) < NEIGHBOURS or len(points) == 0:
             return
         footprint = config.stride * z / camera.fx
-        new = new_disks(
-            points, T_wc[:3, 3], footprint, disks.position.detach(), config, random,
-            self.config.ablation.initialisation,
-        )  # fmt: skip
+        existing = disks.position.detach()
+        new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config)
+        if self.config.ablation.initialisation == "random":
+            new = turned_at_random(new, random)
         disks.append(new, view.id)
 
     def split(self, optimizer: MapOptimizer, unit: float) -> None:

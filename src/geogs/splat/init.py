@@ -1,7 +1,6 @@
 """How disks start: in local planes (paper, Sec. "Local-plane driven initialization"), or anyhow."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -98,58 +97,24 @@ def face_camera(
     return normal / normal.norm(dim=-1, keepdim=True)
 
 
-def new_disks(
+def initialise_disks(
     points: Float[Tensor, "n 3"],
     camera_centre: Float[Tensor, "3"],
     footprint: Float[Tensor, "n"],
     existing: Float[Tensor, "m 3"],
     config: DiskConfig,
-    random: torch.Generator,
-    start: Literal["local_plane", "random"] = "local_plane",
-) -> DiskParameters:
-    """Disks at ``points`` (world frame) as the settings want them to start.
-
-    The arguments are those of :func:`initialise_disks`; ``random`` is a generator on the CPU.
-    """
-    disks = initialise_disks(
-        points, camera_centre, footprint if config.bound_spacing else None, existing,
-        neighbours=NEIGHBOURS, scale_factor=config.scale_factor,
-        planarity_threshold=config.planarity_threshold,
-        planarity_shrink=config.planarity_shrink, opacity=config.opacity,
-    )  # fmt: skip
-    return disks if start == "local_plane" else turned_at_random(disks, random)
-
-
-def turned_at_random(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
-    """The same disks, of the same scales, with orientations uniform over all rotations."""
-    # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
-    quaternion = torch.randn(len(disks.position), 4, generator=random).to(disks.position)
-    return disks._replace(quaternion=quaternion / quaternion.norm(dim=-1, keepdim=True))
-
-
-def initialise_disks(
-    points: Float[Tensor, "n 3"],
-    camera_centre: Float[Tensor, "3"],
-    footprint: Float[Tensor, "n"] | None,
-    existing: Float[Tensor, "m 3"],
-    *,
-    neighbours: int,
-    scale_factor: float,
-    planarity_threshold: float,
-    planarity_shrink: float,
-    opacity: float,
 ) -> DiskParameters:
     """Disks at ``points`` (world frame), lying in the planes of their neighbourhoods.
 
     ``footprint`` is the distance between neighbouring samples at each point's depth; the spacing
     is kept within [0.3, 1.5] of it so that a stray point makes neither a speck nor a blanket.
-    Without it the spacing is what it is, as in the paper. Where planarity is under the threshold
-    the scale shrinks, as the paper does with a factor 0.1.
+    Without ``bound_spacing`` it is what it is, as in the paper. Where planarity is under the
+    threshold the scale shrinks, as the paper does with a factor 0.1.
     """
     if len(points) == 0:
         empty = points.new_zeros
         return DiskParameters(empty(0, 3), empty(0, 4), empty(0, 2), empty(0))
-    plane = fit_local_planes(points, existing, neighbours)
+    plane = fit_local_planes(points, existing, NEIGHBOURS)
     to_camera = camera_centre - points
     to_camera = to_camera / to_camera.norm(dim=-1, keepdim=True)
     normal = face_camera(plane.normal, to_camera, min_cosine=0.15)
@@ -157,11 +122,18 @@ def initialise_disks(
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     rotation = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)
     spacing = plane.spacing.clamp(min=1e-7)
-    if footprint is not None:
+    if config.bound_spacing:
         spacing = torch.minimum(torch.maximum(spacing, 0.3 * footprint), 1.5 * footprint)
-    shrink = torch.where(plane.planarity < planarity_threshold, planarity_shrink, 1.0)
-    scale = scale_factor * spacing * shrink
-    logit = torch.logit(points.new_full((len(points),), opacity))
+    shrink = torch.where(plane.planarity < config.planarity_threshold, config.planarity_shrink, 1.0)
+    scale = config.scale_factor * spacing * shrink
+    logit = torch.logit(points.new_full((len(points),), config.opacity))
     return DiskParameters(
         points, matrix_to_quaternion(rotation), scale.log()[:, None].expand(-1, 2).clone(), logit
     )
+
+
+def turned_at_random(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
+    """The same disks, of the same scales, with orientations uniform over all rotations."""
+    # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
+    quaternion = torch.randn(len(disks.position), 4, generator=random).to(disks.position)
+    return disks._replace(quaternion=quaternion / quaternion.norm(dim=-1, keepdim=True))

@@ -59,11 +59,6 @@ class Archive:
             raise self._unwritable(error) from error
         weakref.finalize(self, self._file.close)
 
-    @property
-    def size(self) -> int:
-        """Bytes of the file."""
-        return self._end
-
     def put(self, array: np.ndarray) -> "Archived":
         """Write an array.
 

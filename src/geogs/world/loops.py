@@ -16,7 +16,7 @@ Cause = Literal["geometry", "appearance"]
 
 
 @dataclass(frozen=True)
-class Features:
+class ImageFeatures:
     """What is kept of an image to recognise it; the strongest of every cell come first."""
 
     pixels: Float32[np.ndarray, "n 2"]
@@ -184,7 +184,7 @@ class LoopTable:
 
     keyframes: list[int] = field(default_factory=list)
     """Searched for loops so far, earliest first."""
-    features: dict[int, Features] = field(default_factory=dict)
+    features: dict[int, ImageFeatures] = field(default_factory=dict)
     """By keyframe."""
     vocabulary: Vocabulary = field(default_factory=Vocabulary)
     found: list[list[VerifiedCandidate]] = field(default_factory=list)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from geogs.errors import InputError
-from geogs.stopwatch import StageTimes
+from geogs.stopwatch import StageSeconds
 from geogs.types import MetricScale, Uncertainty
 from geogs.world.keyframes import KeyframeTable, check_keyframes
 from geogs.world.loops import LoopTable, check_loops
@@ -22,7 +22,7 @@ class World:
     loops: LoopTable = field(default_factory=LoopTable)
     map: MapTable | None = None
     """Disks and dense depths."""
-    times: StageTimes = field(default_factory=StageTimes)
+    times: StageSeconds = field(default_factory=StageSeconds)
     frames: int = 0
     """Images so far."""
     timestamp: float | None = None

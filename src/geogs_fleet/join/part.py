@@ -15,7 +15,7 @@ from geogs.io.writers.keyframe_folder import image_path, read_image
 from geogs.loop.orb_features import orb_features
 from geogs.threads import on_one_torch_thread
 from geogs.world.grid import SampleGrid
-from geogs.world.loops import Features
+from geogs.world.loops import ImageFeatures
 from geogs_fleet.join.records import write_record
 
 DEVIATION = 0.01
@@ -46,7 +46,7 @@ class PartViews:
     """On the grid; rendered from the part's map, filled where that shows nothing."""
     information: Float32[np.ndarray, "n p"]
     """Inverse variances of these; 0 where the map shows nothing."""
-    features: tuple[Features, ...]
+    features: tuple[ImageFeatures, ...]
 
     @property
     def median_depth(self) -> Float64[np.ndarray, "n"]:

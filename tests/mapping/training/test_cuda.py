@@ -9,7 +9,7 @@ import torch
 
 from cuda_emulator import use_emulator
 from geogs.geometry.lie import retract, se3_exp
-from geogs.losses.cuda import window
+from geogs.losses.cuda import window_losses
 from geogs.mapping.training.cpu import CpuTrainer
 from geogs.mapping.training.cuda import trainer as cuda_trainer
 from geogs.mapping.training.cuda.trainer import CudaTrainer
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.system
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     """Where the kernels run."""
     if request.param == "emulated":
-        use_emulator(monkeypatch, rasterize, window, cuda_trainer)
+        use_emulator(monkeypatch, rasterize, window_losses, cuda_trainer)
         return torch.device("cpu")
     if not torch.cuda.is_available():
         pytest.skip("needs an NVIDIA GPU")

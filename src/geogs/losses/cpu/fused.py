@@ -17,9 +17,9 @@ from geogs.config import LossConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.cpu import multi_view_kernels as multi
 from geogs.losses.cpu.single_view_kernels import single_view_rows
-from geogs.losses.cpu.structure import structure_gradient
+from geogs.losses.cpu.ssim_gradient import ssim_gradient
+from geogs.losses.kernel_settings import photo_settings, record, single_view_settings
 from geogs.losses.multi_view import PhotoView, compared_planes
-from geogs.losses.settings import photo_settings, record, single_view_settings
 from geogs.losses.single_view import ViewConstants, visible
 from geogs.threads import over_rows
 
@@ -130,7 +130,7 @@ class _MultiView(torch.autograd.Function):
         g_image = np.zeros((2, height, width) if with_pose else (2, 0, 0), np.float32)
         if config.ssim_weight > 0:
             g_image = np.zeros((2, height, width), np.float32)
-            value, g_image[0] = structure_gradient(grey, warped, mask, config)
+            value, g_image[0] = ssim_gradient(grey, warped, mask, config)
             total += value
 
         g_depth, g_T = np.zeros_like(small), np.zeros((4, 4))

@@ -7,7 +7,7 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.cuda.view_table import ViewTable
-from geogs.losses.cuda.window import WindowLosses
+from geogs.losses.cuda.window_losses import WindowLosses
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
 from geogs.splat.render import NEAR
 from geogs.world.disks import DiskParameters, GaussianMap

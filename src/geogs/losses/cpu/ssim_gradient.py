@@ -18,7 +18,7 @@ def _blurred(image: np.ndarray) -> np.ndarray:
     return cv2.sepFilter2D(image, -1, _LINE, _LINE, borderType=cv2.BORDER_CONSTANT)
 
 
-def structure_gradient(
+def ssim_gradient(
     reference: Float32[np.ndarray, "h w"],
     warped: Float32[np.ndarray, "h w"],
     mask: Float32[np.ndarray, "h w"],

@@ -16,8 +16,8 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.kernel_settings import photo_settings, single_view_settings
 from geogs.losses.multi_view import compared_planes
-from geogs.losses.settings import photo_settings, single_view_settings
 from geogs.losses.single_view import MIN_ALPHA
 
 _SOURCE = Path(__file__).with_name("losses.cu")
@@ -128,16 +128,9 @@ class WindowLosses:
         )  # fmt: skip
         if c.smoothness_weight > 0:
             kernels["inverse_median"](
-                views,
-                1024,
-                batch,
-                self.table.pointers,
-                depth,
-                alpha,
-                self._inverse_median,
-                height * width,
-                MIN_ALPHA,
-            )
+                views, 1024, batch, t.pointers, depth, alpha, self._inverse_median,
+                height * width, MIN_ALPHA,
+            )  # fmt: skip
         kernels["single_view"](
             (_blocks(width, 32), _blocks(height, 16), views), 256, batch, t.pointers,
             self._view_settings, depth, normal, alpha, distortion, self._inverse_median,
