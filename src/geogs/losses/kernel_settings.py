@@ -39,14 +39,14 @@ class SingleViewSettings(NamedTuple):
 
 
 class PhotoSettings(NamedTuple):
-    """Weights are divided by the number of pixels and scaled by the share of a pair."""
+    """Weights are divided by the number of pixels and scaled by a pair's weight."""
 
     fx: float
     fy: float
     cx: float
     cy: float
     min_depth_ratio: float
-    """Least share of its depth at which a point may lie in front of the other camera."""
+    """Least fraction of its depth at which a point may lie in front of the other camera."""
     occlusion: float
     """Relative depth difference from which a pixel is hidden."""
     l1: float
@@ -81,23 +81,23 @@ def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> Sin
     )  # fmt: skip
 
 
-def photo_settings(config: LossConfig, camera: Camera, share: float = 1.0) -> PhotoSettings:
-    """Settings for pairs of a camera's photometric images; ``share`` of each one's loss counts."""
+def photo_settings(config: LossConfig, camera: Camera, weight: float = 1.0) -> PhotoSettings:
+    """Settings for pairs of a camera's photometric images, each of which counts ``weight``."""
     c, pixels = config, camera.width * camera.height
     return PhotoSettings(
         camera.fx, camera.fy, camera.cx, camera.cy,
         min_depth_ratio=MIN_DEPTH_RATIO,
         occlusion=occlusion_tolerance(c, camera),
-        l1=share * c.l1_weight / pixels,
+        l1=weight * c.l1_weight / pixels,
         huber=max(c.l1_huber, 1e-12),
         cut=c.l1_cut,
-        ncc=share * c.ncc_weight / pixels,
+        ncc=weight * c.ncc_weight / pixels,
         reject=c.ncc_reject,
         min_variance=NCC_MIN_VARIANCE,
         texture=c.ncc_texture,
         min_coverage=MIN_COVERAGE,
         variance_floor=NCC_VARIANCE_FLOOR,
-        ssim=share * c.ssim_weight / pixels,
+        ssim=weight * c.ssim_weight / pixels,
     )  # fmt: skip
 
 

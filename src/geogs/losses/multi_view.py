@@ -17,7 +17,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.photometric import MIN_COVERAGE, NCC_MIN_VARIANCE, ncc, robust_l1, ssim
 
-# A point must keep this share of its depth in the target's frame; nearer ones project wildly.
+# A point must keep this fraction of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
 # Degrees between the rays of two views at which the occlusion test is told in pixels.
 _PARALLAX = 10.0
@@ -217,9 +217,9 @@ def occlusion_mask(
     known = (target_depth > 0) & torch.isfinite(target_depth)
     clean = torch.where(known, target_depth, torch.zeros_like(target_depth)).detach().to(x.dtype)
     maps = torch.stack([clean, known.to(x.dtype)], -1)
-    seen, share = bilinear(maps, torch.stack([x, y], -1)).unbind(-1)
+    seen, coverage = bilinear(maps, torch.stack([x, y], -1)).unbind(-1)
     z = warped.depth.detach()
-    return warped.in_view & (share > 0.999) & ((z - seen).abs() < tolerance * z)
+    return warped.in_view & (coverage > 0.999) & ((z - seen).abs() < tolerance * z)
 
 
 def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:

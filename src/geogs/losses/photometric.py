@@ -109,11 +109,11 @@ def ssim(
                         line[None, None, None], padding=(0, 5))  # fmt: skip
 
     coverage = blur(m)
-    share = coverage.clamp(min=1e-6)
-    mean_a, mean_b = blur(a) / share, blur(b) / share
-    variance_a = blur(a * a) / share - mean_a.square()
-    variance_b = blur(b * b) / share - mean_b.square()
-    covariance = blur(a * b) / share - mean_a * mean_b
+    covered = coverage.clamp(min=1e-6)
+    mean_a, mean_b = blur(a) / covered, blur(b) / covered
+    variance_a = blur(a * a) / covered - mean_a.square()
+    variance_b = blur(b * b) / covered - mean_b.square()
+    covariance = blur(a * b) / covered - mean_a * mean_b
     c1, c2 = 0.01**2, 0.03**2
     luminance = (2 * mean_a * mean_b + c1) / (mean_a.square() + mean_b.square() + c1)
     structure = (2 * covariance + c2) / (variance_a + variance_b + c2)

@@ -206,4 +206,4 @@ def check_loops(table: LoopTable) -> None:
     if len(counts) != len(vocabulary.keyframes) or any(
         ((c[:, 0] < 0) | (c[:, 0] >= words)).any() for c in counts
     ):
-        raise InputError("the index of looks is incomplete")
+        raise InputError("the index of appearance is incomplete")

@@ -81,14 +81,14 @@ def fused_single_view(
 
 @functools.lru_cache(maxsize=64)
 def _enlargement(source: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each of ``size`` pixels its two source pixels (2, size) and the share of the second."""
+    """For each of ``size`` pixels its two source pixels (2, size) and the weight of the second."""
     at = ((np.arange(size) + 0.5) * (source / size) - 0.5).clip(0, source - 1)
     left = np.minimum(at.astype(np.int64), source - 1)
-    share = (at - left).astype(np.float32)
-    # A pixel without share is not looked at, so that its missing depth does not matter.
-    right = np.where(share > 1e-3, left + 1, left)
-    left = np.where(share < 1 - 1e-3, left, right)
-    return np.stack([left, right]), share
+    weight = (at - left).astype(np.float32)
+    # A pixel without weight is not looked at, so that its missing depth does not matter.
+    right = np.where(weight > 1e-3, left + 1, left)
+    left = np.where(weight < 1 - 1e-3, left, right)
+    return np.stack([left, right]), weight
 
 
 class _MultiView(torch.autograd.Function):

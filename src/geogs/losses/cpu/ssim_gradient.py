@@ -32,11 +32,11 @@ def ssim_gradient(
     m = (mask > 0).astype(np.float64)
     a, b = reference * m, warped * m
     coverage = _blurred(m)
-    share = np.maximum(coverage, 1e-6)
-    mean_a, mean_b = _blurred(a) / share, _blurred(b) / share
-    variance_a = _blurred(a * a) / share - mean_a**2
-    variance_b = _blurred(b * b) / share - mean_b**2
-    covariance = _blurred(a * b) / share - mean_a * mean_b
+    covered = np.maximum(coverage, 1e-6)
+    mean_a, mean_b = _blurred(a) / covered, _blurred(b) / covered
+    variance_a = _blurred(a * a) / covered - mean_a**2
+    variance_b = _blurred(b * b) / covered - mean_b**2
+    covariance = _blurred(a * b) / covered - mean_a * mean_b
     above, below = 2 * mean_a * mean_b + _C1, mean_a**2 + mean_b**2 + _C1
     upper, lower = 2 * covariance + _C2, variance_a + variance_b + _C2
     luminance, structure = above / below, upper / lower
@@ -45,7 +45,7 @@ def ssim_gradient(
     loss = weight * float((used * (1 - luminance * structure)).sum())
 
     # The slopes in the three sums over the window that the warped image is part of.
-    out = -weight * used / share
+    out = -weight * used / covered
     d_luminance = 2 * (mean_a - luminance * mean_b) / below
     d_variance, d_covariance = -structure / lower, 2 / lower
     in_mean = out * (

@@ -39,10 +39,10 @@ class _Flags(IntFlag):
 class WindowLosses:
     """L_geo of up to ``views`` views with up to ``partners`` partners each.
 
-    The loss of a view is its single-view loss plus ``pair_share`` times the multi-view loss of each
-    of its pairs (so one over the number of partners that a view should have). ``unit`` is a length
-    in map units that makes the distortion term unitless. ``with_pose`` also gives the gradient in
-    the pairs' relative motions.
+    The loss of a view is its single-view loss plus ``pair_weight`` times the multi-view loss of
+    each of its pairs (so one over the number of partners that a view should have). ``unit`` is a
+    length in map units that makes the distortion term unitless. ``with_pose`` also gives the
+    gradient in the pairs' relative motions.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ class WindowLosses:
         unit: float,
         views: int,
         partners: int,
-        pair_share: float,
+        pair_weight: float,
         with_pose: bool = False,
     ) -> None:
-        if not 0 < pair_share <= 1:
-            raise ValueError(f"a pair's share of the loss is in (0, 1], not {pair_share}")
+        if not 0 < pair_weight <= 1:
+            raise ValueError(f"the weight of a pair is in (0, 1], not {pair_weight}")
         self.table = table
         self.config = config
         self.views = views
@@ -66,9 +66,9 @@ class WindowLosses:
         weights = (config.l1_weight, config.ssim_weight, config.ncc_weight)
         self._photo = partners > 0 and max(weights) > 0
         self._view_settings = self._uploaded(single_view_settings(config, table.render, unit))
-        self._photo_settings = self._uploaded(photo_settings(config, table.photo, pair_share))
+        self._photo_settings = self._uploaded(photo_settings(config, table.photo, pair_weight))
         self._compared = [
-            (k, c, self._uploaded(photo_settings(c, table.photo, pair_share)))
+            (k, c, self._uploaded(photo_settings(c, table.photo, pair_weight)))
             for k, c in compared_planes(config)
         ]
         """Planes of the photometric images with their weights."""

@@ -28,7 +28,7 @@ class WindowPass:
         unit: float,
         views: int,
         partners: int,
-        pair_share: float,
+        pair_weight: float,
         capacity: int,
         for_poses: bool = False,
         fresh: bool = False,
@@ -38,7 +38,7 @@ class WindowPass:
         self.table, self.views, self.partners, self.capacity = table, views, partners, capacity
         self._generation = table.generation
         self.rasterizer = Rasterizer(capacity, views, camera, NEAR, device)
-        self.losses = WindowLosses(table, config, unit, views, partners, pair_share, for_poses)
+        self.losses = WindowLosses(table, config, unit, views, partners, pair_weight, for_poses)
         self.maps = Maps.empty(camera, (views,), capacity, device)
         m = self.maps
         self._gradients = MapGradients(
