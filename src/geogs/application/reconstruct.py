@@ -35,8 +35,16 @@ from geogs.threads import on_one_torch_thread
 
 FIRST_BATCH = 24
 """Images read before it is known for how many the time lasts: some show what one costs."""
-LEAST_BUDGET = 1.0
+_LEAST_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
+
+
+def left_of(budget: float | None, begin: float) -> float | None:
+    """Seconds left of a budget that counts from ``begin``, by the performance counter; none where
+    there is no limit."""
+    if budget is None:
+        return None
+    return max(budget - (time.perf_counter() - begin), _LEAST_BUDGET)
 
 
 @on_one_torch_thread
@@ -65,7 +73,7 @@ def reconstruct(
         InputError: the images or their poses cannot be used.
         DeviceError: the device cannot be used, or its memory is full.
     """
-    clock = _Clock(budget)
+    begin = time.perf_counter()
     config, progress = config or ReconstructConfig(), progress or RunProgress()
     used = require_device(device)
     if not isinstance(source, PosedSource):
@@ -74,10 +82,10 @@ def reconstruct(
                 source = open_photographs(Path(source), config, Path(kept), progress=progress)
         else:
             source = open_posed_source(source, config.input)
-    clock.excuse(compiled_kernels(used))
+    begin += compiled_kernels(used)  # once per machine: in no budget
     checks = progress if check and poses == "given" else None
     with full_memory_in_a_sentence():
-        scene = Reconstruction(source.camera, config, str(used), clock.left())
+        scene = Reconstruction(source.camera, config, str(used), left_of(budget, begin))
         _complete(scene, source, None, progress.stage, budget is not None, checks)
     return Result(scene, source, progress=progress)
 
@@ -97,7 +105,7 @@ def reconstruct_to_folder(
         OutputError: a file cannot be written.
         DeviceError: the device cannot be used, or its memory is full.
     """
-    clock = _Clock(settings.budget)
+    begin = time.perf_counter()
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
     for sentence in idle_settings(config):
@@ -117,8 +125,9 @@ def reconstruct_to_folder(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
                     stop,
                 )  # fmt: skip
-        clock.excuse(compiled_kernels(device))
-        scene = Reconstruction(source.camera, config, str(device), clock.left())
+        begin += compiled_kernels(device)  # once per machine: in no budget
+        left = left_of(settings.budget, begin)
+        scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)
         return driver.complete(MappedImages(scene, source, settings))
 
@@ -253,19 +262,3 @@ def _chosen_views(scene: Reconstruction, asked: ReconstructConfig) -> str:
             f"{asked.mesh.triangle_budget} makes one afterwards."
         )
     return " ".join(said)
-
-
-class _Clock:
-    """What is left of a time that begins now."""
-
-    def __init__(self, budget: float | None) -> None:
-        self._end = None if budget is None else time.perf_counter() + budget
-
-    def excuse(self, seconds: float) -> None:
-        """Seconds that do not count: compiling, once per machine, is in no budget."""
-        if self._end is not None:
-            self._end += seconds
-
-    def left(self) -> float | None:
-        """Seconds; none where there is no limit."""
-        return self._end and max(self._end - time.perf_counter(), LEAST_BUDGET)

@@ -31,11 +31,10 @@ def main(argv: Sequence[str]) -> int:
     settings = record(ReconstructSettings, options)
 
     from geogs.application.interrupt import Interruption
-    from geogs.application.reconstruct import LEAST_BUDGET, reconstruct_to_folder
+    from geogs.application.reconstruct import left_of, reconstruct_to_folder
 
-    if settings.budget is not None:  # which counts from the start of the command
-        left = settings.budget - (time.perf_counter() - begin)
-        settings = replace(settings, budget=max(left, LEAST_BUDGET))
+    # The budget counts from the start of the command.
+    settings = replace(settings, budget=left_of(settings.budget, begin))
     written = followed(
         options, lambda progress: reconstruct_to_folder(settings, progress, Interruption())
     )

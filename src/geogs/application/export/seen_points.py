@@ -18,9 +18,7 @@ AGREEMENT = 0.01
 _LEAST_COSINE = 0.1
 
 
-def seen_points(
-    keyframes: Sequence[RenderedKeyframe], camera: Camera, count: int, seed: int = 0
-) -> SeenPoints:
+def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: int) -> SeenPoints:
     """About ``count`` points from the keyframes' depths that two keyframes or more see.
 
     A keyframe sees a point that projects onto its depth map within 1 % of the depth there and faces
@@ -29,7 +27,7 @@ def seen_points(
     Raises:
         InputError: a keyframe has no image, or no two of them see the same surface.
     """
-    places, normals, colours = _sampled(keyframes, count, np.random.default_rng(seed))
+    places, normals, colours = _sampled(keyframes, count, np.random.default_rng(0))
     observed = [_observed(places, normals, keyframe) for keyframe in keyframes]
     point = np.concatenate([index for index, _ in observed])
     image = np.repeat(np.arange(len(observed)), [len(index) for index, _ in observed])

@@ -33,7 +33,7 @@ class CameraHeight:
     metres: float
 
 
-def scale_by_height(scene: MeasurableScene, known: CameraHeight, seed: int = 0) -> MetricScale:
+def scale_by_height(scene: MeasurableScene, known: CameraHeight) -> MetricScale:
     """The median height of the keyframes over the ground, which is found by RANSAC.
 
     The deviation is the spread of the heights over the path: nobody carries a camera level.
@@ -45,7 +45,7 @@ def scale_by_height(scene: MeasurableScene, known: CameraHeight, seed: int = 0) 
     poses = np.array([k.T_cw for k in scene.keyframes])
     if not len(poses):
         raise InputError("--scale-from: there is no keyframe, and so no ground.")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     clouds = []
     for T_cw in poses[::step]:
         points, _ = scene.points(T_cw)
