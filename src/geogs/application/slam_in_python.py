@@ -3,10 +3,8 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool
-from torch import Tensor
 
 from geogs.application.calibrate import self_calibrated, with_shutter_found
 from geogs.application.results.keyframe_files import write_keyframes
@@ -88,16 +86,9 @@ def go_on_in(slam: Slam, saved: SavedResult) -> None:
     ids = add_saved_keyframes(segment, saved.keyframes)
     segment.status.frames_lost = slam.config.tracking.patience  # nothing is to be waited for
     slam.loops.remember(ids)
-    size, given = (slam.camera.width, slam.camera.height), zip(ids, saved.keyframes, strict=True)
-    masks = {i: _enlarged(k.mask, size) for i, k in given if k.mask is not None}
+    masks = {i: m for n, i in enumerate(ids) if (m := saved.image_mask(n)) is not None}
     with slam.stopwatch("mapping"):
         slam.executor.mapping.take_over(saved.disks, masks, ids)
-
-
-def _enlarged(mask: Tensor, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """A mask at the size of the images, width and height."""
-    small = mask.cpu().numpy().astype(np.uint8)
-    return cv2.resize(small, size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def load_slam(

@@ -3,15 +3,12 @@
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
 
 from geogs.application.export.seen_points import seen_points
 from geogs.application.results.saved_result import SavedResult
 from geogs.errors import InputError
-from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.colmap_writer import write_colmap_model
 from geogs.io.writers.exports.exported import ExportedImage
@@ -37,9 +34,9 @@ def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bo
     """
     images = _write_images(folder, result)
     for number, image in enumerate(images):
-        mask = result.mask(number)
+        mask = result.image_mask(number)
         if mask is not None:
-            write_mask(folder / "masks" / f"{image.name}.png", _full_size(mask, result.camera))
+            write_mask(folder / "masks" / f"{image.name}.png", mask)
     seen = seen_points(result.keyframes, result.camera, points)
     write_colmap_model(folder / "sparse" / "0", result.camera, images, seen, as_text)
 
@@ -55,11 +52,11 @@ def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None
     unit, masked = _nerfstudio_unit(result), []
     for number, image in enumerate(images):
         name = Path(image.name).with_suffix(".png").name
-        mask = result.mask(number)
+        mask = result.image_mask(number)
         masked.append(mask is not None)
         if mask is not None:
-            write_mask(folder / "masks" / name, _full_size(mask, result.camera))
-        depth, normal = _maps(number, result, result.camera)
+            write_mask(folder / "masks" / name, mask)
+        depth, normal = _maps(number, result)
         write_depth_png(folder / "depth" / name, depth, unit)
         write_normal_png(folder / "normals" / name, normal)
     seen = seen_points(result.keyframes, result.camera, points)
@@ -77,7 +74,7 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
     unit = depth_unit(_farthest(result))
     for number, id in enumerate(result.views.keyframe_id.tolist()):
         path = folder / f"{id:06d}.png"
-        depth, normal = _maps(number, result, result.camera)
+        depth, normal = _maps(number, result)
         if kind == "depth":
             write_depth_png(path, depth, unit)
             write_npz(path.with_suffix(".npz"), "depth", depth)
@@ -113,20 +110,14 @@ def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:
     return images
 
 
-def _maps(number: int, result: SavedResult, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and normals of a keyframe inside its mask, rendered for another camera."""
-    maps = result.render(torch.from_numpy(result.views.T_cw[number]), camera)
+def _maps(number: int, result: SavedResult) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and normals of a keyframe inside its mask, at the size of its image."""
+    maps = result.render(torch.from_numpy(result.views.T_cw[number]), result.camera)
     depth, normal = maps.depth.cpu().numpy(), maps.normal.cpu().numpy()
-    mask = result.mask(number)
+    mask = result.image_mask(number)
     if mask is not None:
-        inside = _full_size(mask, camera)
-        depth, normal = np.where(inside, depth, 0), np.where(inside[..., None], normal, 0)
+        depth, normal = np.where(mask, depth, 0), np.where(mask[..., None], normal, 0)
     return depth.astype(np.float32), normal.astype(np.float32)
-
-
-def _full_size(mask: Bool[np.ndarray, "h w"], camera: Camera) -> Bool[np.ndarray, "h2 w2"]:
-    size = (camera.width, camera.height)
-    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def _farthest(result: SavedResult) -> float:

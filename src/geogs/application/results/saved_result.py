@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -137,7 +138,7 @@ class SavedResult:
         return image
 
     def mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
-        """The mask of a keyframe, by its place among them; none if it has none.
+        """The mask of a keyframe's depth, by its place among them; none if it has none.
 
         Raises InputError if its file is missing, damaged or of another size.
         """
@@ -147,6 +148,13 @@ class SavedResult:
         mask = read_mask(path)
         _check_size(path, mask, self.depth_camera)
         return mask
+
+    def image_mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
+        """The mask of a keyframe at the size of its image; none if it has none."""
+        mask, size = self.mask(number), (self.camera.width, self.camera.height)
+        if mask is None:
+            return None
+        return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
     @on_one_torch_thread
     def _keyframe(self, number: int) -> RenderedKeyframe:
