@@ -184,10 +184,10 @@ def _model_beside_truth(
     def coloured(mesh: Mesh) -> Sequence[Colouring]:
         if surface is None:
             return ()
-        places = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+        vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
         limit = surface.scores.colour_limit_cm
         errors = 100 * surface.distance
-        colours = error_colours(places, surface.points, errors, limit, surface.reach)
+        colours = error_colours(vertices, surface.points, errors, limit, surface.reach)
         ends = ("0", f"{limit:g} cm and more")
         legend = Legend("Distance to the truth", ends, ERROR_STOPS, "grey: not compared")
         return [Colouring("Error", colours, legend)]

@@ -1,6 +1,5 @@
 """A video without tracking: sharp frames, structure from motion, every frame against the map."""
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 
 import torch
@@ -15,7 +14,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
 from geogs.reconstruction import Reconstruction
-from geogs.stopwatch import Stopwatch
+from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import Uncertainty
 
@@ -106,7 +105,7 @@ def _place_all(
     scene: OfflineScene,
     placed: PlacedVideo,
     config: ReconstructConfig,
-    report: Callable[[str, float], None],
+    report: StageProgress,
 ) -> list[Float64[Tensor, "4 4"] | None]:
     """Poses of the frames that find a place; those of structure from motion go to ``scene``."""
     localise = localiser(placed, source.camera, config.seed)

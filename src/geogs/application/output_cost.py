@@ -93,8 +93,8 @@ class OutputForecast:
     def first(self, times_the_surface: Callable[[Sequence[int]], float]) -> OutputCost:
         """Once some depths have been searched: rehearsed with these.
 
-        ``times_the_surface`` gives how much more surface all views show than some, given as places
-        in the set. Where little time is left, the scene's mesh gets a smaller budget of triangles.
+        ``times_the_surface`` gives how much more surface all views show than some, given by their
+        indices. Where little time is left, the scene's mesh gets a smaller budget of triangles.
         """
         scene = self._scene
         views = _neighbouring(scene)

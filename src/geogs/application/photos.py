@@ -17,7 +17,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.stopwatch import Stopwatch
+from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.types import Frame
 
 GROUP = "geogs.photos"
@@ -63,7 +63,7 @@ class PlacedVideo:
 def place_video(
     video: Source,
     seed: int,
-    report: Callable[[str, float], None],
+    report: StageProgress,
     stopwatch: Stopwatch,
 ) -> PlacedVideo:
     """Choose the sharp frames of a video and find where they were taken.

@@ -59,10 +59,10 @@ class PosedViews:
             image = source[index]
             return image.image, image.mask
 
-        places = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+        poses = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
         with self._scene.stopwatch("first look"):
             return first_points(
-                places, image_at, source.camera,
+                poses, image_at, source.camera,
                 lambda fraction: self._report("first look", fraction),
             )  # fmt: skip
 
@@ -85,21 +85,21 @@ class PosedViews:
             InputError: an image cannot be read.
         """
         with self._scene.stopwatch("choosing views"):
-            places = list(islice(self._order, count))
-        self.give_these(places)
+            indices = list(islice(self._order, count))
+        self.give_these(indices)
 
-    def give_these(self, places: Sequence[int]) -> None:
-        """The images at some places of the source, in this order."""
+    def give_these(self, indices: Sequence[int]) -> None:
+        """The images of the source with these indices, in this order."""
         source, scene = self._source, self._scene
-        for done, image in enumerate(read_side_by_side(source.__getitem__, places)):
+        for done, image in enumerate(read_side_by_side(source.__getitem__, indices)):
             scene.add(image.image, image.T_cw, image.mask, image.timestamp, image.index)
-            self._report("reading", (done + 1) / len(places))
+            self._report("reading", (done + 1) / len(indices))
 
-    def times_the_surface(self, places: Sequence[int]) -> float:
-        """How much more of the scene all images see than those at some places of the source."""
+    def times_the_surface(self, indices: Sequence[int]) -> float:
+        """How much more of the scene all images see than those with some indices."""
         if self._seen is None:
             return 1.0
-        some = np.isin(self._seen.view, places)
+        some = np.isin(self._seen.view, indices)
         part = len(np.unique(self._seen.point[some])) / len(np.unique(self._seen.point))
         return 1.0 / max(part, 1e-3)
 
@@ -109,5 +109,5 @@ def usual_depths(
 ) -> Float64[np.ndarray, "v"]:
     """Median depth of the points that each image sees."""
     some = points[:: 1 + len(points) // _MAX_DEPTH_POINTS]
-    places = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
-    return np.array([depth_search(p, some, source.camera, 1.0).typical for p in places])
+    poses = [ViewPose(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+    return np.array([depth_search(pose, some, source.camera, 1.0).typical for pose in poses])

@@ -134,8 +134,8 @@ def save_slam(slam: Slam, folder: str | Path) -> Path:
     write_intrinsics(output / "intrinsics.json", slam.camera)
     write_config(output / "config.yaml", slam.config)
     views = write_keyframes(output, slam, slam.camera, renders, with_images=True)
-    facts = {"source": "a Python program", "seed": slam.config.seed}
-    save_map_with_views(output / "map.safetensors", slam.snapshot(), views, facts)
+    metadata = {"source": "a Python program", "seed": slam.config.seed}
+    save_map_with_views(output / "map.safetensors", slam.snapshot(), views, metadata)
     return output
 
 

@@ -27,12 +27,12 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
     Raises:
         InputError: a keyframe has no image, or no two of them see the same surface.
     """
-    places, normals, colours = _sampled(keyframes, count, np.random.default_rng(0))
-    observed = [_observed(places, normals, keyframe) for keyframe in keyframes]
+    positions, normals, colours = _sampled(keyframes, count, np.random.default_rng(0))
+    observed = [_observed(positions, normals, keyframe) for keyframe in keyframes]
     point = np.concatenate([index for index, _ in observed])
     image = np.repeat(np.arange(len(observed)), [len(index) for index, _ in observed])
     at = np.concatenate([pixels for _, pixels in observed])
-    kept = np.bincount(point, minlength=len(places)) >= 2
+    kept = np.bincount(point, minlength=len(positions)) >= 2
     if not kept.any():
         raise InputError("No two keyframes see the same surface; there are no points to export.")
     number = np.cumsum(kept) - 1
@@ -42,7 +42,7 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
     own = keyframes[0].camera
     scale = size / np.array([own.width, own.height])
     return SeenPoints(
-        places[kept], normals[kept].astype(np.float32), colours[kept], number[point[stays]],
+        positions[kept], normals[kept].astype(np.float32), colours[kept], number[point[stays]],
         image[stays].astype(np.int64), (at[stays] + 0.5) * scale - 0.5,
     )  # fmt: skip
 
@@ -58,14 +58,14 @@ def cloud(
         InputError: there is no depth, or a keyframe has no image.
     """
     parts = [_lifted(keyframe, _confident(keyframe)) for keyframe in keyframes]
-    places, normals, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
-    if not len(places):
+    positions, normals, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
+    if not len(positions):
         raise InputError("The map shows no surface; there are no points to export.")
     depths = [k.depth[k.depth > 0].median() for k in keyframes if bool((k.depth > 0).any())]
     edge = spacing * float(torch.stack(depths).median()) / keyframes[0].camera.fx
-    _, first = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(np.floor(positions / edge).astype(np.int64), axis=0, return_index=True)
     first.sort()
-    return places[first], normals[first].astype(np.float32), colours[first]
+    return positions[first], normals[first].astype(np.float32), colours[first]
 
 
 def _sampled(
@@ -80,8 +80,8 @@ def _sampled(
         parts.append(_lifted(keyframe, chosen))
     if not parts:
         raise InputError("The result has no keyframes.")
-    places, normals, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return places, normals, colours
+    positions, normals, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return positions, normals, colours
 
 
 def _confident(keyframe: RenderedKeyframe) -> Int64[np.ndarray, "n"]:
@@ -100,20 +100,20 @@ def _lifted(
     v, u = np.divmod(pixels, camera.width)
     z = keyframe.depth.cpu().numpy()[v, u].astype(np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], 1)
-    places = (rays * z[:, None] - T_cw[:3, 3]) @ T_cw[:3, :3]
+    positions = (rays * z[:, None] - T_cw[:3, 3]) @ T_cw[:3, :3]
     normals = keyframe.normal.cpu().numpy()[v, u] @ T_cw[:3, :3]
     height, width = keyframe.image.shape[:2]
     row = np.round((v + 0.5) * height / camera.height - 0.5).astype(int).clip(0, height - 1)
     column = np.round((u + 0.5) * width / camera.width - 0.5).astype(int).clip(0, width - 1)
-    return places, normals, keyframe.image[row, column]
+    return positions, normals, keyframe.image[row, column]
 
 
 def _observed(
-    places: Float64[np.ndarray, "n 3"], normals: np.ndarray, keyframe: RenderedKeyframe
+    positions: Float64[np.ndarray, "n 3"], normals: np.ndarray, keyframe: RenderedKeyframe
 ) -> tuple[Int64[np.ndarray, "k"], Float64[np.ndarray, "k 2"]]:
     """Points that a keyframe sees, and where in its depth map."""
     camera, T_cw = keyframe.camera, keyframe.T_cw
-    points = transform(T_cw, torch.from_numpy(places))
+    points = transform(T_cw, torch.from_numpy(positions))
     pixels, z = camera.project(points)
     u, v = pixels.round().long().unbind(-1)
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)

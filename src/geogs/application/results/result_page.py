@@ -131,7 +131,7 @@ def shown_model(
         mesh: the surface, if there is one.
         disks: of the map, if they are shown.
         more_colourings: of the surface as it is shown, besides the colours of the images.
-        true_path: places of the true camera, in the frame of the map.
+        true_path: positions of the true camera, in the frame of the map.
     """
     notes = []
     surface = None

@@ -55,8 +55,10 @@ def verdict(
         known: how well these are known.
         why_not: why no map could be started, if so.
     """
-    places = keyframes.T_wc[:, :3, 3]
-    extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean())) if len(places) else 0
+    centres = keyframes.T_wc[:, :3, 3]
+    extent = 0.0
+    if len(centres):
+        extent = float(np.sqrt(np.square(centres - centres.mean(0)).sum(1).mean()))
     states = trajectory.states
     lost = states.count("lost") / len(states) if states else 1.0
     orientation_only = states.count("orientation only") / max(len(states), 1)

@@ -21,9 +21,9 @@ _SAMPLES = 1000
 _JUDGES = 3000
 """Points that say how good a plane is, at most."""
 _BELOW = 0.05
-"""Share of all points that may lie clearly under the ground."""
+"""Fraction of all points that may lie clearly under the ground."""
 _LEAST = 0.03
-"""Share of all points that the ground has, at least."""
+"""Fraction of all points that the ground has, at least."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def refined(grey: UInt8[np.ndarray, "h w"], corners: Corners) -> Corners:
 def _edge_line(
     grey: UInt8[np.ndarray, "h w"], a: Float64[np.ndarray, "2"], b: Float64[np.ndarray, "2"]
 ) -> Float64[np.ndarray, "3"] | None:
-    """The line through the steepest places across an edge from a to b, homogeneous."""
+    """The line through the steepest pixels across an edge from a to b, homogeneous."""
     length = float(np.linalg.norm(b - a))
     count = int(length)
     if count < 8:
@@ -134,8 +134,8 @@ def _edge_line(
     across = np.array([-along[1], along[0]])
     at = np.linspace(0.12, 0.88, count)[:, None] * (b - a) + a
     reach = np.arange(-3, 3.01, 0.25)
-    places = (at[:, None] + reach[:, None] * across).astype(np.float32)
-    values = cv2.remap(grey.astype(np.float32), places[..., 0], places[..., 1], cv2.INTER_LINEAR)
+    pixels = (at[:, None] + reach[:, None] * across).astype(np.float32)
+    values = cv2.remap(grey.astype(np.float32), pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR)
     slope = np.abs(np.gradient(cv2.blur(values, (3, 1)), axis=1))
     total = slope.sum(1)
     if total.min() <= 0:
