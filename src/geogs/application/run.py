@@ -27,8 +27,8 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import write_stage
 from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
-from geogs.application.scale.apply import check_scale_source, make_metric
-from geogs.application.scale.known_length import scale_source
+from geogs.application.scale.apply import make_metric
+from geogs.application.scale.known_length import SensorScale, scale_source
 from geogs.application.slam_in_python import go_on_in
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
@@ -74,7 +74,8 @@ def run(
         progress.write(f"note: {sentence}")
     base = None if settings.map is None else load_result(settings.map, device)
     opened = open_source(settings.source, config.input if base is None else seen_by(base, config))
-    check_scale_source(scale, opened)
+    if isinstance(scale, SensorScale) and not opened.uses_depth:
+        raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")

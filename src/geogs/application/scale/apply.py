@@ -15,12 +15,6 @@ from geogs.slam import Slam
 from geogs.tracking.graph.measured_odometry import OdometryAgreement
 
 
-def check_scale_source(source: KnownLength | SensorScale | None, stream: Source) -> None:
-    """Raises InputError where a scale is asked for that cannot be had of a source."""
-    if isinstance(source, SensorScale) and not stream.uses_depth:
-        raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
-
-
 def make_metric(
     slam: Slam, stream: Source, source: KnownLength | SensorScale | None, progress: RunProgress
 ) -> None:
