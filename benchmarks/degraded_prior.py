@@ -11,8 +11,8 @@ from jaxtyping import Float32, UInt8
 
 from geogs.priors.monocular_prior import DepthKind, PriorMaps
 from geogs_synth.raycast.raycaster import RenderedView
-from geogs_synth.scene.scene import Scene
 from geogs_synth.scene.solids import BOX
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures.patterns import fractal_noise
 
 

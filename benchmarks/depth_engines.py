@@ -29,7 +29,7 @@ from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_train.depth.depth_scores import KINDS, texture_kind
 

@@ -17,7 +17,7 @@ from geogs_synth.places import furniture
 from geogs_synth.places.furniture import Materials
 from geogs_synth.places.room import add_ceiling_and_floor, add_ceiling_lamp, add_picture, wall_image
 from geogs_synth.scene.builder import SceneBuilder
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures import patterns
 
 ROOM = np.array([5.0, 4.4, 2.6])

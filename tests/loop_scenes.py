@@ -12,7 +12,7 @@ from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from lit_rooms import lit_room
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=191.5, cy=143.5, width=384, height=288)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-import geogs_synth.clips.clips as clips_module
+import geogs_synth.clips.clip_batch as clips_module
 import geogs_synth.clips.sampler as sampler_module
 import geogs_synth.raycast.cuda_caster as cuda_module
 from cuda_emulator import use_emulator

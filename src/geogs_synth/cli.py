@@ -57,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from geogs_synth.camera.measured_depth import DepthSensor
+    from geogs_synth.camera.depth_sensor import DepthSensor
     from geogs_synth.sequence.replica_files import write_sequence
 
     with Progress(console=Console(stderr=True), transient=True) as progress:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geogs_synth.camera.measured_depth import DepthSensor
+from geogs_synth.camera.depth_sensor import DepthSensor
 
 SENSOR = DepthSensor()
 

@@ -17,7 +17,7 @@ from geogs_synth.cli import main
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.replica_files import write_sequence
 from lit_rooms import lit_room

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
 from geogs_synth.motion.room_motions import room_motion
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from lit_rooms import lit_room
 
 

@@ -13,7 +13,7 @@ from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.scene_mesh import scene_mesh
 from lit_rooms import lit_room

@@ -11,7 +11,7 @@ from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.places.walkers import crossing_walkers
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.shooting import Shooting
 from lit_rooms import lit_room

@@ -39,7 +39,7 @@ class RandomFlaws:
 
 
 @dataclass(frozen=True)
-class _Clips:
+class _ClipFlaws:
     """How much each of b clips is disturbed."""
 
     strength: Float[Tensor, "b"]
@@ -70,7 +70,7 @@ def draw_flaws(
     """
     nearly_none = draw.chance(clean, clips)
     strength = torch.where(nearly_none, 0.05, draw.uniform(0.3, 1.0, clips)) * disturbance
-    some = _Clips(strength, views)
+    some = _ClipFlaws(strength, views)
     brightness = draw.normal(0.35, clips, 1).exp().expand(-1, views).flatten()
     return RandomFlaws(
         exposure=brightness * some.vary(draw, 0.15, 0.12)[:, 0],
@@ -86,7 +86,7 @@ def draw_flaws(
     )
 
 
-def _blur(draw: Draw, some: _Clips) -> Float[Tensor, "n t 2"]:
+def _blur(draw: Draw, some: _ClipFlaws) -> Float[Tensor, "n t 2"]:
     """Out of focus: a disc; moved during the exposure: a line. In widths of an image."""
     radius, length = some.amount(draw, 0.3, 6e-4, 3e-3), some.amount(draw, 0.3, 1e-3, 1e-2)
     angle = draw.uniform(-3.15, 3.15, len(radius))
@@ -100,6 +100,6 @@ def _blur(draw: Draw, some: _Clips) -> Float[Tensor, "n t 2"]:
     return disc * radius[:, None, None] + line[:, None] * way[:, None]
 
 
-def _steps(draw: Draw, some: _Clips) -> Float[Tensor, "n"]:
+def _steps(draw: Draw, some: _ClipFlaws) -> Float[Tensor, "n"]:
     steps = some.amount(draw, 0.7, 2.0, 18.0)
     return torch.where(steps < 0.5, 0.0, steps)

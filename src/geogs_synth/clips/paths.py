@@ -50,7 +50,7 @@ _KINDS = (
 
 
 @dataclass(frozen=True)
-class _Steps:
+class _PathSteps:
     """How each of k candidates moves away from its first pose."""
 
     way: Float[Tensor, "b k 3"]
@@ -98,7 +98,7 @@ def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tenso
     return torch.stack([fx, fy, cx, cy], -1)
 
 
-def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _Steps:
+def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _PathSteps:
     """All candidates of a room move in the same manner, so that none is taken less often."""
     b, k = forward.shape[:2]
     kind = draw.choose(
@@ -114,7 +114,7 @@ def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 
     way = torch.nn.functional.normalize(way, dim=-1) * length[..., None]
     spin = draw.uniform(-1, 1, b, k, 3) * torch.tensor([1.0, 1.0, 0.5])
     spin = spin * (rotation * math.pi / 180)[..., None]
-    return _Steps(way, spin, hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k))
+    return _PathSteps(way, spin, hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k))
 
 
 def _keep_in_view(

@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.camera.develop import develop
 from geogs_synth.camera.random_flaws import RandomFlaws, draw_flaws
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.dynamics import Dynamics, draw_dynamics
 from geogs_synth.clips.furnishing import draw_furnishing
 from geogs_synth.clips.lights import draw_lights

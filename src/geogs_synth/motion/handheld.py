@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
 from geogs.errors import InputError
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 
 FRAMES_PER_LAP = 280
 """Frames after which the camera is back near its first view."""

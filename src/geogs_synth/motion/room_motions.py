@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, HandheldPath, look_at, with_shake
 from geogs_synth.motion.motion_kinds import RoomMotionKind
 from geogs_synth.scene.bodies import Path
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 
 _FRAMES_PER_SECOND = 30.0
 _SLOW = 4

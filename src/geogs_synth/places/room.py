@@ -8,7 +8,7 @@ import numpy as np
 from geogs_synth.places import furniture
 from geogs_synth.places.furniture import Materials
 from geogs_synth.scene.builder import SceneBuilder
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures import artwork, patterns
 
 _TEXEL = 0.003

@@ -7,7 +7,7 @@ from geogs_synth.motion.handheld import look_at
 from geogs_synth.motion.room_motions import Motion
 from geogs_synth.places.vehicles import VehicleMaterials, car, draw_materials
 from geogs_synth.scene.builder import SceneBuilder
-from geogs_synth.scene.scene import Scene, Texture
+from geogs_synth.scene.textured_scene import Scene, Texture
 from geogs_synth.textures import artwork, facades, patterns
 
 LENGTH = 260.0

@@ -16,7 +16,7 @@ from geogs_synth.places.vehicles import (
 )
 from geogs_synth.scene.bodies import Body, Path, upright_poses
 from geogs_synth.scene.builder import SceneBuilder
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 
 _ONCOMING, _ONCOMING_SPEED = 3, 9.0
 _GAP_WAVE, _GAP_PERIOD = 0.08, 7.0

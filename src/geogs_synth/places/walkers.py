@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from geogs.geometry.camera import Camera
 from geogs_synth.scene.bodies import Body, Path, upright_poses
 from geogs_synth.scene.builder import SceneBuilder
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures import patterns
 
 _HEIGHT = 1.72

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 
 from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.raycast.pixel_kernels import PlacedSolids
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 
 _NEAR = 1e-3
 

@@ -17,7 +17,7 @@ from geogs_synth.raycast.placement import PlacedScene
 from geogs_synth.raycast.visibility_kernels import visibility_slices
 from geogs_synth.scene.bodies import Body
 from geogs_synth.scene.builder import SceneBuilder
-from geogs_synth.scene.scene import Scene, Texture, joined
+from geogs_synth.scene.textured_scene import Scene, Texture, joined
 
 _LEVELS = 8
 _VOXEL = 0.14

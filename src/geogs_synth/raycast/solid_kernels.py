@@ -1,4 +1,4 @@
-"""Rays against single solids and rays against many, compiled; solids are those of scene.py.
+"""Rays against single solids and rays against many, compiled; solids are those of solids.py.
 
 Rays are o + t d. A unit d makes t a distance, a d of unit z in the camera's frame makes it a depth.
 """

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 
 Path = Callable[[Float64[np.ndarray, "m"]], Float64[np.ndarray, "m 4 4"]]
 """Body to world at times in seconds."""

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from geogs_synth.scene.scene import Light, Scene, Texture
 from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, Solids
+from geogs_synth.scene.textured_scene import Light, Scene, Texture
 
 Number = float | int
 Triple = Sequence[Number] | Float64[np.ndarray, "3"]

@@ -12,7 +12,7 @@ from geogs_synth.places.street import drive, make_street
 from geogs_synth.places.traffic import street_traffic
 from geogs_synth.places.walkers import crossing_walkers
 from geogs_synth.scene.bodies import Body
-from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.textured_scene import Scene
 
 ROOM_FOCAL = 0.7
 """Focal length over width of the camera in rooms: 71 degrees across."""

@@ -13,8 +13,8 @@ from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.ply_writer import write_mesh, write_points
+from geogs_synth.camera.depth_sensor import DepthSensor
 from geogs_synth.camera.flaws import Flaws
-from geogs_synth.camera.measured_depth import DepthSensor
 from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.motion_kinds import MotionKind
 from geogs_synth.raycast.raycaster import Raycaster

@@ -7,8 +7,8 @@ from jaxtyping import Float32, Float64, Int32
 
 from geogs.geometry.camera import Camera
 from geogs_synth.camera.radial_camera import RadialCamera
-from geogs_synth.scene.scene import Scene
 from geogs_synth.scene.solids import BOX, FRUSTUM
+from geogs_synth.scene.textured_scene import Scene
 
 _TOLERANCE = 4e-4
 """Largest distance in metres between a chord and the arc it replaces."""

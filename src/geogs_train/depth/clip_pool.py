@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float16, UInt8
 from torch import Tensor
 
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.ahead import PlansAhead
 from geogs_train.course import Worker

@@ -12,7 +12,7 @@ from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlowOptions
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import only_scene
 from geogs_train.course import Worker
 from geogs_train.flow.bundle import (

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.tracking.flow.own_network import FlowNetwork, load_flow_network
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import SCENE_KINDS
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.ahead import PlansAhead

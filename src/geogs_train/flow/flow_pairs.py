@@ -11,7 +11,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own_network import cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import PAPERED
 from geogs_train.flow.starts import StartOptions, disturbed_starts
 

@@ -10,7 +10,7 @@ from geogs_synth.camera.camera_batch import pixel_grid, rays
 from geogs_synth.camera.develop import develop
 from geogs_synth.camera.jpeg import compress
 from geogs_synth.camera.random_flaws import draw_flaws
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw

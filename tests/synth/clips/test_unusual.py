@@ -7,7 +7,7 @@ import torch
 
 from geogs_synth.camera.camera_batch import pixel_grid, project, rays
 from geogs_synth.camera.motion_blur import exposed, motion_while_open
-from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import (
     SCENE_KINDS,
     STREET,
