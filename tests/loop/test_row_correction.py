@@ -1,6 +1,7 @@
 """Rows in the adjustment of all keyframes: a hall that is read row by row, with exact matches."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from torch import Tensor
 from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.loop.global_bundle import global_bundle
+from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.row_correction import _readout_gradient, _Search, correct_rows
 from geogs.tracking.frames.pose_filling import row_errors
 from geogs.tracking.frames.row_errors import RowErrors
@@ -78,7 +79,8 @@ def as_read(factor: float = 1.0, doubt: float = 0.0) -> SeenRows:
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("ROUNDS", 1), ("PAIRS", 4), ("ITERATIONS", 5)):
+    options = replace(GLOBAL_OPTIONS, iterations=5)
+    for name, value in (("ROUNDS", 1), ("PAIRS", 4), ("GLOBAL_OPTIONS", options)):
         monkeypatch.setattr(f"geogs.loop.global_bundle.{name}", value)
 
 
