@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.live.live_reader import LiveReader
-from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.reader import RawFrame, fingerprint_of
 from geogs.io.sources.working_images import WorkingImages
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.shutter import Shutter
@@ -185,7 +185,7 @@ class Source:
 
     def fingerprint(self) -> str:
         """Sixteen digits for each recording that change with the names and sizes of its files."""
-        return "-".join(images.fingerprint() for images in self._recordings)
+        return "-".join(fingerprint_of(images.reader.paths) for images in self._recordings)
 
     def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames; the next one is read while the present one is used.

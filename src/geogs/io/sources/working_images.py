@@ -6,7 +6,6 @@ common: the selection, the calibration, the shutter, the working resolution and 
 
 from collections.abc import Generator, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -26,7 +25,6 @@ from geogs.io.sources.pose_priors import chosen_poses
 from geogs.io.sources.reader import (
     RawFrame,
     Reader,
-    fingerprint_of,
     of_one_size,
     read_ahead,
 )
@@ -73,6 +71,8 @@ class WorkingImages:
         """How they are stored."""
         self.name = info.name
         """Name of the sequence."""
+        self.fps = info.fps / config.stride
+        """Frames per second after the stride, nominal."""
         self._config = config
         self.calibration = calibration or resolve_intrinsics(
             config.intrinsics, info.calibration, info.width, info.height, info.quarter_turns
@@ -86,19 +86,18 @@ class WorkingImages:
         check_large_enough(self.camera, info.name)
         masks = None if config.mask is None else expanded(config.mask)
         self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
-        self.mask = None if masks is None or self._masks is not None else self._working_mask(masks)
+        self.mask: Bool[np.ndarray, "h w"] | None = None
         """Pixels of every frame that may show the scene; none where all do."""
+        if masks is not None and self._masks is None:
+            self.mask = self._straight(read_mask(masks, (info.height, info.width)))
 
     @property
     def black_is_masked(self) -> bool:
         """Whether pixels of frames that are quite black are masked out."""
         return self._masks is not None
 
-    def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
-        """A mask for all images, straightened as they are."""
-        return self._straight(read_mask(path, (self.reader.info.height, self.reader.info.width)))
-
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
+        """A mask of an image as it came, straightened as that is."""
         grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
         return self._rectifier(grey)[..., 0] > 127
 
@@ -146,20 +145,12 @@ class WorkingImages:
         """Neighbouring images at working size as they came, from all over the selection."""
         return read_clips(self.reader, self._config, self._at_working_size)
 
-    def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
-        """Neighbours in the source at working size, lens and rows as they came."""
-        return map(self._at_working_size, self.reader.read(start, stop, 1))
-
     def _at_working_size(self, raw: RawFrame) -> RawFrame:
+        """The image at working size, lens and rows as they came."""
         raw = of_one_size(raw, self.reader.info)
         if raw.image is None:
             return raw
         return replace(raw, image=self._rectifier.resized(raw.image))
-
-    @property
-    def fps(self) -> float:
-        """Frames per second after the stride, nominal."""
-        return self.reader.info.fps / self._config.stride
 
     @property
     def length(self) -> int | None:
@@ -170,10 +161,6 @@ class WorkingImages:
             if length is None
             else len(range(length)[config.start : config.stop : config.stride])
         )
-
-    def fingerprint(self) -> str:
-        """Sixteen digits that change with the names and sizes of the files."""
-        return fingerprint_of(self.reader.paths)
 
     def read(self, first: int) -> Iterator[RawFrame]:
         """Read the selection from its ``first`` image on; unless it is live, the next one is read
@@ -230,7 +217,7 @@ class WorkingImages:
             inside = config.stop is None or start + after < config.stop
             return after >= 0 and after % config.stride == 0 and inside
 
-        images = self._resized(start - before, stop)
+        images = map(self._at_working_size, self.reader.read(start - before, stop, 1))
         offsets = RowOffsets(rolling, self.camera)
         for raw, turning in with_angular_motion(images, rolling, readout, is_selected):
             if raw.image is None:
