@@ -50,7 +50,7 @@ def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[Surface
     return (part for part in parts if len(part.faces))
 
 
-def _part(chunk: "_Chunk") -> SurfacePart:
+def _part(chunk: "_VoxelChunk") -> SurfacePart:
     vertices, axis, triangles = march(chunk.distance, chunk.cell)
     keys = _edge_keys(np.floor(vertices).astype(np.int64) + chunk.origin, axis)
     return SurfacePart(chunk.chunk, keys, vertices + chunk.origin, triangles)
@@ -70,7 +70,7 @@ def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
 
 
 @dataclass(frozen=True)
-class _Chunk:
+class _VoxelChunk:
     """A dense box of voxels."""
 
     chunk: tuple[int, int, int]
@@ -81,7 +81,7 @@ class _Chunk:
     """True at a cell's upper corner if all its eight voxels were seen."""
 
 
-def _chunks(tsdf: SparseTsdf, min_weight: float) -> Iterator[_Chunk]:
+def _chunks(tsdf: SparseTsdf, min_weight: float) -> Iterator[_VoxelChunk]:
     """Boxes that overlap by one voxel layer, but for those without a cell or without a zero."""
     blocks = tsdf.coordinates
     chunk_of = torch.div(blocks, CHUNK, rounding_mode="floor")
@@ -104,7 +104,7 @@ def _chunks(tsdf: SparseTsdf, min_weight: float) -> Iterator[_Chunk]:
         if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
             x, y, z = chunk.tolist()
             origin = first.cpu().numpy() * BLOCK
-            yield _Chunk((x, y, z), origin, distance.cpu().numpy(), cell.cpu().numpy())
+            yield _VoxelChunk((x, y, z), origin, distance.cpu().numpy(), cell.cpu().numpy())
 
 
 def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
