@@ -61,6 +61,10 @@ class FlowMatch:
     memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
     """What the operator wants to be given when it measures an edge again, of each."""
 
+    def on_cpu(self) -> "FlowMatch":
+        """Positions and weights alone, on the CPU."""
+        return FlowMatch(self.pixels.cpu(), self.weight.cpu())
+
     def sure(self) -> Bool[Tensor, "e p"]:
         """Cells that a geometry may be guessed from: matched with no less than a hundredth of the
         weight of the edge's best, where a mere guess would count like a good match."""

@@ -1,6 +1,7 @@
 """The pinhole camera with pixel centres at integer coordinates."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -17,6 +18,11 @@ class Camera:
     cy: float
     width: int
     height: int
+
+    @property
+    def long_edge(self) -> int:
+        """Pixels along the longer side of the image."""
+        return max(self.width, self.height)
 
     def matrix(self) -> Float[Tensor, "3 3"]:
         """K in float64."""
@@ -41,9 +47,17 @@ class Camera:
 
     def with_long_edge(self, long_edge: int) -> "Camera":
         """The camera of the image scaled so that its longer side has ``long_edge`` pixels."""
-        scale = long_edge / max(self.width, self.height)
+        scale = long_edge / self.long_edge
         width, height = round(self.width * scale), round(self.height * scale)
         return self.resized(max(width, 1), max(height, 1))
+
+    def with_focal(self, focal: float) -> "Camera":
+        """The camera with fx = ``focal`` and the same aspect."""
+        return replace(self, fx=focal, fy=focal * self.fy / self.fx)
+
+    def with_field_of_view(self, degrees: float) -> "Camera":
+        """The camera with the focal length that sees so much along its longer side."""
+        return self.with_focal(self.long_edge / 2 / math.tan(math.radians(degrees / 2)))
 
     def rays(
         self, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"

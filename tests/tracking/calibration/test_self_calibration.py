@@ -13,7 +13,6 @@ from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import stretch
 from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
 from geogs.tracking.calibration.self_calibration import self_calibrate
-from geogs.tracking.calibration.view_gatherer import with_focal
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
 
@@ -36,7 +35,7 @@ def swinging(count: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("factor", [0.65, pytest.param(1.5, marks=pytest.mark.long)])
 def test_finds_the_focal_length_of_a_rendered_room(factor):
-    guess = with_focal(CAMERA, factor * CAMERA.fx)
+    guess = CAMERA.with_focal(factor * CAMERA.fx)
     shares = []
     found = self_calibrate(frames(swinging(22)), guess, report=shares.append)
     assert found.failure is None
@@ -55,7 +54,7 @@ def test_finds_the_focal_length_of_a_rendered_room(factor):
 
 @pytest.mark.long
 def test_the_radial_term_of_a_pinhole_is_none():
-    found = self_calibrate(frames(swinging(22)), with_focal(CAMERA, 200.0), radial=True)
+    found = self_calibrate(frames(swinging(22)), CAMERA.with_focal(200.0), radial=True)
     assert found.failure is None
     assert found.deviation_k1 is not None
     assert abs(found.k1) < max(0.02, 2.5 * found.deviation_k1)
@@ -72,7 +71,7 @@ def test_finds_the_radial_term_of_a_distorting_lens():
         Frame(k, k / 30, cv2.remap(render(T, wide)[0], at, None, cv2.INTER_CUBIC))
         for k, T in enumerate(swinging(22))
     ]
-    found = self_calibrate(video, with_focal(CAMERA, 190.0), radial=True)
+    found = self_calibrate(video, CAMERA.with_focal(190.0), radial=True)
     assert found.failure is None
     assert found.deviation_k1 is not None
     print(found)
@@ -88,7 +87,7 @@ def pixels_of(camera: Camera) -> np.ndarray:
 
 def test_a_camera_that_only_turns_is_said_to():
     path = [pose(0.0, 0.0, 0.0, 0.03 * k) for k in range(16)]
-    guess = with_focal(CAMERA, 120.0)
+    guess = CAMERA.with_focal(120.0)
     found = self_calibrate(frames(path), guess)
     assert found.failure == "the camera only turns (no parallax)"
     assert found.camera == guess
@@ -97,14 +96,14 @@ def test_a_camera_that_only_turns_is_said_to():
 def test_a_plane_is_said_to_be_one(monkeypatch):
     plane, hidden = ((0.2, 0.1, 1.0), 2.5), ((0.0, 0.0, 1.0), 100.0)
     monkeypatch.setattr(tracking_scenes, "PLANES", [plane, hidden])
-    guess = with_focal(CAMERA, 120.0)
+    guess = CAMERA.with_focal(120.0)
     found = self_calibrate(frames(swinging(16)), guess)
     assert found.failure == "it shows a single plane"
     assert found.camera == guess
 
 
 def test_a_camera_that_stands_still_is_said_to():
-    guess = with_focal(CAMERA, 120.0)
+    guess = CAMERA.with_focal(120.0)
     found = self_calibrate(frames([pose(0.0)] * 5), guess)
     assert found.failure == "the camera hardly moves"
     assert found.camera == guess

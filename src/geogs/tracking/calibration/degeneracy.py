@@ -4,7 +4,6 @@ A camera that only rotates, or that looks at a plane, moves its image by a homog
 scene under translation does not.
 """
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -13,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.view_gatherer import on_cpu, with_focal
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -37,14 +35,15 @@ class Degeneracy(Enum):
 
 
 @dataclass(frozen=True)
-class HomographyFit:
-    """How well homographies explain the flow from one view to others."""
+class _HomographyFit:
+    """The homography that explains the flow from one view to another best."""
 
+    H: Float[np.ndarray, "3 3"]
     explained: float
-    """Fraction of the matches, in the view that fits least."""
-    parallax: float
-    """Pixels of median motion that rotation leaves, in the view where that is most, at the field
-    of view for which it is least."""
+    """Fraction of the matches."""
+    first: Float[np.ndarray, "n 2"]
+    """Pixels of the matches."""
+    second: Float[np.ndarray, "n 2"]
 
 
 def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Degeneracy | None:
@@ -52,52 +51,38 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
 
     ``min_parallax`` is in pixels; of the camera only size, aspect and principal point count.
     """
-    fit = fit_homographies(camera, flows)
-    if fit is None:
+    fits = [fit for fit in (_homography(camera, match) for match in flows) if fit is not None]
+    if not fits:
         return Degeneracy.STILL
-    if fit.parallax < min_parallax:
+    # What rotation leaves, in the view where that is most, at the angle for which it is least.
+    matrices = [camera.with_field_of_view(a).matrix().numpy() for a in _FIELDS_OF_VIEW]
+    if min(max(_unexplained(K, fit) for fit in fits) for K in matrices) < min_parallax:
         return Degeneracy.TURNING
-    return Degeneracy.PLANAR if fit.explained > PLANAR_FRACTION else None
+    planar = min(fit.explained for fit in fits) > PLANAR_FRACTION
+    return Degeneracy.PLANAR if planar else None
 
 
-def fit_homographies(camera: Camera, flows: list[FlowMatch]) -> HomographyFit | None:
-    """A homography for each view (MAGSAC); None where no view has enough matches."""
-    points = SampleGrid(camera).pixels.double().numpy()
-    tolerance = max(camera.width, camera.height) * _TOLERANCE
-    found, explained = [], []
-    for match in map(on_cpu, flows):
-        used = match.sure()[0].numpy()
-        if used.sum() < 50:
-            continue
-        p, q = points[used], match.pixels[0].double().numpy()[used]
-        H, _ = cv2.findHomography(p, q, cv2.USAC_MAGSAC, tolerance)
-        if H is None or not np.linalg.det(H) > 0:
-            continue
-        error = np.linalg.norm(_moved(H, p) - q, axis=1)
-        explained.append(float((error < tolerance).mean()))
-        found.append((H, p, q))
-    if not found:
+def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:
+    """The homography of one view (MAGSAC); None where it has too few matches."""
+    match, tolerance = match.on_cpu(), camera.long_edge * _TOLERANCE
+    used = match.sure()[0].numpy()
+    if used.sum() < 50:
         return None
-    cameras = [_camera(camera, a) for a in _FIELDS_OF_VIEW]
-    parallax = min(max(_unexplained(c, *view) for view in found) for c in cameras)
-    return HomographyFit(min(explained), parallax)
+    p = SampleGrid(camera).pixels.double().numpy()[used]
+    q = match.pixels[0].double().numpy()[used]
+    H, _ = cv2.findHomography(p, q, cv2.USAC_MAGSAC, tolerance)
+    if H is None or not np.linalg.det(H) > 0:
+        return None
+    error = np.linalg.norm(_moved(H, p) - q, axis=1)
+    return _HomographyFit(H, float((error < tolerance).mean()), p, q)
 
 
-def _camera(camera: Camera, degrees: float) -> Float[np.ndarray, "3 3"]:
-    edge = max(camera.width, camera.height)
-    return with_focal(camera, edge / 2 / math.tan(math.radians(degrees / 2))).matrix().numpy()
-
-
-def _unexplained(
-    K: Float[np.ndarray, "3 3"],
-    H: Float[np.ndarray, "3 3"],
-    p: Float[np.ndarray, "n 2"],
-    q: Float[np.ndarray, "n 2"],
-) -> float:
+def _unexplained(K: Float[np.ndarray, "3 3"], fit: _HomographyFit) -> float:
     """Median distance of matches from where the rotation nearest to a homography moves them."""
-    U, _, Vt = np.linalg.svd(np.linalg.inv(K) @ H @ K)
+    U, _, Vt = np.linalg.svd(np.linalg.inv(K) @ fit.H @ K)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return float(np.median(np.linalg.norm(_moved(K @ R @ np.linalg.inv(K), p) - q, axis=1)))
+    moved = _moved(K @ R @ np.linalg.inv(K), fit.first)
+    return float(np.median(np.linalg.norm(moved - fit.second, axis=1)))
 
 
 def _moved(H: Float[np.ndarray, "3 3"], p: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:

@@ -4,7 +4,6 @@ Flow needs no focal length, so it is measured once. Every candidate places the k
 essential matrix and PnP and is adjusted, the focal length with the rest; the least cost wins.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,7 +15,6 @@ from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.view_gatherer import on_cpu, stacked, with_focal
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.two_view import best_two_view, two_view
 from geogs.types import FlowMatch
@@ -37,20 +35,16 @@ class Start:
     """On the cells of the first keyframe."""
     information: Float[Tensor, "p"]
     cost: float
-    field_of_view: float
-    """Degrees from which it began."""
 
 
 def candidates(camera: Camera) -> list[Camera]:
     """The guess and cameras of other fields of view."""
-    edge = max(camera.width, camera.height)
-    focals = [camera.fx, *(edge / 2 / math.tan(math.radians(a / 2)) for a in FIELDS_OF_VIEW)]
-    return [with_focal(camera, f) for f in focals]
+    return [camera.with_focal(camera.fx), *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
 
 
 def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Start | None:
     """Place and adjust the keyframes from one focal length; None where it shows no parallax."""
-    flows = [on_cpu(f) for f in flows]
+    flows = [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view((two_view(camera, match) for match in flows[1::2]), min_parallax)
     if found is None:
@@ -63,23 +57,21 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
             grid, depth, match.pixels[0], view.good & match.sure()[0]
         )  # fmt: skip
         poses.append(poses[-1] if T is None else T)
-    pixels, weight = stacked(flows)
     n = len(flows) + 1
     free = torch.ones(n, dtype=torch.bool)
     free[0] = False
     rows = torch.cat([depth[None], torch.ones(n - 1, grid.size)])
     problem = BundleProblem(
         torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
-        free, torch.ones(n, dtype=torch.bool), pixels=pixels, weight=weight,
+        free, torch.ones(n, dtype=torch.bool),
+        pixels=torch.cat([f.pixels for f in flows]), weight=torch.cat([f.weight for f in flows]),
     )  # fmt: skip
     result = _adjusted(problem, LensBlock(RadialLens(camera), grid.pixels))
     if result is None:
         return None
-    edge = max(camera.width, camera.height)
     return Start(
-        result.block.lens, result.T_cw, result.inverse_depth[0], result.information[0], result.cost,
-        2 * math.degrees(math.atan(edge / 2 / camera.fx)),
-    )  # fmt: skip
+        result.block.lens, result.T_cw, result.inverse_depth[0], result.information[0], result.cost
+    )
 
 
 def _adjusted(problem: BundleProblem, block: LensBlock) -> SharedResult[LensBlock] | None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
-from geogs.tracking.calibration.view_gatherer import with_focal
 
 STANDARD_ERRORS = 3.0
 """The adjustment's own standard error times this is taken for the deviation: matches of different
@@ -56,8 +55,7 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
         shift = math.log(other.block.lens.camera.fx / result.block.lens.camera.fx)
         deviation = math.hypot(deviation, DISTORTION_FRACTION * shift)
     lens = result.block.lens
-    edge = max(lens.camera.width, lens.camera.height)
-    angle = 2 * math.degrees(math.atan(edge / 2 / lens.camera.fx))
+    angle = 2 * math.degrees(math.atan(lens.camera.long_edge / 2 / lens.camera.fx))
     if not FIELDS_OF_VIEW[0] < angle < FIELDS_OF_VIEW[1]:
         return f"it seems to have a field of view of {angle:.0f} degrees"
     if result.cost > MAX_COST:
@@ -85,7 +83,7 @@ def joined(estimates: Sequence[Estimate]) -> Estimate:
     excess = max(1.0, squares / max(len(party) - 1, 1))
     best = min(party, key=lambda e: e.deviation)
     return Estimate(
-        with_focal(best.camera, math.exp(mean)),
+        best.camera.with_focal(math.exp(mean)),
         best.k1,
         max(math.sqrt(excess / total), LEAST_DEVIATION),
         best.deviation_k1,

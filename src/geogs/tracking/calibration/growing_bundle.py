@@ -10,8 +10,9 @@ from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import SharedResult, solve_shared
+from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
-from geogs.tracking.calibration.view_gatherer import View, on_cpu
+from geogs.tracking.calibration.view_gatherer import View
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.matching.pnp import pnp
 from geogs.world.grid import SampleGrid
@@ -66,7 +67,7 @@ class GrowingBundle:
     def place(self, view: View) -> bool:
         """Append the next view by PnP on the last one's depth; False if that fails."""
         assert view.step is not None
-        grid, step = self._pinhole, on_cpu(view.step)
+        grid, step = self._pinhole, view.step.on_cpu()
         plain, depth = SampleGrid(self.lens.camera), self._depth[-1].cpu()
         good = step.sure()[0] & (self._information[-1].cpu() > 0)
         T = pnp(plain, depth, step.pixels[0], good)
@@ -79,7 +80,7 @@ class GrowingBundle:
         self._information.append(i)
         return True
 
-    def measure(self, fine: bool, tick: Callable[[], None] = lambda: None) -> None:
+    def measure(self, fine: bool, tick: Callable[[], None]) -> None:
         """Match every pair that is new, was matched less finely, or whose reprojection moved."""
         n = len(self)
         pairs = [(j - k, j) for j in range(n) for k in OFFSETS if j >= k]
@@ -156,9 +157,4 @@ class GrowingBundle:
         scale = float(known.median())
         self._depth = [d / scale for d in self._depth]
         self._information = [i * scale**2 for i in self._information]
-        moved = []
-        for T in self._T:
-            T = T.clone()
-            T[:3, 3] *= scale
-            moved.append(T)
-        self._T = moved
+        self._T = [scaled(T, scale) for T in self._T]

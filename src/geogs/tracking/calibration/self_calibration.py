@@ -13,7 +13,7 @@ from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
-from geogs.tracking.calibration.stretch import FRAMES, Report, Stretch
+from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
@@ -75,9 +75,7 @@ def self_calibrate(
             estimates.append(found)
         else:
             failure = failure or found
-        if gatherer.frames >= FRAMES or gatherer.is_over:
-            break
-        if estimates and joined(estimates).deviation < CONFIDENT:
+        if gatherer.is_over or (estimates and joined(estimates).deviation < CONFIDENT):
             break
     if not estimates:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)

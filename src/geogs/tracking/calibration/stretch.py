@@ -12,8 +12,6 @@ from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
-FRAMES = 600
-"""Frames of the video that are used, at most, in all of its stretches: bounds the time."""
 START_KEYFRAMES = 12
 """Keyframes of a stretch that are solved first, and by which it then grows."""
 KEYFRAMES = 36
@@ -44,8 +42,7 @@ class Stretch:
         self._gatherer, self._report = gatherer, report
         self._views: list[View] = []
         self._done = 0.0
-        edge = max(grid.camera.width, grid.camera.height)
-        self._min_parallax = MIN_PARALLAX * edge
+        self._min_parallax = MIN_PARALLAX * grid.camera.long_edge
 
     def _tick(self) -> None:
         """Every frame is a safe point."""
@@ -54,7 +51,7 @@ class Stretch:
     def _gather(self, count: int) -> bool:
         """Whether there are more views than before."""
         before = len(self._views)
-        self._views = self._gatherer.gather(self._views, count, FRAMES, self._tick)
+        self._views = self._gatherer.gather(self._views, count, self._tick)
         return len(self._views) > before
 
     def start(self) -> Start | Degeneracy:

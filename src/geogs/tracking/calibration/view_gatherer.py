@@ -1,15 +1,13 @@
 """Keyframes of a camera about which nothing is known, and the flow between them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import TrackingConfig
-from geogs.geometry.camera import Camera
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
@@ -18,6 +16,9 @@ from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
+
+FRAMES = 600
+"""Frames of the video that are used, at most: bounds the time."""
 
 
 @dataclass(frozen=True)
@@ -40,22 +41,24 @@ class ViewGatherer:
         self._positions = ChainedPositions()
         self.frames = 0
         """Frames taken so far."""
-        self.is_over = False
-        """Whether no frame is left."""
+        self._is_read = False
 
-    def gather(
-        self, views: list[View], count: int, limit: int, tick: Callable[[], None]
-    ) -> list[View]:
-        """``views`` grown to ``count``, or less where ``limit`` frames are seen or none is left.
+    @property
+    def is_over(self) -> bool:
+        """Whether no frame is left, or ``FRAMES`` are enough."""
+        return self._is_read or self.frames >= FRAMES
+
+    def gather(self, views: list[View], count: int, tick: Callable[[], None]) -> list[View]:
+        """``views`` grown to ``count``, or less where the video is over.
 
         The frames begin anew where the view changes at once, with what comes after.
         """
         views = list(views)
-        edge = max(self._grid.camera.width, self._grid.camera.height)
-        while len(views) < count and self.frames < limit:
+        edge = self._grid.camera.long_edge
+        while len(views) < count and not self.is_over:
             frame = next(self._frames, None)
             if frame is None:
-                self.is_over = True
+                self._is_read = True
                 break
             self.frames += 1
             tick()
@@ -76,11 +79,6 @@ class ViewGatherer:
             self._positions.reset()
             views.append(View(frame, encoded, step))
         return views
-
-
-def with_focal(camera: Camera, focal: float) -> Camera:
-    """The camera with fx = ``focal`` and the same aspect."""
-    return replace(camera, fx=focal, fy=focal * camera.fy / camera.fx)
 
 
 def flows_from_first(
@@ -107,13 +105,3 @@ def flows_from_first(
         there = filled_positions(grid, match)
         back = filled_positions(grid, reverse)
     return flows
-
-
-def on_cpu(match: FlowMatch) -> FlowMatch:
-    """Positions and weights, on the CPU."""
-    return FlowMatch(match.pixels.cpu(), match.weight.cpu())
-
-
-def stacked(matches: list[FlowMatch]) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-    """Positions and weights of several single edges."""
-    return torch.cat([m.pixels for m in matches]), torch.cat([m.weight for m in matches])

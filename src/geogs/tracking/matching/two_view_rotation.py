@@ -67,7 +67,7 @@ def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | N
     rotated = fit_rotation(grid, match)
     if rotated is None:
         return None
-    pair = FlowMatch(match.pixels.cpu(), match.weight.cpu())
+    pair = match.on_cpu()
     moved = relative_pose(grid.camera, pair)
     if moved is not None:
         T_ji = torch.from_numpy(moved[0])

@@ -65,7 +65,7 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     camera = segment.grid.camera
     min_parallax = MIN_PARALLAX * max(camera.width, camera.height)
     # Poses are guessed on the CPU.
-    flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
+    flows = [f.on_cpu() for f in flows]
     found = thread_map(lambda match: two_view(camera, match), flows)
     best = best_two_view(found, min_parallax)
     if best is None:

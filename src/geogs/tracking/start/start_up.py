@@ -62,8 +62,7 @@ class StartUp:
         if match.matched < MIN_MATCHED:
             return self._miss(frame, encoded, rotations)
         self._progress.misses = 0
-        there = FlowMatch(match.there.pixels.cpu(), match.there.weight.cpu())
-        measure = partial(_rotation, last.frame_index, self._grid, there)
+        measure = partial(_rotation, last.frame_index, self._grid, match.there.on_cpu())
         if self._choice.calls_for(match.flow, match.matched):
             return self._gather(frame, encoded, rotations, measure)
         eye = torch.eye(4, dtype=torch.float64)
