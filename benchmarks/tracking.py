@@ -198,11 +198,11 @@ def main() -> None:
 
     start, spent, lost, cpu = time.perf_counter(), 0.0, 0, time.process_time()
     for frame in sequence.frames():
-        tick = time.perf_counter()
+        count, tick = len(tracker.keyframes), time.perf_counter()
         result = tracker.track(frame)
         spent += time.perf_counter() - tick
         lost += result.state.value == "lost"
-        if result.new_keyframe is not None and len(tracker.keyframes) % 10 == 0:
+        if len(tracker.keyframes) > count and len(tracker.keyframes) % 10 == 0:
             print(
                 f"  frame {frame.index}: {len(tracker.keyframes)} keyframes, "
                 f"ATE {keyframe_error(tracker, sequence)[0]:.3f} cm, {spent:.1f} s",

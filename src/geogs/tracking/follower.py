@@ -82,8 +82,7 @@ class Follower:
         motion = self._locator.locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
         if motion is None or motion.known < MIN_KNOWN:
             return None
-        long_edge = max(camera.width, camera.height)
-        if calls_for_keyframe(config, long_edge, motion.flow, motion.overlap, FARTHER):
+        if calls_for_keyframe(config, camera.long_edge, motion.flow, motion.overlap, FARTHER):
             return None
         velocity = motion.T_cw @ se3_inverse(self.T_cw)
         T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)

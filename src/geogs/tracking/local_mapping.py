@@ -46,8 +46,7 @@ class LocalMapping:
     def __init__(self, map: SegmentMap, config: TrackingConfig) -> None:
         self.map, self.config = map, config
         self.segment, self.keyframes, self.graph = map.segment, map.keyframes, map.graph
-        camera = map.keyframes.grid.camera
-        self._long_edge = max(camera.width, camera.height)
+        self._long_edge = map.keyframes.grid.camera.long_edge
 
     @property
     def active(self) -> tuple[int, ...]:

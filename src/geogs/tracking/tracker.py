@@ -20,7 +20,7 @@ from geogs.tracking.frames.pose_filling import solve_trajectory
 from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.local_mapping import LocalMapping
-from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameMotion, Recognition
+from geogs.tracking.locate.frame_locator import FrameMotion, Recognition
 from geogs.tracking.locate.localiser import SegmentLocaliser
 from geogs.tracking.locate.orientation_follower import OrientationFollower
 from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
@@ -39,8 +39,6 @@ class TrackResult:
     """What one frame changed."""
 
     state: TrackState
-    new_keyframe: int | None = None
-    """Id of the keyframe made from this frame."""
     finalized: tuple[int, ...] = ()
     """Ids that from now on are never removed, earliest first."""
     active: tuple[int, ...] = ()
@@ -77,10 +75,8 @@ class Tracker:
         to :meth:`complete` what a new keyframe takes beyond its pose."""
         self.segment, self.keyframes, self.config = segment, segment.keyframes, config.tracking
         self.map = SegmentMap(segment, operator, config, prior)
-        camera, grid = self.keyframes.grid.camera, self.keyframes.grid
-        self._choice = KeyframeChoice(
-            self.config, max(camera.width, camera.height), segment.sharpness
-        )
+        grid = self.keyframes.grid
+        self._choice = KeyframeChoice(self.config, grid.camera.long_edge, segment.sharpness)
         self._start_up = StartUp(self.map, self._choice, self.config)
         self._localiser = SegmentLocaliser(self.map)
         self._orientation = OrientationFollower(grid, operator, self.config)
@@ -181,7 +177,7 @@ class Tracker:
         ids = self.keyframes.ids
         fresh = self.map.finalise(ids)
         self.map.recorder.finalise(ids[-1], None)
-        return TrackResult(self.segment.status.state, None, fresh, ())
+        return TrackResult(self.segment.status.state, fresh)
 
     def absorb(self, other: "Tracker") -> None:
         """Take over the keyframes and frames of another tracker, already in this one's gauge.
@@ -230,7 +226,7 @@ class Tracker:
         removed = self.local.update(new.keyframe, new.motion.keyframe, new.rotations)
         fresh = self.map.finalise(self.keyframes.ids[:-1])
         state, active = self.segment.status.state, self.local.active
-        return TrackResult(state, new.keyframe.id, fresh, active, removed)
+        return TrackResult(state, fresh, active, removed)
 
     # --- steps of a frame ----------------------------------------------------------------------
 
@@ -254,18 +250,15 @@ class Tracker:
             return TrackResult(status.state, removed=given_up)
         self._begin()
         self._orientation.located(status.orientation, frame, encoded)
-        newest = keyframes[keyframes.ids[-1]]
-        new = newest.id if newest.frame_index == frame.index else None
         fresh = self.map.finalise(keyframes.ids[:-1])
-        return TrackResult(status.state, new, fresh, self.local.active, given_up)
+        return TrackResult(status.state, fresh, self.local.active, given_up)
 
     def _begin(self) -> None:
         """The map has just been started."""
         self.map.odometry.update_scale()
-        locator, keyframes = self._localiser.locator, self.keyframes
-        locate_early_frames(self.map.recorder, keyframes, locator, MIN_KNOWN)
-        newest = keyframes[keyframes.ids[-1]]
-        self.segment.status.last = LastFrame.at(newest)
+        keyframes = self.keyframes
+        locate_early_frames(self.map.recorder, keyframes, self._localiser.locator)
+        self.segment.status.last = LastFrame.at(keyframes[keyframes.ids[-1]])
 
     def _lose(self, frame: Frame, rotations: Sequence[RelativeRotation] = ()) -> TrackResult:
         """The frame has no pose; no orientation, either, unless rotations say one."""
@@ -302,7 +295,7 @@ class Tracker:
         keyframe = self.local.insert(frame, encoded, motion)
         status.last = LastFrame.at(keyframe, last.velocity, last.interval)
         self._unfinished = _Unfinished(keyframe, motion, rotations)
-        return TrackResult(status.state, keyframe.id) if self._defers else self.complete()
+        return TrackResult(status.state) if self._defers else self.complete()
 
     def _located(self, frame: Frame, motion: FrameMotion) -> LastFrame:
         """Where the frame is, and how the camera has moved since the one before."""

@@ -11,7 +11,7 @@ from geogs.config import TrackingConfig
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
-from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, FlowChain
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, follow_flow
 from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
@@ -25,7 +25,6 @@ FRAMES = 600
 class View:
     """A keyframe without a pose."""
 
-    frame: Frame
     encoded: Any
     step: FlowMatch | None
     """From the keyframe before it; None for the first."""
@@ -37,8 +36,7 @@ class ViewGatherer:
     def __init__(self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator) -> None:
         self._frames, self._grid, self._operator = frames, grid, operator
         self._config = TrackingConfig()
-        self._chain = FlowChain(grid, operator)
-        self._positions = ChainedPositions()
+        self._chain = ChainedPositions()
         self.frames = 0
         """Frames taken so far."""
         self._is_read = False
@@ -67,7 +65,9 @@ class ViewGatherer:
                 continue
             step = None
             if views:
-                match = self._chain.follow(self._positions, views[-1].encoded, encoded)
+                match = follow_flow(
+                    self._grid, self._operator, self._chain, views[-1].encoded, encoded
+                )
                 if match.matched < MIN_MATCHED:
                     if len(views) >= count // 2:
                         break
@@ -76,8 +76,8 @@ class ViewGatherer:
                     continue
                 else:
                     step = match.there
-            self._positions.reset()
-            views.append(View(frame, encoded, step))
+            self._chain.reset()
+            views.append(View(encoded, step))
         return views
 
 

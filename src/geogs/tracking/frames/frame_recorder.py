@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
@@ -39,7 +39,7 @@ class FrameRecorder:
         self._waiting = _in_order([r for r in frames.records if r.image is not None])
         self._rotations: deque[tuple[FrameRecord, Future[RelativeRotation | None]]] = deque()
         self._threads = ThreadPoolExecutor(ROTATION_THREADS, thread_name_prefix="rotations")
-        self._cells = torch.nonzero(sparse_cells(keyframes.grid))[:, 0]
+        self._cells = sparse_cells(keyframes.grid)
 
     @property
     def log(self) -> FrameLog:
@@ -221,11 +221,11 @@ def pose_of(record: FrameRecord, keyframes: KeyframeSet) -> Float[Tensor, "4 4"]
     return record.T_cw(keyframes[record.anchor])
 
 
-def sparse_cells(grid: SampleGrid) -> Bool[Tensor, "p"]:
-    """Every second cell in both directions."""
+def sparse_cells(grid: SampleGrid) -> Int[Tensor, "s"]:
+    """Indices of every second cell in both directions."""
     keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
     keep[::2, ::2] = True
-    return keep.reshape(-1)
+    return torch.nonzero(keep.reshape(-1))[:, 0]
 
 
 def _in_order(records: Sequence[FrameRecord]) -> list[FrameRecord]:

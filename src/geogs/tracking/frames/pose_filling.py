@@ -70,7 +70,7 @@ def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
 def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> None:
     """Correct what was found of frames by the errors of their rows and their keyframes'."""
     grid = keyframes.grid
-    cells = torch.nonzero(sparse_cells(grid))[:, 0]
+    cells = sparse_cells(grid)
     seen = [(r, o) for r in frames.records for o in r.observations if o.keyframe in keyframes]
     for start in range(0, len(seen), SOLVED_TOGETHER):
         part = seen[start : start + SOLVED_TOGETHER]
@@ -89,7 +89,7 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
 def _solved(records: list[FrameRecord], keyframes: KeyframeSet) -> Float[Tensor, "n 4 4"]:
     """Poses of frames by their observations."""
     grid = keyframes.grid
-    cells = torch.nonzero(sparse_cells(grid))[:, 0]
+    cells = sparse_cells(grid)
     pairs = [
         (n, o) for n, r in enumerate(records) for o in r.observations if o.keyframe in keyframes
     ]

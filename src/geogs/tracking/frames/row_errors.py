@@ -8,6 +8,7 @@ that by fractions of a pixel, so the matches are corrected to first order and th
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -32,6 +33,17 @@ LARGEST = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
 
 
+@dataclass(frozen=True)
+class _RectifiedFrame:
+    """The rows of a frame, and how the camera moved around it."""
+
+    rows: SeenRows
+    times: Float[Tensor, "5"]
+    """Seconds of the nodes, from the frame."""
+    motions: Float[Tensor, "5 4 4"]
+    """From the camera at the frame to the camera at its nodes."""
+
+
 class RowErrors:
     """Errors of the rows of frames, at a state of the trajectory."""
 
@@ -46,34 +58,31 @@ class RowErrors:
 
         Frames without rows have no errors, nor have those with too few tracked neighbours.
         """
-        self._grid, self._long_edge = grid, max(grid.camera.width, grid.camera.height)
+        self._grid = grid
         nodes = _nodes(trajectory)
         T_wc = torch.from_numpy(trajectory.T_wc)
         self._T_cw = dict(zip(frames, se3_inverse(T_wc), strict=True))
-        self._rows: dict[int, SeenRows] = {}
+        self._rectified: dict[int, _RectifiedFrame] = {}
         self._factor = 1.0
-        self._times: dict[int, Float[Tensor, "5"]] = {}
-        self._motions: dict[int, Float[Tensor, "5 4 4"]] = {}
-        """From the camera at a frame to the camera at its nodes."""
-        for n, frame in enumerate(frames):
-            if frame in rows and nodes[n] is not None:
-                around = nodes[n]
+        for n, (frame, around) in enumerate(zip(frames, nodes, strict=True)):
+            if frame in rows and around is not None:
                 times = trajectory.timestamps[around] - trajectory.timestamps[n]
-                self._rows[frame] = rows[frame]
-                self._times[frame] = torch.from_numpy(times).float()
-                self._motions[frame] = (se3_inverse(T_wc[around]) @ T_wc[n]).float()
+                motions = (se3_inverse(T_wc[around]) @ T_wc[n]).float()
+                self._rectified[frame] = _RectifiedFrame(
+                    rows[frame], torch.from_numpy(times).float(), motions
+                )
 
     def merged(self, other: "RowErrors") -> "RowErrors":
         """Those of the frames of both, of one camera and one unit; their numbers differ."""
         both = copy.copy(self)
-        for name in ("_T_cw", "_rows", "_times", "_motions"):
-            setattr(both, name, getattr(self, name) | getattr(other, name))
+        both._T_cw = self._T_cw | other._T_cw
+        both._rectified = self._rectified | other._rectified
         return both
 
     @property
     def doubt(self) -> float:
         """Relative standard error of the readout; 0 where it was given, or nothing is known."""
-        return next((rows.doubt for rows in self._rows.values()), 0.0)
+        return next((f.rows.doubt for f in self._rectified.values()), 0.0)
 
     def with_readout(self, factor: float) -> "RowErrors":
         """The same, the readout being so many times what the rows were rectified by."""
@@ -117,7 +126,7 @@ class RowErrors:
             self._grid, T_ji, p.pixels, p.z, self.of_pixels(source, own, inverse_depth)
         )
         error = there - moved
-        believed = p.valid & (error.norm(dim=-1) < LARGEST * self._long_edge)
+        believed = p.valid & (error.norm(dim=-1) < LARGEST * camera.long_edge)
         return torch.where(believed[..., None], error, 0.0)
 
     def of_pixels(
@@ -133,16 +142,16 @@ class RowErrors:
         order.
         """
         error = torch.zeros_like(pixels)
-        known = [n for n, frame in enumerate(frames) if frame in self._rows]
+        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
         if not known:
             return error
-        names = [frames[n] for n in known]
+        rectified = [self._rectified[frames[n]] for n in known]
         at = torch.tensor(known, device=pixels.device)
         shown, d = pixels[at], inverse_depth[at]
-        offset, seconds = self._seen(names, shown)
+        offset, seconds = _seen([f.rows for f in rectified], shown)
         seconds = self._factor * seconds
-        T = torch.stack([self._motions[f] for f in names]).to(shown)
-        times = torch.stack([self._times[f] for f in names]).to(shown)
+        T = torch.stack([f.motions for f in rectified]).to(shown)
+        times = torch.stack([f.times for f in rectified]).to(shown)
         weights, camera = lagrange(times, seconds), self._grid.camera
         focal, centre = (
             shown.new_tensor([camera.fx, camera.fy]), shown.new_tensor([camera.cx, camera.cy])
@@ -155,21 +164,6 @@ class RowErrors:
             moved += weights[..., j, None] * (y[..., :2] / z[..., None])
         error[at] = shown + offset - (moved * focal + centre)
         return error
-
-    def _seen(
-        self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
-    ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
-        """Offsets and seconds at pixels, bilinear between the nodes as the image was made."""
-        laid = [
-            torch.cat([self._rows[f].offset, self._rows[f].seconds[..., None]], -1) for f in frames
-        ]
-        field = torch.stack(laid).to(pixels).permute(0, 3, 1, 2)
-        size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
-        position = 2 * (pixels + CELL + 0.5) / size - 1
-        values = torch.nn.functional.grid_sample(
-            field, position[:, :, None], padding_mode="border", align_corners=False
-        )[..., 0]
-        return values[:, :2].mT, values[:, 2]
 
 
 def edge_shifts(
@@ -222,6 +216,20 @@ def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
             start = int(np.clip(frame - NODES // 2, first, last + 1 - NODES))
             nodes[frame] = np.arange(start, start + NODES)
     return nodes
+
+
+def _seen(
+    rows: Sequence[SeenRows], pixels: Float[Tensor, "e p 2"]
+) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
+    """Offsets and seconds at pixels, bilinear between the nodes as the image was made."""
+    laid = [torch.cat([r.offset, r.seconds[..., None]], -1) for r in rows]
+    field = torch.stack(laid).to(pixels).permute(0, 3, 1, 2)
+    size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
+    position = 2 * (pixels + CELL + 0.5) / size - 1
+    values = torch.nn.functional.grid_sample(
+        field, position[:, :, None], padding_mode="border", align_corners=False
+    )[..., 0]
+    return values[:, :2].mT, values[:, 2]
 
 
 def _propagated(

@@ -32,8 +32,8 @@ class SegmentLocaliser:
     def __init__(self, map: SegmentMap) -> None:
         self.map = map
         grid = map.keyframes.grid
-        edge = max(grid.camera.width, grid.camera.height)
-        self.locator = FrameLocator(grid, map.operator, MIN_MATCHED, MAX_RESIDUAL * edge, MIN_NCC)
+        max_residual = MAX_RESIDUAL * grid.camera.long_edge
+        self.locator = FrameLocator(grid, map.operator, MIN_MATCHED, max_residual, MIN_NCC)
 
     def track(self, frame: Frame, encoded: Any) -> FrameMotion | None:
         """The frame near where the last one was; None if the camera is not there."""

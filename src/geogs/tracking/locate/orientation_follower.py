@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
-from geogs.tracking.matching.flow_chain import MIN_MATCHED, FlowChain
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, follow_flow
 from geogs.tracking.matching.two_view_rotation import two_view_rotation
 from geogs.types import Frame
 from geogs.world.frames import RelativeRotation
@@ -41,7 +41,6 @@ class OrientationFollower:
 
     def __init__(self, grid: SampleGrid, operator: FlowOperator, config: TrackingConfig) -> None:
         self.grid, self.operator, self.config = grid, operator, config
-        self._flow = FlowChain(grid, operator)
 
     def located(self, track: OrientationTrack, frame: Frame, encoded: Any) -> None:
         """The frame has a pose: what follows may be matched with it."""
@@ -56,7 +55,7 @@ class OrientationFollower:
             return None
         if view.encoded is None:
             view.encoded = self.operator.encode(view.image)
-        match = self._flow.follow(track.flow, view.encoded, encoded)
+        match = follow_flow(self.grid, self.operator, track.flow, view.encoded, encoded)
         found = None
         if match.matched >= MIN_MATCHED:
             found = two_view_rotation(self.grid, match.there)
@@ -67,8 +66,7 @@ class OrientationFollower:
             return None
         track.misses = 0
         R = None if view.R is None else found.R @ view.R
-        camera = self.grid.camera
-        edge = max(camera.width, camera.height)
+        edge = self.grid.camera.long_edge
         if calls_for_keyframe(self.config, edge, match.flow, match.matched):
             track.reset(ReferenceView(frame.index, frame.image, R, encoded))
         rotation = RelativeRotation(view.index, found.R, found.deviation)

@@ -36,27 +36,24 @@ class ChainedMatch:
     """Fraction of the cells that are matched; 0 where the images do not agree there."""
 
 
-class FlowChain:
-    """Follows the flow from a first image through those after it, each starting from the last."""
+def follow_flow(
+    grid: SampleGrid, operator: FlowOperator, chain: ChainedPositions, first: Any, encoded: Any
+) -> ChainedMatch:
+    """Match the first image with the next one, from where ``chain`` has come to; it goes on there.
 
-    def __init__(self, grid: SampleGrid, operator: FlowOperator) -> None:
-        self.grid = grid
-        self.operator = operator
-
-    def follow(self, chain: ChainedPositions, first: Any, encoded: Any) -> ChainedMatch:
-        """Match the first image with the next one, from where ``chain`` has come to."""
-        there, back = self.operator.measure([first], [encoded], chain.there, chain.back, fine=False)
-        there, back = guided_flow(self.grid, self.operator, first, encoded, there, back)
-        # What the images say where the flow, for want of a pose, leads.
-        images = self.operator.grey(first), self.operator.grey(encoded)
-        seen = correlation_matched(self.grid, *images, there.pixels[0])
-        moved = matched_motion(self.grid, there.pixels[0], there.weight[0])
-        # All at once, so that a GPU is waited for once.
-        found = torch.cat([moved, seen]).cpu()
-        matched, flow = found[:2].tolist()
-        if not PhotometricCheck.of(found[2:]).passes(MIN_NCC, is_expected=True):
-            matched = 0.0
-        if matched > 0:
-            chain.there = filled_positions(self.grid, there)[None]
-            chain.back = filled_positions(self.grid, back)[None]
-        return ChainedMatch(there, flow if matched else 0.0, matched)
+    Both images are encoded.
+    """
+    there, back = operator.measure([first], [encoded], chain.there, chain.back, fine=False)
+    there, back = guided_flow(grid, operator, first, encoded, there, back)
+    # What the images say where the flow, for want of a pose, leads.
+    seen = correlation_matched(grid, operator.grey(first), operator.grey(encoded), there.pixels[0])
+    moved = matched_motion(grid, there.pixels[0], there.weight[0])
+    # All at once, so that a GPU is waited for once.
+    found = torch.cat([moved, seen]).cpu()
+    matched, flow = found[:2].tolist()
+    if not PhotometricCheck.of(found[2:]).passes(MIN_NCC, is_expected=True):
+        matched = 0.0
+    if matched > 0:
+        chain.there = filled_positions(grid, there)[None]
+        chain.back = filled_positions(grid, back)[None]
+    return ChainedMatch(there, flow if matched else 0.0, matched)

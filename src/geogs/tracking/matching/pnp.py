@@ -50,7 +50,7 @@ def _pnp(
         camera.matrix().numpy(),
         None,
         iterationsCount=200,
-        reprojectionError=max(camera.width, camera.height) / 250,
+        reprojectionError=camera.long_edge / 250,
         flags=cv2.SOLVEPNP_SQPNP,
     )
     if not ok or inliers is None or len(inliers) < 0.3 * len(points):

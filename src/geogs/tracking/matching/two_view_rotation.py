@@ -106,7 +106,7 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     pixels = match.pixels[0].double().cpu().numpy()[used]
     weight = match.weight[0].double().cpu().numpy()[used]
     weight = weight / (1 + MIN_SIGMA**2 * weight)
-    edge = max(camera.width, camera.height)
+    edge = camera.long_edge
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     seen = rays_through(pixels, camera.matrix().numpy())
     first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))

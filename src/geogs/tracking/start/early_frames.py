@@ -1,11 +1,13 @@
 """Poses of the frames from before a map was started."""
 
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
 from geogs.tracking.frames.frame_recorder import FrameRecorder
 from geogs.tracking.frames.rotation_averaging import orientations
-from geogs.tracking.locate.frame_locator import FrameLocator
+from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator
 from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
@@ -22,10 +24,7 @@ def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
     """
     ordered = list(keyframes)
     indices = [k.frame_index for k in ordered]
-    oriented = orientations(
-        {r.index: r.rotations for r in log.records},
-        {k.frame_index: k.T_cw[:3, :3] for k in ordered},
-    )
+    oriented = _oriented(log, keyframes)
     for record in log.records:
         if record.anchor is None or record.anchor not in keyframes:
             continue
@@ -43,7 +42,7 @@ def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
 
 
 def locate_early_frames(
-    recorder: FrameRecorder, keyframes: KeyframeSet, locator: FrameLocator, min_known: float
+    recorder: FrameRecorder, keyframes: KeyframeSet, locator: FrameLocator
 ) -> None:
     """Locate the frames that have no pose between the keyframes of a start, the latest first.
 
@@ -54,10 +53,7 @@ def locate_early_frames(
     candidates = list(keyframes)
     if not waiting or not candidates:
         return
-    oriented = orientations(
-        {r.index: r.rotations for r in recorder.log.records},
-        {k.frame_index: k.T_cw[:3, :3] for k in candidates},
-    )
+    oriented = _oriented(recorder.log, keyframes)
     centres = {k.frame_index: se3_inverse(k.T_cw)[:3, 3] for k in candidates}
     for record, encoded in reversed(waiting):
         record.anchor, R = None, oriented.get(record.index)
@@ -68,8 +64,16 @@ def locate_early_frames(
         guess[:3, :3], guess[:3, 3] = R, -R @ centres[nearest]
         for keyframe in visible_keyframes(candidates, guess):
             motion = locator.locate(keyframe, encoded, guess, is_expected=False)
-            if motion is not None and motion.known >= min_known:
+            if motion is not None and motion.known >= MIN_KNOWN:
                 T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)
                 recorder.place(record, keyframe.id, T_rel, motion.match)
                 centres[record.index] = se3_inverse(motion.T_cw)[:3, 3]
                 break
+
+
+def _oriented(log: FrameLog, keyframes: KeyframeSet) -> dict[int, Float64[Tensor, "3 3"]]:
+    """World to camera of frames that rotations link to keyframes, by the index of the frame."""
+    return orientations(
+        {r.index: r.rotations for r in log.records},
+        {k.frame_index: k.T_cw[:3, :3] for k in keyframes},
+    )

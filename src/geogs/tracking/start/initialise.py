@@ -63,11 +63,10 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     """
     segment = graph.keyframes
     camera = segment.grid.camera
-    min_parallax = MIN_PARALLAX * max(camera.width, camera.height)
     # Poses are guessed on the CPU.
     flows = [f.on_cpu() for f in flows]
     found = thread_map(lambda match: two_view(camera, match), flows)
-    best = best_two_view(found, min_parallax)
+    best = best_two_view(found, MIN_PARALLAX * camera.long_edge)
     if best is None:
         return Attempt.FAILED
     _place_all(graph, flows, best)

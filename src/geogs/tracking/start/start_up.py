@@ -11,7 +11,7 @@ from geogs.config import TrackingConfig
 from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import MIN_KNOWN
-from geogs.tracking.matching.flow_chain import MIN_MATCHED, FlowChain
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, follow_flow
 from geogs.tracking.matching.two_view_rotation import two_view_rotation
 from geogs.tracking.start.chained_flows import ChainedFlows
 from geogs.tracking.start.early_frames import place_between_keyframes
@@ -39,7 +39,6 @@ class StartUp:
         self.keyframes = map.keyframes
         self._grid = SampleGrid(map.keyframes.grid.camera)
         """On the CPU, where rotations are measured."""
-        self._chain = FlowChain(map.keyframes.grid, map.operator)
         self._flows = ChainedFlows(map.graph)
         self._progress = map.segment.start
 
@@ -58,7 +57,9 @@ class StartUp:
         if not len(self.keyframes):
             return self._gather(frame, encoded, rotations)
         last = list(self.keyframes)[-1]
-        match = self._chain.follow(self._progress.flow, last.encoded, encoded)
+        match = follow_flow(
+            self.keyframes.grid, self.map.operator, self._progress.flow, last.encoded, encoded
+        )
         if match.matched < MIN_MATCHED:
             return self._miss(frame, encoded, rotations)
         self._progress.misses = 0
