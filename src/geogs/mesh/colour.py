@@ -75,7 +75,7 @@ def _observe(
 
 def _sample(view: DepthMapView, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
     """Bilinear samples of the view's image at pixels of its depth map."""
-    image = torch.from_numpy(view.image).to(pixels.device).permute(2, 0, 1).float()
+    image = torch.from_numpy(view.rgb()).to(pixels.device).permute(2, 0, 1).float()
     height, width = image.shape[1:]
     scale = pixels.new_tensor([width / view.camera.width, height / view.camera.height])
     pixels = (pixels + 0.5) * scale - 0.5

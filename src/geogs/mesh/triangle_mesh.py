@@ -25,6 +25,11 @@ class DepthMapView:
     image: UInt8[np.ndarray, "ih iw 3"] | None = None
     """RGB of the same view, of any size; gives the vertices their colour."""
 
+    def rgb(self) -> UInt8[np.ndarray, "ih iw 3"]:
+        """The image, asked for only where there is one."""
+        assert self.image is not None, "a view without an image shows no colours"
+        return self.image
+
     def valid(self) -> torch.Tensor:
         """Pixels (h, w) that carry a depth."""
         return torch.isfinite(self.depth) & (self.depth > 0) & (self.weight > 0)

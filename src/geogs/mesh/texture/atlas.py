@@ -89,9 +89,7 @@ def _patch(
     """The pixels of a patch."""
     view = int(patches.view[number])
     left, top, right, bottom = patches.box[number]
-    source = views[view].image
-    assert source is not None
-    crop = source[top : bottom + 1, left : right + 1]
+    crop = views[view].rgb()[top : bottom + 1, left : right + 1]
     if (crop.shape[1], crop.shape[0]) != size:
         crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
     corners = patches.corners[patches.start[number] : patches.start[number + 1]]

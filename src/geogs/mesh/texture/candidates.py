@@ -70,7 +70,7 @@ def image_pixels(
     z = local[:, 2]
     safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
     pixels = local[:, :2] / safe[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    height, width = view.image.shape[:2]  # type: ignore[union-attr]
+    height, width = view.rgb().shape[:2]
     scale = np.array([width / camera.width, height / camera.height])
     return (pixels + 0.5) * scale - 0.5, z
 
@@ -79,8 +79,7 @@ def _seen_faces(
     mesh: Mesh, view: DepthMapView, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Numbers of the faces that a view shows, pixels each covers, colours."""
-    image = view.image
-    assert image is not None
+    image = view.rgb()
     height, width = image.shape[:2]
     pixels, z = image_pixels(view, mesh.vertices.astype(np.float64))
     low, high = MARGIN, np.array([width, height]) - 1 - MARGIN

@@ -82,7 +82,7 @@ def _boxes(
     low, high = np.full((number, 2), np.inf), np.full((number, 2), -np.inf)
     np.minimum.at(low, patch, pixel)
     np.maximum.at(high, patch, pixel)
-    sizes = {int(v): views[int(v)].image.shape[1::-1] for v in np.unique(view)}  # type: ignore[union-attr]
+    sizes = {int(v): views[int(v)].rgb().shape[1::-1] for v in np.unique(view)}
     size = np.array([sizes[int(v)] for v in view]).reshape(-1, 2)
     low = np.maximum(np.floor(low) - PADDING, 0)
     high = np.minimum(np.ceil(high) + PADDING, size - 1)

@@ -92,8 +92,7 @@ def _corner_colours(
     own = patches.view[patches.corner_patch]
     for v in np.unique(patches.view):
         here = np.flatnonzero(own == v)
-        image = views[int(v)].image
-        assert image is not None
+        image = views[int(v)].rgb()
         smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
         x, y = np.round(patches.pixel[here]).astype(int).T
         x, y = x.clip(0, image.shape[1] - 1), y.clip(0, image.shape[0] - 1)

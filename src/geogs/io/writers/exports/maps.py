@@ -37,7 +37,7 @@ def write_normal_png(path: Path, normal: Float[np.ndarray, "h w 3"]) -> None:
 def write_npz(path: Path, name: str, values: Float32[np.ndarray, "..."]) -> None:
     """Write one array, compressed."""
     with atomic_file(path) as stream:
-        np.savez_compressed(stream, **{name: values})  # type: ignore[arg-type]
+        np.savez_compressed(stream, **{name: values})  # type: ignore[arg-type]  # a name, no option
 
 
 def write_description(path: Path, camera: Camera, meaning: dict[str, object]) -> None:
