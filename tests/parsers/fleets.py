@@ -5,7 +5,7 @@ from pathlib import Path
 import mutations
 from geogs_fleet.row import FILE, Row, read_row, row_text
 from geogs_fleet.sources import find_sources
-from geogs_fleet.storage import Place
+from geogs_fleet.storage import StoragePath
 from geogs_fleet.table import table_html
 from parsers.base import Parser, written
 
@@ -25,6 +25,6 @@ def fleets() -> dict[str, Parser]:
 
 def table(folder: Path) -> object:
     """The row beside others, as they are shown."""
-    row = read_row(Place(str(folder / FILE)).read())
+    row = read_row(StoragePath(str(folder / FILE)).read())
     rows = [row] if row is not None else []
     return table_html(sorted(rows, key=lambda row: row.trouble))

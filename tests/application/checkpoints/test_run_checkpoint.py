@@ -101,8 +101,9 @@ ANEW = (SampleGrid, Archive, MethodType, type)
 """Of the process, or compared elsewhere."""
 DROPPED = {
     "memory", "held",  # of a flow operator, of a GPU
-    "rejected", "_warned", "_motion", "pose",  # for who looks on
+    "_warned", "_motion", "pose",  # for who looks on
     "_recent", "encoded", "_values", "own_encoded",  # made again
+    "_pending",  # searches that have ended
     "operator", "_locator", "_search_thread", "_start", "_ahead", "_trainer",
 }  # fmt: skip
 """In memory for speed alone, or of the process."""
