@@ -37,13 +37,19 @@ class Marginals:
     Zero for what is fixed, infinite for what no match tells of.
     """
 
-    pose: Float[Tensor, "n 6 6"]
-    """Covariance of the left perturbation of each pose; float64."""
+    covariance: Float[Tensor, "m m"]
+    """Of the left perturbations of all poses, m = 6n; float64."""
     relative_depth: Float[Tensor, "n c"]
     """Deviation of the inverse depth of some cells of each frame, as a part of it."""
     normalised_residual: Float[Tensor, "n"]
     """Median residual of the matches from each frame, in their own standard deviations (two
     dimensions): 1.2 where errors are as expected, more where the scene is not as modelled."""
+
+    @property
+    def pose(self) -> Float[Tensor, "n 6 6"]:
+        """Covariance of the left perturbation of each pose; float64."""
+        n = len(self.covariance) // 6
+        return self.covariance.reshape(n, 6, n, 6).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
@@ -71,16 +77,14 @@ def marginals(
     """
     part = _Thinned(grid, problem, cells)
     covariance = ALIKE * _pose_covariance(problem, part, options)
-    n = len(problem.T_cw)
-    pose = torch.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)])
-    relative = torch.zeros(n, part.count)
+    relative = torch.zeros(len(problem.T_cw), part.count)
     relative[problem.free_depth.cpu()] = torch.inf
     for source in part.sources(options):
         frame = source.frame
         if bool(problem.free_depth[frame]):
             sigma = _depth_variance(source.edges, covariance).sqrt()
             relative[frame] = sigma / part.inverse_depth[frame].clamp(min=1e-12)
-    return Marginals(pose, relative, _normalised_residual(problem, part, options))
+    return Marginals(covariance, relative, _normalised_residual(problem, part, options))
 
 
 class _Thinned:

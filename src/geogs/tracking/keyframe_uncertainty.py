@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from geogs.bundle.gauge import deviations_after_alignment
 from geogs.bundle.marginals import Marginals, marginals
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.graph.frame_graph import HUBER
@@ -16,9 +17,12 @@ TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23
 """Median residual, in deviations of a match, where the scene is as modelled."""
-RESIDUAL_POWER = 4
-"""Errors of poses grow with this power of the residual. Both were read off rendered videos with and
-without rolling shutter, blur, noise and people who cross (docs/tracking.md has the table)."""
+RESIDUAL_POWER = 2
+"""Errors of poses grow with this power of the residual."""
+COMMON_ERRORS = 4 / 3
+"""Times as large as foretold are errors of poses where the residual is usual: matches of a whole
+video have some in common. All three were read off rendered videos with and without rolling shutter,
+blur and noise (docs/tracking.md has the table)."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +32,8 @@ class KeyframeUncertainty:
     keyframes: tuple[int, ...]
     """Ids."""
     position: Float64[np.ndarray, "n"]
-    """Standard deviation of the camera's centre relative to the first keyframe, map units, all axes
-    together; infinite where nothing is known, as the others."""
+    """Standard deviation of the camera's centre, map units, all axes together; infinite where
+    nothing is known, as the others."""
     rotation: Float64[np.ndarray, "n"]
     """Likewise of its orientation, radians."""
     depth: Float64[np.ndarray, "n"]
@@ -41,7 +45,7 @@ class KeyframeUncertainty:
         """Deviations that hold where the scene is not as modelled, too: see ``RESIDUAL_POWER``."""
         residual = np.where(np.isfinite(self.residual), self.residual / USUAL_RESIDUAL, 1.0)
         residual = np.maximum(residual, 1.0)
-        factor = float(np.mean(residual**RESIDUAL_POWER)) if len(residual) else 1.0
+        factor = COMMON_ERRORS * float(np.mean(residual**RESIDUAL_POWER)) if len(residual) else 1.0
         times = [tracker.keyframes[k].timestamp for k in self.keyframes]
         return Uncertainty(
             np.array(times, np.float64), factor * self.position, factor * self.rotation,
@@ -52,11 +56,14 @@ class KeyframeUncertainty:
 def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
     """Uncertainty of all keyframes of a tracker that has a map, from its present edges.
 
-    In the world of a saved map: of those that it did not bring, relative to it.
+    What it says of poses is what is left of their errors when the trajectory is laid over the truth
+    by a similarity, for frame and unit of the map are anyone's
+    (:func:`~geogs.bundle.gauge.deviations_after_alignment`). In the world of a saved map: of the
+    keyframes that it did not bring, relative to it.
 
-    Lengths are relative to the length of the path: the unit of the map is anyone's. In a long
-    video each part begins where the one before it ended, so that errors add up along the way
-    whatever loops say: what is said of it is rather too much.
+    In a video of more than ``TOGETHER`` keyframes each part begins where the one before it ended,
+    and deviations are relative to the first keyframe: errors add up along the way whatever loops
+    say, and what is said of it is rather too much.
     """
     ids = tracker.segment.free
     position, rotation, depth, residual = (np.full(len(ids), np.inf) for _ in range(4))
@@ -66,13 +73,17 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
         found = _marginals(tracker, ids[part])
         if found is None:
             continue
-        squares = found.pose.diagonal(dim1=-2, dim2=-1).reshape(-1, 2, 3).sum(-1).numpy()
-        squares = squares + propagated
-        position[part], rotation[part] = np.sqrt(squares).T
         depth[part], residual[part] = (
             found.depth_deviation.numpy(),
             found.normalised_residual.numpy(),
         )
+        if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
+            T_cw = tracker.keyframes.poses(ids)
+            position[:], rotation[:] = deviations_after_alignment(T_cw, found.covariance)
+            break
+        squares = found.pose.diagonal(dim1=-2, dim2=-1).reshape(-1, 2, 3).sum(-1).numpy()
+        squares = squares + propagated
+        position[part], rotation[part] = np.sqrt(squares).T
         propagated = squares[-1] if not tracker.segment.fixed else propagated
     return KeyframeUncertainty(tuple(ids), position, rotation, depth, residual)
 
@@ -88,4 +99,6 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     grid = tracker.keyframes.grid
     found = marginals(grid, problem, BundleOptions(huber=HUBER), cells=512)
     own = torch.tensor([frames.index(k) for k in ids])
-    return Marginals(found.pose[own], found.relative_depth[own], found.normalised_residual[own])
+    rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
+    covariance = found.covariance[rows[:, None], rows]
+    return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])
