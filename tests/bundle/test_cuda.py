@@ -351,7 +351,7 @@ def test_fit_of_a_frame_matches_the_cpu(device):
     torch.testing.assert_close(T.cpu(), expected_T, rtol=0, atol=2e-5)
     torch.testing.assert_close(motion.cpu(), expected_motion, rtol=0, atol=3e-5)
     torch.testing.assert_close(motion.cpu() @ slow[0].T_cw, T.cpu(), rtol=0, atol=1e-9)
-    used, matched, residual, flow, informed, known = found.tolist()
+    used, matched, residual, flow, parallax, informed, known = found.tolist()
     share = ((weight[:, 0] > 0) & (slow[0].information > 0)).float().mean()
     assert used == pytest.approx(float(share), abs=1e-6)
     assert used == pytest.approx(float(expected[0]), abs=1e-6)
@@ -359,10 +359,12 @@ def test_fit_of_a_frame_matches_the_cpu(device):
     assert matched < used
     assert residual == pytest.approx(float(expected[2]), rel=1e-3)
     assert flow == pytest.approx(float(expected[3]), rel=1e-5)
+    assert parallax == pytest.approx(float(expected[4]), rel=1e-3)
+    assert 0.05 * flow < parallax != flow
     assert informed == pytest.approx(float((slow[0].information > 0).float().mean()), abs=1e-6)
     placed = slow[0].has_known_depth & (weight[:, 0] > 0)
     assert known == pytest.approx(float(placed.float().mean()), abs=1.5 / len(weight))
-    assert known == pytest.approx(float(expected[5]), abs=1.5 / len(weight))
+    assert known == pytest.approx(float(expected[6]), abs=1.5 / len(weight))
     assert 0 < known < used < informed < 1
 
 

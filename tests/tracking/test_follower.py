@@ -135,7 +135,8 @@ def test_a_follower_knows_what_it_cannot_do(stream):
     assert follower.follow(replace(stream[n], image=black)) is None
     assert follower.follow(replace(stream[n], image=black[:-8])) is None
     assert follower.follow(replace(stream[n], follows_cut=True)) is None
-    assert follower.follow(stream[-1]) is None  # too far from the keyframe
+    far, _ = render(sideways(LENGTH + 5)[-1])
+    assert follower.follow(replace(stream[-1], image=far)) is None  # too far from the keyframe
     assert follower.frames == []
     assert follower.last.keyframe == tracker.keyframes.ids[-1]
 

@@ -224,9 +224,9 @@ def test_slow_motion_makes_few_keyframes_and_culling_removes_more(monkeypatch):
     slow = frames(sideways(30, 0.012))
     few, _ = run(slow)
     monkeypatch.setattr(local_mapping, "CULL_DISTANCE", 0.0)
-    many, results = run(slow, replace(CONFIG, keyframe_flow=0.012))
+    many, results = run(slow, replace(CONFIG, keyframe_parallax=0.012))
     monkeypatch.setattr(local_mapping, "CULL_DISTANCE", 0.02)
-    culled, results = run(slow, replace(CONFIG, keyframe_flow=0.012))
+    culled, results = run(slow, replace(CONFIG, keyframe_parallax=0.012))
     assert len(few.segment.ids) < len(many.segment.ids)
     removed = [k for r in results for k in r.removed]
     assert removed
@@ -241,7 +241,7 @@ def test_thirty_frames_of_a_rendered_living_room(shared_data):
     folder = shared_data / "rooms" / "living-room-2"
     T_wc = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
     camera = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680).with_long_edge(320)
-    tracker = lone_tracker(camera, Config(tracking=replace(CONFIG, keyframe_flow=0.02)))
+    tracker = lone_tracker(camera, Config(tracking=replace(CONFIG, keyframe_parallax=0.02)))
     for k in range(0, 60, 2):
         image = cv2.imread(str(folder / "results" / f"frame{k:06d}.jpg"))[..., ::-1]
         size = (camera.width, camera.height)

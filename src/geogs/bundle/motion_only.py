@@ -55,7 +55,7 @@ class CpuMotion:
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
         """As in the protocol."""
         informed = keyframe.information > 0
         placed = keyframe.has_known_depth & (weight[:, 0] > 0)
@@ -69,10 +69,18 @@ class CpuMotion:
             iterations, huber,
         )  # fmt: skip
         used = weight[:, 0] > 0
-        error, flow = residual[0].norm(dim=-1), (pixels - self.grid.pixels).norm(dim=-1)
+        T_ji = T[0] @ se3_inverse(keyframe.T_cw)
+        turned = self._turned(T_ji)
+        error, flow, parallax = (
+            x.norm(dim=-1) for x in (residual[0], pixels - self.grid.pixels, pixels - turned)
+        )
         agree = used & (error < limit)
         fractions = (x.float().mean() for x in (used, agree, informed, placed))
         matched, agreeing, known, placed_fraction = fractions
-        medians = error[used].median(), flow[used].median()
-        T_ji = T[0] @ se3_inverse(keyframe.T_cw)
+        medians = (x[used].median() for x in (error, flow, parallax))
         return T[0], T_ji, torch.stack([matched, agreeing, *medians, known, placed_fraction])
+
+    def _turned(self, T_ji: Float[Tensor, "4 4"]) -> Float[Tensor, "p 2"]:
+        """Where the cells fall if the camera only turns: those of points infinitely far away."""
+        far = self.grid.pixels.new_zeros(1, len(self.rays))
+        return project(self.grid.camera, self.rays, T_ji[None], far).pixels[0]

@@ -81,13 +81,14 @@ class MotionSolver(Protocol):
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
         """Pose of a frame against one keyframe, and what says whether it is right.
 
         Cells without information do not count. Returns the pose; the motion from the keyframe to
         it; and in one tensor the fraction of the cells that are matched, that whose residual is
-        below ``limit`` pixels, the medians over the matched of the residual and of the motion, in
-        pixels, which are not numbers where nothing is matched, the fraction of the cells that have
+        below ``limit`` pixels, the medians over the matched of the residual, of the motion and of
+        its parallax (the motion from where the camera's rotation alone takes a cell), in pixels,
+        which are not numbers where nothing is matched, the fraction of the cells that have
         information, and of those that are matched and have known depth
         (``Keyframe.has_known_depth``). On a GPU all stays there, and nothing waits.
         """

@@ -17,6 +17,7 @@ RENAMED = {
     "odometry.turn": "odometry.rotation-drift",
     "search.depth-share": "search.depth-ratio",
     "sensor.share": "sensor.ratio",
+    "tracking.keyframe-flow": "tracking.keyframe-parallax",
 }
 """Present names by the old ones."""
 _REMOVED = {

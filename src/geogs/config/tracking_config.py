@@ -30,8 +30,9 @@ class TrackingConfig(Settings, group="tracking"):
     """What measures image motion; auto takes classical, which needs no weights."""
     weights: Annotated[str, Basic()] = ""
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
-    keyframe_flow: Fraction = 0.025
-    """Median motion since the last keyframe that makes a frame a keyframe, of the long edge."""
+    keyframe_parallax: Fraction = 0.025
+    """Median motion since the last keyframe that makes a frame a keyframe, of the long edge;
+    where depths are known, without what the camera's rotation alone does."""
     keyframe_overlap: Fraction = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""

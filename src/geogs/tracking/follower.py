@@ -82,7 +82,8 @@ class Follower:
         motion = self._locator.locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
         if motion is None or motion.known < MIN_KNOWN:
             return None
-        if calls_for_keyframe(config, camera.long_edge, motion.flow, motion.overlap, FARTHER):
+        seen = motion.flow, motion.overlap, motion.parallax
+        if calls_for_keyframe(config, camera.long_edge, *seen, patience=FARTHER):
             return None
         velocity = motion.T_cw @ se3_inverse(self.T_cw)
         T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)

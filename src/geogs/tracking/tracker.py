@@ -289,7 +289,8 @@ class Tracker:
         is_first_measured = (
             frame.depth is not None and self.segment.is_metric and anchor.measured is None
         )
-        if not (is_first_measured or self._choice.calls_for(motion.flow, motion.overlap)):
+        seen = motion.flow, motion.overlap, motion.parallax
+        if not (is_first_measured or self._choice.calls_for(*seen)):
             self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)
             return TrackResult(status.state, active=self.local.active)
         keyframe = self.local.insert(frame, encoded, motion)

@@ -7,7 +7,7 @@ import pytest
 from geogs.config import TrackingConfig
 from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice, sharpness
 
-CONFIG = TrackingConfig(keyframe_flow=0.025, keyframe_overlap=0.7)
+CONFIG = TrackingConfig(keyframe_parallax=0.025, keyframe_overlap=0.7)
 
 
 def texture(seed: int = 0) -> np.ndarray:
@@ -72,3 +72,12 @@ def test_a_choice_goes_on_where_another_was() -> None:
     other = KeyframeChoice(CONFIG, 512, recent)
     other.see(cv2.blur(texture(5), (9, 1)))
     assert not other.calls_for(13.0, 1.0)
+
+
+def test_a_camera_that_turns_makes_keyframes_by_what_goes_out_of_sight() -> None:
+    choice = KeyframeChoice(CONFIG, 512)
+    turned = 60.0
+    assert not choice.calls_for(turned, 0.85, parallax=5.0)
+    assert choice.calls_for(turned, 0.85, parallax=12.9)
+    assert choice.calls_for(turned, 0.65, parallax=0.5)
+    assert choice.calls_for(77.0, 0.85, parallax=0.5)  # farther than flow should be measured over

@@ -78,16 +78,22 @@ extern "C" __global__ void __launch_bounds__(512) solve_poses(
 }
 
 // What tells whether a frame was found: the share of the cells that are matched, the share whose
-// residual is below `limit`, the median residual and the median motion of the matched, the share of
-// the cells that have information, and of those that are matched and have enough of it to know their
-// depth to sqrt(known). Also the upper rows of the motion from the keyframe at T_source to the frame
-// at T. One block.
+// residual is below `limit`, the medians over the matched of the residual, of the motion and of its
+// parallax (from where the rotation alone takes a cell), the share of the cells that have
+// information, and of those that are matched and have enough of it to know their depth to
+// sqrt(known). Also the upper rows of the motion from the keyframe at T_source to the frame at T.
+// One block.
 extern "C" __global__ void __launch_bounds__(512) judge_match(
     const float2* pixels, const float2* weight, const float* information,
-    const float* inverse_depth, const float2* residual, const float2* grid_pixels, int cells,
-    float limit, float known, const double* T, const double* T_source, double* judgement,
-    double* T_ji) {
+    const float* inverse_depth, const float2* residual, const float2* grid_pixels,
+    const float* rays, int cells, float fx, float fy, float cx, float cy, float limit, float known,
+    const double* T, const double* T_source, double* judgement, double* T_ji) {
   SHARED_MEMORY(u32, keys);
+  __shared__ Motion motion;
+  if (threadIdx.x == 0) {
+    relative_motion(T, T_source, T_ji);
+    for (int m = 0; m < 12; m++) motion.m[m] = (float)T_ji[m];
+  }
   float used = 0.f, agree = 0.f, informed = 0.f, placed = 0.f;
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
     float d = inverse_depth[p], told = information[p];
@@ -110,13 +116,22 @@ extern "C" __global__ void __launch_bounds__(512) judge_match(
     if (keys[p] != LEFT_OUT) keys[p] = median_key(sqrtf(x * x + y * y));
   }
   float median_flow = block_median(keys, cells);
+  __syncthreads();
+  Camera camera = {fx, fy, cx, cy};
+  for (int p = threadIdx.x; p < cells; p += blockDim.x) {
+    if (keys[p] == LEFT_OUT) continue;
+    float2 turned = pixel_of(camera, project_cell(motion, rays, p, 0.f));
+    float x = pixels[p].x - turned.x, y = pixels[p].y - turned.y;
+    keys[p] = median_key(sqrtf(x * x + y * y));
+  }
+  float median_parallax = block_median(keys, cells);
   if (threadIdx.x == 0) {
     judgement[0] = used / cells;
     judgement[1] = agree / cells;
     judgement[2] = median_error;
     judgement[3] = median_flow;
-    judgement[4] = informed / cells;
-    judgement[5] = placed / cells;
-    relative_motion(T, T_source, T_ji);
+    judgement[4] = median_parallax;
+    judgement[5] = informed / cells;
+    judgement[6] = placed / cells;
   }
 }

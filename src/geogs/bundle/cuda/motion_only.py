@@ -60,15 +60,15 @@ class CudaMotion:
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
         """As in the protocol."""
         grid, c, known = self.grid, self.grid.camera, keyframe.information
         device, threads = known.device, block_size(grid.size, MOST_THREADS)
         # Both poses in one piece; behind them what is found.
-        found = torch.cat([torch.eye(4).reshape(-1), torch.zeros(6)]).to(T_guess)
+        found = torch.cat([torch.eye(4).reshape(-1), torch.zeros(7)]).to(T_guess)
         state = torch.cat([T_guess.reshape(-1), keyframe.T_cw.reshape(-1), found])
         state = to_device(state, device)
-        T, T_source, T_ji, judged = state.split([16, 16, 16, 6])
+        T, T_source, T_ji, judged = state.split([16, 16, 16, 7])
         rows = torch.arange(2, dtype=torch.int32, device=device)
         pixels, weight = pixels.contiguous(), weight.contiguous()
         residual = torch.empty_like(pixels)
@@ -79,6 +79,7 @@ class CudaMotion:
         )  # fmt: skip
         kernels["judge_match"](
             1, threads, pixels, weight, known, keyframe.inverse_depth, residual, grid.pixels,
-            grid.size, limit, KNOWN**2, T, T_source, judged, T_ji, shared=4 * grid.size,
+            self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, limit, KNOWN**2, T, T_source, judged,
+            T_ji, shared=4 * grid.size,
         )  # fmt: skip
         return T.reshape(4, 4), T_ji.reshape(4, 4), judged

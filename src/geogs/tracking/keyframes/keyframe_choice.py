@@ -12,6 +12,9 @@ from geogs.config import TrackingConfig
 LEAST_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
 hardly moved, so it is the image that is poor."""
+FARTHEST = 0.15
+"""Motion that makes a keyframe without any parallax, of the long edge: over larger ones flow finds
+fewer matches, and worse ones."""
 BLUR_RATIO = 0.7
 """A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
 BLUR_WAIT = 0.4
@@ -23,19 +26,36 @@ _EDGE = 320
 
 
 def calls_for_keyframe(
-    config: TrackingConfig, long_edge: int, flow: float, overlap: float, patience: float = 0.0
+    config: TrackingConfig,
+    long_edge: int,
+    flow: float,
+    overlap: float,
+    parallax: float | None = None,
+    patience: float = 0.0,
 ) -> bool:
     """Whether a frame is far enough from the last keyframe to become one.
 
-    ``flow`` is the median motion of the cells that are matched, in pixels, ``overlap`` the fraction
-    of the keyframe's cells that are. In forward motion the cells that move most leave the image or
-    are not matched any more, so that the median motion of the rest stays small while the overlap
-    goes. With ``patience`` it may come so much further.
+    A keyframe brings depth by its parallax; one of a camera that has only turned brings none, and
+    is needed where the view goes out of sight. So the parallax decides, or the overlap. Before
+    depths are known, the rotation is not told from the motion, and all of it counts.
+
+    Args:
+        config: ``keyframe_parallax`` and ``keyframe_overlap``.
+        long_edge: of the image, pixels.
+        flow: median motion of the cells that are matched, pixels.
+        overlap: fraction of the keyframe's cells that are. In forward motion the cells that move
+            most leave the image or are not matched any more, so that the median motion of the rest
+            stays small while the overlap goes.
+        parallax: median of the motion without the rotation's, where it is known, pixels.
+        patience: it may come so much further.
     """
-    enough = config.keyframe_flow * (1 + patience)
-    if overlap < config.keyframe_overlap / (1 + patience):
-        enough *= LEAST_FLOW
-    return flow >= enough * long_edge
+    more = 1 + patience
+    enough = config.keyframe_parallax * more * long_edge
+    if overlap < config.keyframe_overlap / more and flow >= LEAST_FLOW * enough:
+        return True
+    if parallax is None:
+        return flow >= enough
+    return parallax >= enough or flow >= FARTHEST * more * long_edge
 
 
 def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
@@ -57,7 +77,7 @@ def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
 
 
 class KeyframeChoice:
-    """Says which frames become keyframes, from their motion, overlap and sharpness."""
+    """Says which frames become keyframes, from their parallax, overlap and sharpness."""
 
     def __init__(
         self, config: TrackingConfig, long_edge: int, recent: list[float] | None = None
@@ -80,14 +100,14 @@ class KeyframeChoice:
         """Wait until the latest frame has been noted."""
         self._concurrent.wait()
 
-    def calls_for(self, flow: float, overlap: float) -> bool:
+    def calls_for(self, flow: float, overlap: float, parallax: float | None = None) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
 
         A frame that is blurred compared with the latest ones waits for a sharper one, though not
         for long: nothing else sees what comes into view meanwhile.
         """
         patience = BLUR_WAIT if self._is_blurred() else 0.0
-        return calls_for_keyframe(self.config, self.long_edge, flow, overlap, patience)
+        return calls_for_keyframe(self.config, self.long_edge, flow, overlap, parallax, patience)
 
     def _note(self, value: float) -> None:
         self._recent.append(value)

@@ -39,7 +39,9 @@ class FrameMotion:
     match: FlowMatch
     """One edge, keyframe -> frame."""
     flow: float
-    """Median motion of the matched cells in pixels: what the motion filter goes by."""
+    """Median motion of the matched cells in pixels."""
+    parallax: float
+    """Median of that motion without what the camera's rotation does: what tells depth."""
     matched: float
     """Fraction of the keyframe's cells with a match that agrees with the pose."""
     overlap: float
@@ -117,15 +119,17 @@ class FrameLocator:
         )
         # All at once, so that a GPU is waited for once.
         found = torch.cat([T.reshape(-1), fit.to(T), seen.to(T)]).cpu()
-        _, agree, residual, flow, informed, known = found[16:22].tolist()
-        check = PhotometricCheck.of(found[22:24])
+        _, agree, residual, flow, parallax, informed, known = found[16:23].tolist()
+        check = PhotometricCheck.of(found[23:25])
         if agree < self.min_matched or not residual < self.max_residual:
             return None
         if not check.passes(self.min_ncc, is_expected):
             return None
         T_cw = found[:16].reshape(4, 4)
         overlap = agree / informed
-        return FrameMotion(keyframe.id, T_cw, match, flow, agree, overlap, known, residual, check)
+        return FrameMotion(
+            keyframe.id, T_cw, match, flow, parallax, agree, overlap, known, residual, check
+        )
 
     def locate_relative(
         self, keyframe: Keyframe, encoded: Any, T_rel: Float[Tensor, "4 4"] | None
