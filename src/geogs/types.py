@@ -144,6 +144,11 @@ class Trajectory:
             for t, o in zip(self.tracked, only, strict=True)
         ]
 
+    def of(self, state: FrameState) -> "Trajectory":
+        """The frames of which so much is known and no more."""
+        keep = np.array([known == state for known in self.states], bool)
+        return Trajectory(self.timestamps[keep], self.T_wc[keep], self.tracked[keep])
+
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
@@ -152,8 +157,8 @@ class Uncertainty:
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
     position: Float[np.ndarray, "n"]
-    """That of the camera's centre, map units, all axes together; relative to the first keyframe,
-    and to the length of the path."""
+    """That of the camera's centre, map units, all axes together: of what is left when the
+    trajectory is laid over the truth by a similarity."""
     rotation: Float[np.ndarray, "n"]
     """That of its orientation, radians."""
     depth: Float[np.ndarray, "n"]

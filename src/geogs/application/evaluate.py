@@ -27,8 +27,9 @@ from geogs.evaluation.trajectory_errors import (
     evaluate_trajectory,
 )
 from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
-from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.pose_files import has_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
+from geogs.io.writers.trajectories import ORIENTATIONS
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread
 
@@ -49,7 +50,11 @@ def evaluate(settings: EvalSettings) -> Evaluation:
     scene = read_true_scene(settings.gt)
     summary = _summary(settings.output)
     alignment = _alignment(settings, summary)
-    trajectory = _trajectory_errors(settings, "trajectory.tum", scene, alignment)
+    only_turns = (settings.output / ORIENTATIONS).is_file() and not has_poses(
+        settings.output / "trajectory.tum"
+    )
+    frames = ORIENTATIONS if only_turns else "trajectory.tum"
+    trajectory = _trajectory_errors(settings, frames, scene, alignment)
     keyframes = None
     if (settings.output / "keyframes.tum").is_file():
         with suppress(InputError):  # too few of them to align

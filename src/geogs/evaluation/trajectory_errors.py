@@ -124,8 +124,7 @@ def evaluate_trajectory(
     """ATE of the camera positions, as ``evo_ape tum -a(s)`` computes it.
 
     Poses are paired by time (:func:`associate`), the estimate is aligned (Sim(3) for monocular
-    runs, whose scale is free) and compared. Poses that are not finite are left out. Lost frames
-    (``tracked`` false) take part: their interpolated poses are part of the result. An estimate
+    runs, whose scale is free) and compared. Poses that are not finite are left out. An estimate
     that has orientations alone, all at one place, is aligned by these, at scale 1.
 
     Raises InputError if fewer than three poses match in time or the motion does not determine an

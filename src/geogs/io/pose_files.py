@@ -48,6 +48,11 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
     return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
 
 
+def has_poses(path: Path) -> bool:
+    """Whether there is any row in a file of poses, or it is damaged."""
+    return any(line.strip() and line[0] != "#" for line in read_text(path).splitlines())
+
+
 def poses_from(
     position: Float[np.ndarray, "n 3"], xyzw: Float[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 4 4"]:

@@ -15,6 +15,7 @@ from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
+from geogs.io.writers.trajectories import ORIENTATIONS
 from geogs.types import Trajectory
 from geogs_bench.results.record import StageName
 
@@ -111,9 +112,14 @@ class ResultFolder:
         return None if file is None else read_tum_trajectory(file)
 
     def poses(self) -> Trajectory | None:
-        """All poses of the result, whatever its last stage."""
-        file = self.path / "trajectory.tum"
-        return read_tum_trajectory(file) if file.is_file() else None
+        """All poses and orientations of the result, whatever its last stage, in order of time."""
+        files = [self.path / name for name in ("trajectory.tum", ORIENTATIONS)]
+        found = [read_tum_trajectory(file) for file in files if file.is_file()]
+        if not found:
+            return None
+        times = np.concatenate([t.timestamps for t in found])
+        order, T_wc = times.argsort(), np.concatenate([t.T_wc for t in found])
+        return Trajectory(times[order], T_wc[order], np.ones(len(times), bool))
 
     def uncertainty(self) -> FrameStates | None:
         """``trajectory_uncertainty.csv``; none where it is not there.

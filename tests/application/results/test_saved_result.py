@@ -1,5 +1,7 @@
 """A result that was written can be used again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,9 @@ from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.keyframe_folder import image_path, read_image
 from geogs.io.writers.map_file import save_map
+from geogs.io.writers.trajectories import write_trajectories
+from geogs.io.writers.uncertainty import write_uncertainty
+from geogs.types import Uncertainty
 from saved_results import (
     CAMERA,
     DEPTH_CAMERA,
@@ -81,8 +86,26 @@ def test_lost_frames_are_known_from_the_table(tmp_path):
     times = geogs.load_result(folder).trajectory.timestamps
     rows = [f"{float(t)!r},{'lost' if i == 1 else 'tracked'},1,1,1" for i, t in enumerate(times)]
     (folder / "trajectory_uncertainty.csv").write_text("\n".join(["timestamp,state", *rows]))
-    tracked = geogs.load_result(folder).trajectory.tracked
-    assert tracked.tolist() == [True, False, True, True, True]
+    found = geogs.load_result(folder).trajectory
+    assert found.tracked.tolist() == [True, False, True, True, True]
+
+
+def test_frames_without_a_place_come_back_between_the_others(tmp_path):
+    folder = make_result(tmp_path)
+    whole = geogs.load_result(folder).trajectory
+    tracked = np.array([True, False, True, False, True])
+    seen = replace(whole, tracked=tracked, oriented=np.array([False, True, False, False, False]))
+    write_trajectories(folder, seen, whole)
+    write_uncertainty(folder / "trajectory_uncertainty.csv", seen, Uncertainty(*np.zeros((4, 0))))
+    rows = (folder / "trajectory.tum").read_text().splitlines()[1:]
+    assert [float(row.split()[0]) for row in rows] == whole.timestamps[tracked].tolist()
+    (turned,) = (folder / "orientations.tum").read_text().splitlines()[1:]
+    assert turned.split()[:4] == [repr(float(whole.timestamps[1])), "0.0", "0.0", "0.0"]
+    found = geogs.load_result(folder).trajectory
+    assert found.states == ["tracked", "orientation only", "tracked", "lost", "tracked"]
+    np.testing.assert_allclose(found.T_wc[tracked], whole.T_wc[tracked], atol=1e-12)
+    np.testing.assert_allclose(found.T_wc[1, :3, :3], whole.T_wc[1, :3, :3], atol=1e-12)
+    assert np.ptp(found.T_wc[2:, :3, 3], axis=0).max() > 0
 
 
 def test_without_images_all_else_is_there(tmp_path):

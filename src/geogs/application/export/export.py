@@ -70,11 +70,11 @@ def export(settings: ExportSettings) -> Path:
         case "cloud":
             _write_cloud(path, result)
         case "kitti":
-            write_kitti(path, result.trajectory)
+            write_kitti(path, result.trajectory.of("tracked"))
         case "euroc":
-            write_euroc(path, result.trajectory)
+            write_euroc(path, result.trajectory.of("tracked"))
         case "tum":
-            write_tum_trajectory(path, result.trajectory)
+            write_tum_trajectory(path, result.trajectory.of("tracked"))
         case "glb" | "obj":
             _write_mesh(path, result, settings)
     return path

@@ -14,12 +14,12 @@ from geogs.io.writers.atomic import prepare_output_folder
 
 _FILES = (
     "summary.json", "eval.json", "trajectory.tum", "keyframes.tum", "trajectory_uncertainty.csv",
-    "intrinsics.json", "config.yaml", "mesh.ply", "splats.ply", "map.safetensors",
-    "depth_fusion/mesh.ply",
+    "orientations.tum", "intrinsics.json", "config.yaml", "mesh.ply", "splats.ply",
+    "map.safetensors", "depth_fusion/mesh.ply",
 )  # fmt: skip
 """In the order in which they go: the summary first, so that no half of a result has one."""
 _STAGES = ("online", "adjusted")
-_OF_A_STAGE = ("trajectory.tum", "keyframes.tum", "mesh.ply")
+_OF_A_STAGE = ("trajectory.tum", "orientations.tum", "keyframes.tum", "mesh.ply")
 _KEYFRAME = re.compile(r"\d{6,}\.(jpg|mask\.png)|rows\.safetensors")
 _REPORT = re.compile(r"\w+\.(png|html|css|js)")
 LOCK = ".geogs.lock"

@@ -15,6 +15,7 @@ from torch import Tensor
 from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.keyframe_folder import (
     image_path,
@@ -25,7 +26,8 @@ from geogs.io.writers.keyframe_folder import (
     rows_path,
 )
 from geogs.io.writers.map_file import MapViews, load_map_views
-from geogs.io.writers.uncertainty import read_tracked
+from geogs.io.writers.trajectories import ORIENTATIONS
+from geogs.io.writers.uncertainty import read_states
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
 from geogs.mesh.mesh_file import read_mesh
@@ -33,6 +35,7 @@ from geogs.mesh.triangle_mesh import Mesh
 from geogs.on_demand import OnDemand
 from geogs.shutter.rows import CELL
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.frames.interpolation import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 
 
@@ -65,11 +68,22 @@ class SavedResult:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of all frames. Raises InputError if their file is missing or damaged."""
-        trajectory = read_tum_trajectory(self.folder / "trajectory.tum")
+        """Poses of all frames; of those whose place is not known, between their neighbours.
+
+        Raises InputError if a file of them is missing or damaged.
+        """
+        placed = read_tum_trajectory(self.folder / "trajectory.tum")
         table = self.folder / "trajectory_uncertainty.csv"
-        tracked = read_tracked(table, trajectory.timestamps)
-        return Trajectory(trajectory.timestamps, trajectory.T_wc, tracked)
+        if not table.is_file():
+            return placed
+        T_cw = _by_time(placed)
+        if (self.folder / ORIENTATIONS).is_file():
+            T_cw |= _by_time(read_tum_trajectory(self.folder / ORIENTATIONS))
+        frames = read_states(table)
+        known = [T_cw.get(t) if state == "tracked" else None for t, state in frames]
+        turned = [T_cw.get(t) if state == "orientation only" else None for t, state in frames]
+        only = [None if T is None else T[:3, :3] for T in turned]
+        return bridged(np.array([t for t, _ in frames]), known, only)
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -180,6 +194,12 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
     if not (folder / "map.safetensors").is_file():
         raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
     return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
+
+
+def _by_time(trajectory: Trajectory) -> dict[float, Float[Tensor, "4 4"]]:
+    """World to camera at each time."""
+    T_cw = se3_inverse(torch.from_numpy(trajectory.T_wc))
+    return dict(zip(trajectory.timestamps.tolist(), T_cw, strict=True))
 
 
 def _check_size(path: Path, picture: np.ndarray, camera: Camera) -> None:

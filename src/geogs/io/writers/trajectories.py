@@ -9,14 +9,24 @@ from geogs.geometry.lie import matrix_to_quaternion
 from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory
 
+ORIENTATIONS = "orientations.tum"
+"""The file of the frames of which no more than the orientation is known."""
 _EUROC = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
 
 
 def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) -> None:
-    """``trajectory.tum`` and ``keyframes.tum`` of a result or one of its stages."""
-    write_tum_trajectory(folder / "trajectory.tum", frames)
+    """Write ``trajectory.tum`` and ``keyframes.tum`` of a result or one of its stages.
+
+    The first has the frames whose place is known. Those of which no more than the orientation is
+    known go to ``orientations.tum``, at the place 0 0 0, where there are any.
+    """
+    write_tum_trajectory(folder / "trajectory.tum", frames.of("tracked"))
+    turned = frames.of("orientation only")
+    if len(turned.timestamps):
+        turned.T_wc[:, :3, 3] = 0
+        write_tum_trajectory(folder / ORIENTATIONS, turned)
     write_tum_trajectory(folder / "keyframes.tum", keyframes)
 
 
@@ -24,7 +34,6 @@ def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write ``t tx ty tz qx qy qz qw`` of every pose.
 
     Reading it again gives the same numbers up to rounding.
-    Poses that were only interpolated are written as well; ``tracked`` has no place in the format.
     """
     wxyz = matrix_to_quaternion(torch.from_numpy(trajectory.T_wc[:, :3, :3])).numpy()
     rows = np.column_stack([

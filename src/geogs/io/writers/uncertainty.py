@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from geogs.documents import read_text
 from geogs.errors import InputError
@@ -52,10 +51,10 @@ def moved_rows(path: Path, factor: float, shift: float = 0.0) -> list[str]:
     return rows
 
 
-def read_tracked(path: Path, timestamps: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Which frames were tracked, by the table of a run; all of them where there is no table."""
-    if not path.is_file():
-        return np.ones(len(timestamps), dtype=bool)
-    cells = [line.split(",")[:2] for line in read_text(path).splitlines()[1:]]
-    states = {row[0]: row[1] for row in cells if len(row) == 2}
-    return np.array([states.get(repr(float(t))) != "lost" for t in timestamps], dtype=bool)
+def read_states(path: Path) -> list[tuple[float, str]]:
+    """Time and state of every frame, by the table of a run. Raises InputError if it is damaged."""
+    try:
+        cells = [row.split(",") for row in read_text(path).splitlines()[1:]]
+        return [(float(row[0]), row[1]) for row in cells]
+    except (ValueError, IndexError):
+        raise InputError(f"{path} is damaged; leave it out.") from None
