@@ -29,6 +29,8 @@ def test_a_good_run_says_how_good():
         "Trajectory and shape are reliable: the camera's place is known to 1.0% of the extent of "
         "its path, depths to 2.0%."
     )
+    best = verdict(walk(30, 30), walk(5, 5), known(0.00012, 0.02))
+    assert "known to 0.03% of the extent" in best.sentence
 
 
 @pytest.mark.parametrize(

@@ -80,14 +80,19 @@ def verdict(
         sentence = f"Not to be relied on: {'; '.join(reasons)}."
     else:
         sentence = (
-            f"Trajectory and shape are reliable: the camera's place is known to {position:.1%} of "
-            f"the extent of its path, depths to {depth:.1%}."
+            "Trajectory and shape are reliable: the camera's place is known to "
+            f"{_finely(position)} of the extent of its path, depths to {depth:.1%}."
         )
     return Verdict(not reasons, sentence, lost, orientation_only, position, rotation, depth)
 
 
 def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else float("inf")
+
+
+def _finely(value: float) -> str:
+    """In percent, of small parts the first digit."""
+    return f"{value:.1%}" if value >= 0.001 else f"{100 * value:.1g}%"
 
 
 def _percent(value: float) -> str:
