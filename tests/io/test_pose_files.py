@@ -9,11 +9,14 @@ import torch
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp
 from geogs.io.pose_files import (
+    read_frame_poses,
     read_poses,
     read_replica_trajectory,
     read_seven_scenes_poses,
     read_tum_trajectory,
 )
+from geogs.io.writers.trajectories import write_trajectories
+from geogs.types import Trajectory
 
 IDENTITY_ROW = "0 0 0 0 0 0 0 1"
 
@@ -138,3 +141,22 @@ def test_shared_sequences(shared_data):
     }
     for name, count in counts.items():
         assert len(read_poses(shared_data / name).timestamps) == count
+
+
+def test_frames_that_only_turned_are_read_with_the_others_or_alone(tmp_path):
+    T_wc = np.tile(np.eye(4), (3, 1, 1))
+    T_wc[:, 0, 3] = [1.0, 2.0, 3.0]
+    seen = Trajectory(np.arange(3.0), T_wc, np.array([1, 0, 0], bool), np.array([0, 1, 0], bool))
+    write_trajectories(tmp_path, seen, seen)
+    found = read_frame_poses(tmp_path)
+    assert found.states == ["tracked", "orientation only"]
+    assert found.timestamps.tolist() == [0.0, 1.0]
+    assert found.T_wc[:, 0, 3].tolist() == [1.0, 0.0]
+    turned = Trajectory(np.arange(3.0), T_wc, np.zeros(3, bool), np.ones(3, bool))
+    write_trajectories(tmp_path, turned, turned)
+    assert read_frame_poses(tmp_path).states == 3 * ["orientation only"]
+    lost = Trajectory(np.arange(3.0), T_wc, np.zeros(3, bool))
+    write_trajectories(tmp_path, lost, lost)
+    assert not (tmp_path / "orientations.tum").exists()
+    with pytest.raises(InputError):
+        read_frame_poses(tmp_path)

@@ -27,11 +27,11 @@ from geogs.evaluation.trajectory_errors import (
     evaluate_trajectory,
 )
 from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
-from geogs.io.pose_files import has_poses, read_tum_trajectory
+from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
-from geogs.io.writers.trajectories import ORIENTATIONS
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread
+from geogs.types import Trajectory
 
 _ICP_PROTOCOLS = ("samples", "vertex")
 """Those whose definition holds an alignment by ICP."""
@@ -50,15 +50,14 @@ def evaluate(settings: EvalSettings) -> Evaluation:
     scene = read_true_scene(settings.gt)
     summary = _summary(settings.output)
     alignment = _alignment(settings, summary)
-    only_turns = (settings.output / ORIENTATIONS).is_file() and not has_poses(
-        settings.output / "trajectory.tum"
-    )
-    frames = ORIENTATIONS if only_turns else "trajectory.tum"
-    trajectory = _trajectory_errors(settings, frames, scene, alignment)
+    frames = read_frame_poses(settings.output)
+    known = frames.of("tracked" if frames.tracked.any() else "orientation only")
+    trajectory = _trajectory_errors(settings, known, scene, alignment)
     keyframes = None
     if (settings.output / "keyframes.tum").is_file():
         with suppress(InputError):  # too few of them to align
-            keyframes = _trajectory_errors(settings, "keyframes.tum", scene, alignment)
+            mapped = read_tum_trajectory(settings.output / "keyframes.tum")
+            keyframes = _trajectory_errors(settings, mapped, scene, alignment)
     mesh_file, points_file = find_surface(settings) if settings.surface else (None, None)
     surface, photo = None, None
     if (settings.output / "mesh.ply").is_file() and (settings.surface or settings.photo):
@@ -108,11 +107,11 @@ def _alignment(settings: EvalSettings, summary: dict[str, object]) -> Alignment:
 
 
 def _trajectory_errors(
-    settings: EvalSettings, name: str, scene: TrueScene, alignment: Alignment
+    settings: EvalSettings, found: Trajectory, scene: TrueScene, alignment: Alignment
 ) -> TrajectoryErrors:
     """Errors of one of the trajectories in metres; its transform takes the map's unit to them."""
     # A map in the frame of the true poses has their unit; for others the factor is free.
-    estimate = scaled(read_tum_trajectory(settings.output / name), scene.metres)
+    estimate = scaled(found, scene.metres)
     errors = evaluate_trajectory(estimate, scene.trajectory, settings.max_diff, alignment)
     T = errors.T_ref_est @ np.diag([scene.metres] * 3 + [1.0])
     return replace(errors, T_ref_est=T, scale=errors.scale * scene.metres)

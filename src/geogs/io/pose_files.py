@@ -23,6 +23,8 @@ FRAMES_PER_SECOND = 30.0
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes x right, y down, z forward from x right, y up, z backward; it is its own inverse."""
 
+ORIENTATIONS = "orientations.tum"
+"""The file of a result with the frames of which no more than the orientation is known."""
 _log = logging.getLogger(__name__)
 _POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
 
@@ -48,8 +50,26 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
     return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
 
 
-def has_poses(path: Path) -> bool:
-    """Whether there is any row in a file of poses, or it is damaged."""
+def read_frame_poses(folder: Path) -> Trajectory:
+    """Frames of a result whose place is known, or no more than their orientation, in order of time.
+
+    Raises:
+        InputError: ``trajectory.tum`` is missing, a file is damaged, or no frame is known at all.
+    """
+    files = [folder / "trajectory.tum"]
+    if (folder / ORIENTATIONS).is_file():
+        files = [file for file in (*files, folder / ORIENTATIONS) if _has_rows(file)] or files
+    parts = [read_tum_trajectory(file) for file in files]
+    only = np.concatenate([
+        np.full(len(part.timestamps), file.name == ORIENTATIONS)
+        for part, file in zip(parts, files, strict=True)
+    ])  # fmt: skip
+    times = np.concatenate([part.timestamps for part in parts])
+    order, T_wc = times.argsort(kind="stable"), np.concatenate([part.T_wc for part in parts])
+    return Trajectory(times[order], T_wc[order], ~only[order], only[order])
+
+
+def _has_rows(path: Path) -> bool:
     return any(line.strip() and line[0] != "#" for line in read_text(path).splitlines())
 
 

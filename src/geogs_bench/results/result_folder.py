@@ -13,9 +13,8 @@ from geogs.documents import UNUSABLE, read_json, read_text
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
-from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
-from geogs.io.writers.trajectories import ORIENTATIONS
 from geogs.types import Trajectory
 from geogs_bench.results.record import StageName
 
@@ -113,13 +112,8 @@ class ResultFolder:
 
     def poses(self) -> Trajectory | None:
         """All poses and orientations of the result, whatever its last stage, in order of time."""
-        files = [self.path / name for name in ("trajectory.tum", ORIENTATIONS)]
-        found = [read_tum_trajectory(file) for file in files if file.is_file()]
-        if not found:
-            return None
-        times = np.concatenate([t.timestamps for t in found])
-        order, T_wc = times.argsort(), np.concatenate([t.T_wc for t in found])
-        return Trajectory(times[order], T_wc[order], np.ones(len(times), bool))
+        is_there = (self.path / "trajectory.tum").is_file()
+        return read_frame_poses(self.path) if is_there else None
 
     def uncertainty(self) -> FrameStates | None:
         """``trajectory_uncertainty.csv``; none where it is not there.

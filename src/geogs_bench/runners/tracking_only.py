@@ -14,7 +14,7 @@ from geogs.errors import TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-from geogs.io.writers.trajectories import write_tum_trajectory
+from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle
 from geogs.slam import Slam
@@ -57,7 +57,7 @@ def track_to_folder(
         global_bundle(slam.segments.main)
         trajectory = slam.trajectory()
         known = keyframe_uncertainty(slam.segments.main).calibrated(slam.segments.main)
-        write_tum_trajectory(folder / "trajectory.tum", trajectory)
+        write_trajectories(folder, trajectory, slam.keyframe_trajectory())
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)
         said = verdict(trajectory, slam.keyframe_trajectory(), known, slam.segments.table.why_not)

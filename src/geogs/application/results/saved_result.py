@@ -16,7 +16,7 @@ from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.pose_files import read_frame_poses
 from geogs.io.writers.keyframe_folder import (
     image_path,
     mask_path,
@@ -26,7 +26,6 @@ from geogs.io.writers.keyframe_folder import (
     rows_path,
 )
 from geogs.io.writers.map_file import MapViews, load_map_views
-from geogs.io.writers.trajectories import ORIENTATIONS
 from geogs.io.writers.uncertainty import read_states
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
@@ -72,13 +71,12 @@ class SavedResult:
 
         Raises InputError if a file of them is missing or damaged.
         """
-        placed = read_tum_trajectory(self.folder / "trajectory.tum")
+        poses = read_frame_poses(self.folder)
         table = self.folder / "trajectory_uncertainty.csv"
         if not table.is_file():
-            return placed
-        T_cw = _by_time(placed)
-        if (self.folder / ORIENTATIONS).is_file():
-            T_cw |= _by_time(read_tum_trajectory(self.folder / ORIENTATIONS))
+            return poses
+        T = se3_inverse(torch.from_numpy(poses.T_wc))
+        T_cw = dict(zip(poses.timestamps.tolist(), T, strict=True))
         frames = read_states(table)
         known = [T_cw.get(t) if state == "tracked" else None for t, state in frames]
         turned = [T_cw.get(t) if state == "orientation only" else None for t, state in frames]
@@ -194,12 +192,6 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
     if not (folder / "map.safetensors").is_file():
         raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
     return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
-
-
-def _by_time(trajectory: Trajectory) -> dict[float, Float[Tensor, "4 4"]]:
-    """World to camera at each time."""
-    T_cw = se3_inverse(torch.from_numpy(trajectory.T_wc))
-    return dict(zip(trajectory.timestamps.tolist(), T_cw, strict=True))
 
 
 def _check_size(path: Path, picture: np.ndarray, camera: Camera) -> None:

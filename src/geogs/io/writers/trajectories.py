@@ -6,11 +6,10 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import matrix_to_quaternion
+from geogs.io.pose_files import ORIENTATIONS
 from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory
 
-ORIENTATIONS = "orientations.tum"
-"""The file of the frames of which no more than the orientation is known."""
 _EUROC = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
@@ -27,6 +26,8 @@ def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) 
     if len(turned.timestamps):
         turned.T_wc[:, :3, 3] = 0
         write_tum_trajectory(folder / ORIENTATIONS, turned)
+    else:
+        (folder / ORIENTATIONS).unlink(missing_ok=True)  # of an earlier result
     write_tum_trajectory(folder / "keyframes.tum", keyframes)
 
 
