@@ -15,11 +15,12 @@ from geogs.application.result_settings import EvalSettings
 from geogs.cli.eval import main
 from geogs.errors import InputError
 from geogs.geometry.lie import so3_exp
-from geogs.io.pose_files import read_poses
+from geogs.io.pose_files import read_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_tum_trajectory
-from geogs.types import Trajectory
+from geogs.io.writers.uncertainty import write_uncertainty
+from geogs.types import Trajectory, Uncertainty
 
 pytestmark = pytest.mark.system
 
@@ -136,6 +137,45 @@ def test_results_of_known_poses_are_not_aligned(result):
     assert "<td>60</td>" in (out / "report" / "index.html").read_text()
     again = evaluate(EvalSettings(output=out, gt=truth, plots=False, alignment="se3"))
     assert again.trajectory.ate_rmse_cm < 1e-6
+
+
+def test_errors_are_laid_beside_what_the_run_said_of_them(result, capfd):
+    truth, out = result
+    found = read_tum_trajectory(out / "trajectory.tum")
+    found.T_wc[:, :3, 3] += np.random.default_rng(0).normal(size=(60, 3)) * 0.01 / 4
+    write_tum_trajectory(out / "trajectory.tum", found)
+    states = replace(found, tracked=np.arange(60) < 50, oriented=None)
+    said = np.full(1, 0.01 * 3**0.5 / 4)
+    write_uncertainty(
+        out / "trajectory_uncertainty.csv", states, Uncertainty(np.zeros(1), said, said, said)
+    )
+    write_tum_trajectory(out / "trajectory.tum", states.of("tracked"))
+    (out / "mesh.ply").unlink()
+    assert main([str(out), "--gt", str(truth)]) == 0
+    assert "frames within 2 sigma (%)" in capfd.readouterr().out
+    numbers = json.loads((out / "eval.json").read_text())
+    told = numbers["reliability"]
+    assert told["frames"] == 50
+    assert told["within_two_sigma"] > 0.95
+    assert told["error_per_sigma"] == pytest.approx(1, abs=0.2)
+    assert np.abs(np.subtract(told["observed"], told["foretold"])).max() < 0.2
+    assert numbers["trajectory"]["rotations"] == "absolute"
+    assert numbers["doubts"] == []
+    assert "Are errors as large as foretold?" in (out / "report" / "index.html").read_text()
+
+
+def test_what_speaks_against_a_comparison_is_said_before_anything_else(result, capfd):
+    truth, out = result
+    found = read_tum_trajectory(out / "trajectory.tum")
+    slow = replace(found, timestamps=6 * found.timestamps)  # five frames a second
+    write_tum_trajectory(out / "trajectory.tum", slow)
+    (out / "mesh.ply").unlink()
+    good = {"verdict": {"sentence": "All is well.", "is_reliable": True}}
+    (out / "summary.json").write_text(json.dumps(good))
+    assert main([str(out), "--gt", str(truth), "--no-plots"]) == 0
+    assert "Only 10 of 60 poses match in time" in capfd.readouterr().err.replace("\n", " ")
+    page = (out / "report" / "index.html").read_text()
+    assert page.index('verdict bad">Only 10 of 60') < page.index("All is well.")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from geogs.bundle.gauge import deviations_after_alignment
-from geogs.evaluation.trajectory_errors import best_rotation, rotation_angle
+from geogs.evaluation.rotation_errors import best_rotation, rotation_angle
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama
 

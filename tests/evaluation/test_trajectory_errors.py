@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs.evaluation.trajectory_errors import associate, evaluate_trajectory, rotation_angle
+from geogs.evaluation.rotation_errors import rotation_angle
+from geogs.evaluation.trajectory_errors import associate, evaluate_trajectory
 from geogs.geometry.lie import se3_exp, so3_exp
 from geogs.io.pose_files import read_poses
 from geogs.io.writers.trajectories import write_tum_trajectory

@@ -9,7 +9,7 @@ import pytest
 
 from geogs.config import Config, TrackingConfig
 from geogs.errors import TrackingLost
-from geogs.evaluation.trajectory_errors import rotation_angle
+from geogs.evaluation.rotation_errors import rotation_angle
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.segment_trackers import Segments

@@ -17,9 +17,11 @@ from geogs.application.results.result_page import shown_model, shown_views
 from geogs.application.results.saved_result import load_result
 from geogs.documents import read_json
 from geogs.errors import InputError
+from geogs.evaluation.doubts import doubts
 from geogs.evaluation.model_view.shown_model import Colouring, Legend, ShownModel
 from geogs.evaluation.pages.evaluation_page import SAME_POSES_CM, Evaluation, write_report
 from geogs.evaluation.pages.run_page import PICTURES, figures, run_figures, run_sections
+from geogs.evaluation.reliability import Reliability, reliability
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.evaluation.trajectory_errors import (
     Alignment,
@@ -29,6 +31,7 @@ from geogs.evaluation.trajectory_errors import (
 from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
 from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
+from geogs.io.writers.uncertainty import read_states
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread
 from geogs.types import Trajectory
@@ -77,8 +80,11 @@ def evaluate(settings: EvalSettings) -> Evaluation:
         "cull": settings.cull,
         "seed": settings.seed,
     }
-    evaluation = Evaluation(trajectory, keyframes, scores, compared, photo)
-    pictures = _draw(settings, trajectory, surface) if settings.plots else _run_pictures(settings)
+    is_metric = str(summary.get("scale", "")).startswith("metric")
+    against = doubts(trajectory, known, scene.trajectory, settings.max_diff, is_metric)
+    told = _reliability(settings.output, trajectory)
+    evaluation = Evaluation(trajectory, keyframes, scores, compared, photo, told, tuple(against))
+    pictures = _draw(settings, evaluation, surface) if settings.plots else _run_pictures(settings)
     page = settings.output / "report" / "index.html"
     title = str(summary.get("source", settings.output.resolve().name))
     run = run_sections(summary) if summary else []
@@ -117,6 +123,19 @@ def _trajectory_errors(
     return replace(errors, T_ref_est=T, scale=errors.scale * scene.metres)
 
 
+def _reliability(output: Path, errors: TrajectoryErrors) -> Reliability | None:
+    """The errors of the frames beside what the run said of them; none where it said nothing.
+
+    What it says is what a similarity leaves of the errors, so another alignment has none.
+    """
+    table = output / "trajectory_uncertainty.csv"
+    if errors.alignment != "sim3" or not table.is_file():
+        return None
+    known = np.array([(t, s) for t, state, s in read_states(table) if state == "tracked"])
+    times, sigma = known.reshape(-1, 2).T
+    return reliability(errors.timestamps, errors.position_error, times, errors.scale * sigma)
+
+
 def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
     """Files of the true mesh and the seen points: as given, else beside the poses or above."""
     for path in (settings.gt_mesh, settings.gt_points):
@@ -134,7 +153,7 @@ def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
 
 
 def _draw(
-    settings: EvalSettings, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
+    settings: EvalSettings, evaluation: Evaluation, surface: SurfaceComparison | None
 ) -> list[tuple[str, Path]]:
     """Pictures of this command, then those that the run left; titles and files."""
     from geogs.evaluation.pages import plots
@@ -142,11 +161,15 @@ def _draw(
 
     folder = settings.output / "report"
     titles: dict[str, str] = {}
+    trajectory = evaluation.trajectory
     if trajectory.ate_max_cm > SAME_POSES_CM:
         plots.plot_trajectory(folder / "trajectory_truth.png", trajectory)
         plots.plot_error_over_time(folder / "trajectory_error.png", trajectory)
         titles["trajectory_truth.png"] = "Trajectory over the truth"
         titles["trajectory_error.png"] = "Error over time"
+    if evaluation.reliability is not None:
+        plots.plot_reliability(folder / "reliability.png", evaluation.reliability)
+        titles["reliability.png"] = "Are errors as large as foretold?"
     if surface is not None:
         mesh, truth, limit = surface.mesh, surface.truth, surface.scores.colour_limit_cm
         camera = read_camera(settings.output / "intrinsics.json")

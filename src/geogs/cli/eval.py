@@ -15,5 +15,8 @@ def main(argv: Sequence[str]) -> int:
     from geogs.application.evaluate import evaluate
     from geogs.evaluation.pages.evaluation_page import table
 
-    Console().print(table(evaluate(options)))
+    evaluation = evaluate(options)
+    Console().print(table(evaluation))
+    for sentence in evaluation.doubts:
+        Console(stderr=True).print(f"warning: {sentence}", style="bold red", highlight=False)
     return 0

@@ -8,12 +8,22 @@ import torch
 from jaxtyping import Float, Int
 
 from geogs.errors import GeogsError, InputError
-from geogs.geometry.nearest_rotation import nearest_rotation
+from geogs.evaluation.rotation_errors import (
+    best_rotation,
+    relative_rotation_error,
+    rotation_angle,
+    stretches,
+)
 from geogs.geometry.umeyama import umeyama
 from geogs.threads import on_one_torch_thread
 from geogs.types import Trajectory
 
 Alignment = Literal["sim3", "se3", "none"]
+
+STRETCH = 0.1
+"""Length of the stretches over which relative rotations are compared, of the whole path."""
+MAX_ROLL = 5.0
+"""Degrees by which alignment may leave the world's rotation open for absolute ones to count."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +40,15 @@ class TrajectoryErrors:
     ate_std_cm: float
     rotation_rmse_deg: float
     """Angle between aligned and true orientation, root mean square."""
+    relative_rotation_rmse_deg: float | None
+    """That between the estimated and the true rotation over stretches of the path, whatever the
+    alignment; none where the reference does not move."""
+    stretch_m: float
+    """Length of these stretches."""
+    roll_deg: float
+    """About how far the alignment may be turned about the line that the path is nearest to: the
+    angle under which the position error is seen at the path's distance from it; 0 where positions
+    do not align."""
     scale: float
     """Length in the reference per length in the estimate."""
     alignment: Alignment
@@ -48,15 +67,27 @@ class TrajectoryErrors:
     """Metres, per pair."""
     rotation_error: Float[np.ndarray, "n"]
     """Degrees, per pair."""
+    relative_rotation_error: Float[np.ndarray, "n"]
+    """Degrees, over the stretch that begins with each pair; NaN where none does."""
     aligned: Float[np.ndarray, "n 4 4"]
     """Estimated camera-to-world poses in the reference frame."""
     truth: Float[np.ndarray, "n 4 4"]
 
+    @property
+    def rotations(self) -> tuple[str, Float[np.ndarray, "n"], float]:
+        """Which rotation errors count, absolute or relative; they, and their root mean square.
+
+        The absolute ones do where the alignment is determined well enough.
+        """
+        if self.roll_deg <= MAX_ROLL or self.relative_rotation_rmse_deg is None:
+            return "absolute", self.rotation_error, self.rotation_rmse_deg
+        return "relative", self.relative_rotation_error, self.relative_rotation_rmse_deg
+
     def as_dict(self) -> dict[str, Any]:
         """The numbers without the per-pose arrays, for JSON."""
-        arrays = {"timestamps", "position_error", "rotation_error", "aligned", "truth"}
-        items = {k: getattr(self, k) for k in self.__dataclass_fields__ if k not in arrays}
-        return items | {"T_ref_est": self.T_ref_est.tolist()}
+        values = {k: getattr(self, k) for k in self.__dataclass_fields__}
+        items = {k: v for k, v in values.items() if not isinstance(v, np.ndarray)}
+        return items | {"T_ref_est": self.T_ref_est.tolist(), "rotations": self.rotations[0]}
 
 
 def associate(
@@ -107,13 +138,6 @@ def align_orientations(
     return T
 
 
-def best_rotation(
-    estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Rotation of the world of some orientations that takes them nearest to others."""
-    return nearest_rotation((reference @ estimate.transpose(0, 2, 1)).sum(0))
-
-
 @on_one_torch_thread
 def evaluate_trajectory(
     estimate: Trajectory,
@@ -135,7 +159,8 @@ def evaluate_trajectory(
     if len(i) < 3:
         raise InputError(_no_match(reference, estimate, len(i), max_difference))
     truth, guess = reference.T_wc[i], estimate.T_wc[j]
-    if (guess[:, :3, 3] == guess[0, :3, 3]).all() and alignment != "none":
+    by_positions = alignment != "none" and not (guess[:, :3, 3] == guess[0, :3, 3]).all()
+    if alignment != "none" and not by_positions:
         T, scale = align_orientations(guess, truth), 1.0
     else:
         try:
@@ -147,7 +172,13 @@ def evaluate_trajectory(
     aligned[:, :3, :3] = T[:3, :3] / scale @ guess[:, :3, :3]
     error = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
     angle = rotation_angle(aligned[:, :3, :3], truth[:, :3, :3])
-    steps = np.diff(truth[np.argsort(reference.timestamps[i]), :3, 3], axis=0)
+    order = np.argsort(reference.timestamps[i])
+    steps = np.linalg.norm(np.diff(truth[order, :3, 3], axis=0), axis=1)
+    path = float(steps.sum())
+    relative = np.full(len(i), np.nan)
+    if path > 0:
+        first, last = (order[k] for k in stretches(np.r_[0, steps.cumsum()], STRETCH * path))
+        relative[first] = relative_rotation_error(guess[:, :3, :3], truth[:, :3, :3], first, last)
     return TrajectoryErrors(
         ate_rmse_cm=100 * float(np.sqrt((error**2).mean())),
         ate_mean_cm=100 * float(error.mean()),
@@ -155,27 +186,29 @@ def evaluate_trajectory(
         ate_max_cm=100 * float(error.max()),
         ate_std_cm=100 * float(error.std()),
         rotation_rmse_deg=float(np.sqrt((angle**2).mean())),
+        relative_rotation_rmse_deg=float(np.sqrt(np.nanmean(relative**2))) if path > 0 else None,
+        stretch_m=STRETCH * path,
+        roll_deg=_roll(truth[:, :3, 3], error) if by_positions else 0.0,
         scale=scale,
         alignment=alignment,
         pairs=len(i),
         estimated=len(estimate.timestamps),
         reference=len(reference.timestamps),
-        path_length_m=float(np.linalg.norm(steps, axis=1).sum()),
+        path_length_m=path,
         T_ref_est=T,
         timestamps=reference.timestamps[i],
         position_error=error,
         rotation_error=angle,
+        relative_rotation_error=relative,
         aligned=aligned,
         truth=truth,
     )
 
 
-def rotation_angle(
-    a: Float[np.ndarray, "n 3 3"], b: Float[np.ndarray, "n 3 3"]
-) -> Float[np.ndarray, "n"]:
-    """Angle between rotations in degrees; accurate near zero, where arccos of the trace is not."""
-    chord = np.linalg.norm(a - b, axis=(1, 2)) / 8**0.5
-    return np.degrees(2 * np.arcsin(np.clip(chord, 0, 1)))
+def _roll(positions: Float[np.ndarray, "n 3"], error: Float[np.ndarray, "n"]) -> float:
+    """Angle in degrees under which the error is seen at the distance of a path from its line."""
+    across = np.linalg.svd(positions - positions.mean(0), compute_uv=False)[1:]
+    return float(np.degrees(np.arctan2(np.linalg.norm(error), np.linalg.norm(across))))
 
 
 def finite_poses(trajectory: Trajectory) -> Trajectory:

@@ -1,6 +1,5 @@
 """Reading the folder that ``geogs run`` or ``geogs reconstruct`` leaves."""
 
-import csv
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,12 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from geogs.documents import UNUSABLE, read_json, read_text
+from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
+from geogs.io.writers.uncertainty import read_states
 from geogs.types import Trajectory
 from geogs_bench.results.record import StageName
 
@@ -123,15 +123,9 @@ class ResultFolder:
         file = self.path / "trajectory_uncertainty.csv"
         if not file.is_file():
             return None
-        try:
-            rows = list(csv.DictReader(read_text(file).splitlines()))
-            return FrameStates(
-                np.array([float(row["timestamp"]) for row in rows]),
-                np.array([row["state"] or "" for row in rows]),
-                np.array([float(row["sigma_position"] or "inf") for row in rows]),
-            )
-        except (csv.Error, *UNUSABLE):
-            raise InputError(f"{file} is damaged; run again to write it anew.") from None
+        rows = read_states(file)
+        times, states, sigma = zip(*rows, strict=True) if rows else ((), (), ())
+        return FrameStates(np.array(times, float), np.array(states, str), np.array(sigma, float))
 
     def snapshots(self) -> list[tuple[float, Path]]:
         """Folders of the map after so many seconds, in order of time."""

@@ -6,13 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.errors import InputError
-from geogs.evaluation.trajectory_errors import (
-    associate,
-    best_rotation,
-    evaluate_trajectory,
-    finite_poses,
-    rotation_angle,
-)
+from geogs.evaluation.rotation_errors import best_rotation, rotation_angle
+from geogs.evaluation.trajectory_errors import associate, evaluate_trajectory, finite_poses
 from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses

@@ -78,10 +78,10 @@ class SavedResult:
         T = se3_inverse(torch.from_numpy(poses.T_wc))
         T_cw = dict(zip(poses.timestamps.tolist(), T, strict=True))
         frames = read_states(table)
-        known = [T_cw.get(t) if state == "tracked" else None for t, state in frames]
-        turned = [T_cw.get(t) if state == "orientation only" else None for t, state in frames]
+        known = [T_cw.get(t) if state == "tracked" else None for t, state, _ in frames]
+        turned = [T_cw.get(t) if state == "orientation only" else None for t, state, _ in frames]
         only = [None if T is None else T[:3, :3] for T in turned]
-        return bridged(np.array([t for t, _ in frames]), known, only)
+        return bridged(np.array([t for t, _, _ in frames]), known, only)
 
     @cached_property
     def summary(self) -> dict[str, Any]:

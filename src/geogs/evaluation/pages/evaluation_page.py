@@ -17,6 +17,7 @@ from geogs.evaluation.pages.page import (
     TextSection,
     write_page,
 )
+from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.photoconsistency import PhotoScores
 from geogs.evaluation.surfaces.surface_errors import SurfaceScores
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
@@ -33,7 +34,7 @@ SAME_POSES_CM = 1e-4
 class Evaluation:
     """All errors of a result; a part is none where its truth or its file was not there."""
 
-    trajectory: TrajectoryErrors | None
+    trajectory: TrajectoryErrors
     """Errors of every frame."""
     keyframes: TrajectoryErrors | None
     """Errors of the keyframes alone, with an alignment of their own."""
@@ -42,12 +43,18 @@ class Evaluation:
     """What was compared and how."""
     photo: PhotoScores | None = None
     """How well the images agree on the surface."""
+    reliability: Reliability | None = None
+    """The errors of all frames beside what the run said of them; none where it said nothing."""
+    doubts: tuple[str, ...] = ()
+    """What speaks against the comparison, in sentences."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
-            "trajectory": self.trajectory and self.trajectory.as_dict(),
+            "doubts": self.doubts,
+            "trajectory": self.trajectory.as_dict(),
             "keyframes": self.keyframes and self.keyframes.as_dict(),
+            "reliability": self.reliability and self.reliability.as_dict(),
             "reconstruction": self.reconstruction and asdict(self.reconstruction),
             "photoconsistency": self.photo and asdict(self.photo),
             "settings": self.settings,
@@ -67,7 +74,16 @@ def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:
     for name, errors in named.items():
         if errors is not None:
             trajectory += _trajectory_rows(name, errors)
-    return [*result, ("Trajectory", trajectory)] if trajectory else result
+    result.append(("Trajectory", trajectory))
+    told = evaluation.reliability
+    if told is not None:
+        rows = [
+            ("frames within 2 sigma (%)", f"{100 * told.within_two_sigma:.1f}"),
+            ("  error / sigma, RMS", f"{told.error_per_sigma:.2f}"),
+            ("  frames compared", f"{len(told.error)}"),
+        ]
+        result.append(("What the run said of its positions", rows))
+    return result
 
 
 def table(evaluation: Evaluation) -> "Table":
@@ -111,7 +127,8 @@ def write_report(
     write_text(json_file, json.dumps(evaluation.as_dict(), indent=2, default=str) + "\n")
     judged = judged or FiguresSection("", None, ())
     numbers = [*error_figures(evaluation), *judged.figures]
-    sections: list[Section] = [FiguresSection(judged.sentence, judged.is_good, numbers)]
+    sections: list[Section] = [FiguresSection(said, False, ()) for said in evaluation.doubts]
+    sections += [FiguresSection(judged.sentence, judged.is_good, numbers)]
     sections += [HtmlSection(model_html(model))] if model is not None else []
     sections += [TableSection(heading, (), rows) for heading, rows in groups(evaluation)]
     sections += [PictureSection(title, file) for title, file in pictures]
@@ -125,8 +142,10 @@ def error_figures(evaluation: Evaluation) -> list[tuple[str, str]]:
     """The errors that matter most."""
     result = []
     path = evaluation.trajectory
-    if path is not None and path.ate_max_cm > SAME_POSES_CM:
+    if path.ate_max_cm > SAME_POSES_CM:
         result.append(("ATE RMSE", f"{path.ate_rmse_cm:.2f} cm"))
+    if evaluation.reliability is not None:
+        result.append(("within 2 sigma", f"{evaluation.reliability.within_two_sigma:.1%}"))
     if evaluation.reconstruction is not None:
         rows = [row for row in evaluation.reconstruction.rows() if not row[0].startswith(" ")]
         result += rows[:3]
@@ -141,9 +160,15 @@ def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str
         (f"ATE RMSE, {name}, {how} aligned (cm)", f"{errors.ate_rmse_cm:.3f}"),
         ("  mean / median / max (cm)", f"{errors.ate_mean_cm:.3f} / {errors.ate_median_cm:.3f} / "
          f"{errors.ate_max_cm:.3f}"),
-        ("  rotation RMSE (deg)", f"{errors.rotation_rmse_deg:.3f}"),
+        _rotation_row(errors),
         ("  scale (m per map unit)", f"{errors.scale:.5f}"),
         ("  poses compared / estimated / true", f"{errors.pairs} / {errors.estimated} / "
          f"{errors.reference}"),
         ("  path length (m)", f"{errors.path_length_m:.2f}"),
     ]  # fmt: skip
+
+
+def _rotation_row(errors: TrajectoryErrors) -> tuple[str, str]:
+    which, _, rmse = errors.rotations
+    over = f", over {errors.stretch_m:.3g} m" if which == "relative" else ""
+    return f"  rotation RMSE, {which}{over} (deg)", f"{rmse:.3f}"

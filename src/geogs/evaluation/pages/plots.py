@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from geogs.evaluation.pages.shading import Sight, Viewpoint, level_axes, look
+from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.surface import Surface
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
 from geogs.io.writers.atomic import atomic_file
@@ -46,24 +47,44 @@ def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
 
 
 def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
-    """Position error in cm and rotation error in degrees against time."""
+    """Position error in cm and rotation error in degrees against time.
+
+    Rotations are those that count: absolute, or over the stretch that begins with each pose.
+    """
     figure = new_figure(10.0, 4.2)
     order = np.argsort(errors.timestamps)
     time = errors.timestamps[order] - errors.timestamps[order[0]]
+    which, rotation, rotation_rmse = errors.rotations
     rows = (
         ("position error (cm)", 100 * errors.position_error, errors.ate_rmse_cm),
-        ("rotation error (deg)", errors.rotation_error, errors.rotation_rmse_deg),
+        (f"{which} rotation error (deg)", rotation, rotation_rmse),
     )
     for row, (label, values, rmse) in enumerate(rows):
         plot = figure.add_subplot(2, 1, row + 1)
         plot.plot(time, values[order], color=_ESTIMATE, lw=1)
         plot.axhline(rmse, color=_TRUTH, ls="--", lw=1, label=f"RMSE {rmse:.3g}")
         plot.set_ylabel(label)
-        plot.set_ylim(0, 1.15 * max(float(values.max()), 1e-9))
+        plot.set_ylim(0, 1.15 * max(float(np.nanmax(values)), 1e-9))
         plot.margins(x=0.01)
         plot.legend(loc="upper right")
         plot.grid(alpha=0.3)
     plot.set_xlabel("time (s)")
+    save_figure(figure, path)
+
+
+def plot_reliability(path: Path, told: Reliability) -> None:
+    """Reliability diagram: parts of the frames that lie as near as foretold, for all such parts."""
+    figure = new_figure(5.2, 4.6)
+    plot = figure.add_subplot(1, 1, 1)
+    foretold = np.linspace(0, 1, 201)
+    plot.plot([0, 1], [0, 1], color=_TRUTH, ls="--", lw=1, label="as foretold")
+    plot.plot(foretold, told.observed(foretold), color=_ESTIMATE, lw=2, label="observed")
+    plot.text(0.03, 0.8, "above the line: errors smaller than said", color=_TRUTH)
+    plot.text(0.97, 0.2, "below: larger", color=_TRUTH, ha="right")
+    plot.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    plot.set(xlabel="foretold part of the frames", ylabel="observed part of the frames")
+    plot.legend(loc="lower right")
+    plot.grid(alpha=0.3)
     save_figure(figure, path)
 
 

@@ -51,10 +51,11 @@ def moved_rows(path: Path, factor: float, shift: float = 0.0) -> list[str]:
     return rows
 
 
-def read_states(path: Path) -> list[tuple[float, str]]:
-    """Time and state of every frame, by the table of a run. Raises InputError if it is damaged."""
+def read_states(path: Path) -> list[tuple[float, str, float]]:
+    """Time, state and standard deviation of the position (infinite where none is given) of every
+    frame, by the table of a run. Raises InputError if it is damaged."""
     try:
         cells = [row.split(",") for row in read_text(path).splitlines()[1:]]
-        return [(float(row[0]), row[1]) for row in cells]
+        return [(float(row[0]), row[1], float(row[2] or "inf")) for row in cells]
     except (ValueError, IndexError):
         raise InputError(f"{path} is damaged; leave it out.") from None

@@ -1,0 +1,105 @@
+"""What speaks against the comparison of two trajectories, in sentences."""
+
+import numpy as np
+from jaxtyping import Float
+
+from geogs.evaluation.trajectory_errors import MAX_ROLL, TrajectoryErrors
+from geogs.types import Trajectory
+
+FEWEST_MATCHED = 0.5
+"""Part of the shorter trajectory whose poses have to match in time."""
+FEWEST_PAIRS = 8
+"""Poses below which a similarity fits nearly anything."""
+MAX_ERROR = 0.5
+"""Error, of the extent of the true path, beyond which the two have little in common."""
+MAX_SPEED = 150.0
+"""Metres a second at which hardly any camera moves."""
+MAX_FACTOR = 1.5
+"""Factor between the sizes of two paths that are both said to be in metres."""
+
+
+def doubts(
+    errors: TrajectoryErrors,
+    estimate: Trajectory,
+    reference: Trajectory,
+    max_difference: float,
+    is_metric: bool,
+) -> list[str]:
+    """Why the errors may not mean what they seem to; empty where nothing speaks against them.
+
+    Args:
+        errors: of the two trajectories that follow.
+        estimate: in any unit.
+        reference: in metres.
+        max_difference: of the times of poses that were compared, seconds.
+        is_metric: whether the estimate claims to be in metres.
+    """
+    said = [_of_times(errors, estimate, reference, max_difference)]
+    said.append("" if errors.alignment == "none" else _of_alignment(errors))
+    said += [_of_size(errors, is_metric or errors.alignment == "se3"), _of_speed(errors)]
+    return [sentence for sentence in said if sentence]
+
+
+def _of_times(
+    errors: TrajectoryErrors, estimate: Trajectory, reference: Trajectory, max_difference: float
+) -> str:
+    fewer = min(errors.estimated, errors.reference)
+    if errors.pairs >= FEWEST_MATCHED * fewer:
+        return ""
+    return (
+        f"Only {errors.pairs} of {fewer} poses match in time, and nothing else is compared: the "
+        f"estimate is from {_span(estimate)}, the truth from {_span(reference)}. Give true poses "
+        f"by the same clock (files without times count 30 a second), or --max-diff above "
+        f"{max_difference:g}."
+    )
+
+
+def _of_alignment(errors: TrajectoryErrors) -> str:
+    if errors.pairs < FEWEST_PAIRS:
+        return f"{errors.pairs} poses are so few that a similarity fits them whatever they are."
+    extent = _extent(errors.truth)
+    if 0.01 * errors.ate_rmse_cm > MAX_ERROR * extent:
+        return (
+            f"The error is {errors.ate_rmse_cm / max(extent, 1e-9):.0f} % of the true path's "
+            "extent: they have hardly anything in common, or the camera hardly moved. The "
+            "alignment means nothing then, nor does what follows from it."
+        )
+    if errors.roll_deg > MAX_ROLL:
+        return (
+            "The true path is so straight that the alignment leaves the rotation about it open by "
+            f"some {errors.roll_deg:.0f} degrees: rotations are compared from pose to pose, and a "
+            "surface may lie turned about the path."
+        )
+    return ""
+
+
+def _of_size(errors: TrajectoryErrors, is_metric: bool) -> str:
+    ratio = max(_extent(errors.truth), 1e-9) / max(_extent(errors.aligned), 1e-9)
+    factor = errors.scale if errors.alignment == "sim3" else ratio
+    if not is_metric or 1 / MAX_FACTOR < factor < MAX_FACTOR:
+        return ""
+    return (
+        f"The true path is {factor:.3g} times as large as the estimated one, though both should be "
+        "in metres."
+    )
+
+
+def _of_speed(errors: TrajectoryErrors) -> str:
+    seconds = float(np.ptp(errors.timestamps))
+    if errors.path_length_m <= MAX_SPEED * seconds:
+        return ""
+    return (
+        f"The true camera moves {errors.path_length_m / max(seconds, 1e-9):.0f} metres a second: "
+        "true poses should be in metres, and their times in seconds."
+    )
+
+
+def _extent(T_wc: Float[np.ndarray, "n 4 4"]) -> float:
+    """Root of the mean squared distance from the middle."""
+    places = T_wc[:, :3, 3]
+    return float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
+
+
+def _span(trajectory: Trajectory) -> str:
+    times = trajectory.timestamps
+    return f"{times.min():.6g} to {times.max():.6g} s"

@@ -1,0 +1,48 @@
+"""How far orientations are from the true ones: aligned by themselves, or from pose to pose."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from geogs.geometry.nearest_rotation import nearest_rotation
+
+
+def rotation_angle(
+    a: Float[np.ndarray, "n 3 3"], b: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "n"]:
+    """Angle between rotations in degrees; accurate near zero, where arccos of the trace is not."""
+    chord = np.linalg.norm(a - b, axis=(1, 2)) / 8**0.5
+    return np.degrees(2 * np.arcsin(np.clip(chord, 0, 1)))
+
+
+def best_rotation(
+    estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world of some orientations that takes them nearest to others."""
+    return nearest_rotation((reference @ estimate.transpose(0, 2, 1)).sum(0))
+
+
+def stretches(
+    along: Float[np.ndarray, "n"], length: float
+) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+    """First and last pose of the stretch of so much ``length`` that begins at each pose.
+
+    ``along`` is the way to each pose, ascending; one with less before it begins no stretch.
+    """
+    last = np.searchsorted(along, along + length * (1 - 1e-9))
+    first = np.flatnonzero(last < len(along))
+    return first, last[first]
+
+
+def relative_rotation_error(
+    estimate: Float[np.ndarray, "n 3 3"],
+    truth: Float[np.ndarray, "n 3 3"],
+    first: Int[np.ndarray, "m"],
+    last: Int[np.ndarray, "m"],
+) -> Float[np.ndarray, "m"]:
+    """Angle in degrees between what both say of the rotation from ``first`` to ``last``.
+
+    It is the rotation of the relative pose error (RPE; Sturm et al. 2012), which does not depend on
+    how the trajectories are aligned.
+    """
+    found, true = (R[first].transpose(0, 2, 1) @ R[last] for R in (estimate, truth))
+    return rotation_angle(found, true)
