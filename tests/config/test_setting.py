@@ -99,6 +99,13 @@ def test_bounds_belong_to_a_range_or_end_it(kind: type, name: str, setting: Kind
                 made(kind, name, wrapped(setting, setting.base(bound)))
 
 
+@pytest.mark.parametrize(("kind", "name", "setting"), NUMBERS)
+def test_no_number_but_a_time_may_be_so_small_that_it_is_nothing(kind, name, setting) -> None:
+    is_time = Time in setting.marks or name == "minutes"
+    if setting.base is float and not is_time and not setting.range.holds(0):
+        assert not setting.range.holds(1e-300)
+
+
 @pytest.mark.parametrize("kind", sorted(CLASSES, key=lambda kind: kind.__name__))
 def test_what_bounds_a_setting_is_checked_before_it(kind: type) -> None:
     assert issubclass(kind, Settings)

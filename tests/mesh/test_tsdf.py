@@ -266,6 +266,17 @@ def test_plan_follows_pixel_budget_and_memory(monkeypatch):
         plan_volume(views, MeshConfig(voxel=0.005, memory_limit=1e-3))
 
 
+@pytest.mark.parametrize(
+    ("voxel", "said"), [(1e-6, "too small: the volume would end at 0.524"), (1e6, "min-weight")]
+)
+def test_voxels_that_do_not_fit_the_scene_are_refused_in_a_sentence(voxel, said):
+    pose = look_at(torch.tensor([0.1, 0.0, 0.0]).double(), torch.tensor([1.0, 0.2, 0.1]).double())
+    depth = box_depth(pose, torch.tensor([1.3, 1.1, 0.9]).double())
+    view = DepthMapView(depth, torch.ones_like(depth), CAMERA, pose)
+    with pytest.raises(InputError, match=said):
+        extract_mesh([view], MeshConfig(voxel=voxel))
+
+
 def test_estimate_of_blocks_is_near_the_truth():
     views = sphere_views(12)
     plan = plan_volume(views, MeshConfig(voxel=0.02))

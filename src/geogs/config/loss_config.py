@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from geogs.config.setting import Fraction, Only, Range, Settings, Weight
+from geogs.config.setting import Fraction, Only, Positive, Range, Settings, Weight
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class LossConfig(Settings, group="mapping.loss"):
     """L_ncc, 1 - normalised cross-correlation."""
     ncc_patch: Annotated[int, Range(3, 15, odd=True)] = 5
     """Side of the correlation window in pixels of the photometric image."""
-    ncc_reject: Annotated[float, Range(above=0, most=2)] = 0.9
+    ncc_reject: Annotated[float, Range(1e-9, 2)] = 0.9
     """Windows with 1 - NCC of this or more are taken for occluded or changed."""
     ncc_texture: Fraction = 1e-6
     """A window of grey variance v weighs v / (v + this); 0 weighs all windows alike."""
     ssim_weight: Weight = 0.0
     """L_ssim, 1 - structural similarity; slow on a CPU."""
-    occlusion: Annotated[float, Range(above=0, most=1e6)] = 2.25
+    occlusion: Positive = 2.25
     """Depth difference to the neighbour's depth from which a pixel is hidden, in pixels of the
     photometric image that it is worth at 10 degrees of parallax."""
     occlusion_ratio: Annotated[float, Range(0, below=1)] = 0.0

@@ -43,11 +43,11 @@ class DiskConfig(Settings, group="mapping.disk"):
     """Below this planarity the initial scale shrinks."""
     planarity_shrink: Positive = 0.5
     """Factor of that shrinking; the paper's is 0.1."""
-    opacity: Annotated[float, Range(above=0, below=1)] = 0.7
+    opacity: Annotated[float, Range(1e-4, 0.9999)] = 0.7
     """Initial opacity."""
     max_scale: Positive = 0.05
     """Largest standard deviation, in u."""
-    min_scale: Annotated[float, Range(above=0, most="max_scale")] = 4e-4
+    min_scale: Annotated[float, Range(1e-9, "max_scale")] = 4e-4
     """Smallest standard deviation, in u."""
     split_ratio: Annotated[float, Range(0, below=1)] = 0.0
     """Part of the disks that is split in two, where the losses pull hardest, each time that the
@@ -130,7 +130,7 @@ class MappingConfig(Settings, group="mapping"):
     windows that overlap by half; 0 leaves them to the final bundle adjustment."""
     lr_position: Weight = 6e-4
     """Adam step of positions, in u."""
-    lr_final: Annotated[float, Range(above=0, most=1)] = 0.1
+    lr_final: Annotated[float, Range(1e-9, 1)] = 0.1
     """Factor that the learning rates fall to over the final iterations."""
     pose_iterations: Annotated[CountOrZero, Only("run")] = 2
     """Pose-only steps of a refinement on the map; 0 leaves the poses to the tracker."""

@@ -10,7 +10,7 @@ from geogs.config.setting import Basic, CountOrZero, Positive, Range, Settings
 class MeshConfig(Settings, group="mesh"):
     """Surface extraction."""
 
-    voxel: Annotated[Positive | None, Basic()] = None
+    voxel: Annotated[float | None, Range(1e-6, 1e6), Basic()] = None
     """Voxel size in map units; chosen from depth, budget and memory limit if none is given."""
     truncation: Annotated[float, Range(2, 16)] = 4.0
     """Voxels in front of and behind a surface in which distances are averaged."""

@@ -26,7 +26,7 @@ class SearchConfig(Settings, group="search"):
     most_views: Annotated[int, Range(2, 100_000), Basic()] = 400
     """Most images that make the map. Of more, and of as many as the time lasts for, those are read
     that see all of the scene from places apart; of near ones the sharper."""
-    depth_ratio: Annotated[float, Range(above=0, most=1)] = 0.25
+    depth_ratio: Annotated[float, Range(1e-3, 1)] = 0.25
     """Largest fraction of the time up to then that reading and the depths may take; images for
     which it does not last are not read, or get no depth and only serve to find those of the
     others."""

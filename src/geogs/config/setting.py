@@ -116,7 +116,8 @@ Fraction = Annotated[float, Range(0, 1)]
 Angle = Annotated[float, Range(0, 180)]
 """Degrees."""
 Weight = Annotated[float, Range(0, 1e6)]
-Positive = Annotated[float, Range(above=0, most=1e6)]
+Positive = Annotated[float, Range(1e-9, 1e6)]
+"""What may divide: not so small that squares and single precision take it for 0."""
 Count = Annotated[int, Range(1, 1_000_000)]
 Port = Annotated[int, Range(1, 65535)]
 CountOrZero = Annotated[int, Range(0, 1_000_000)]

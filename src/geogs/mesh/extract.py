@@ -17,12 +17,14 @@ from geogs.mesh.decimate import decimate
 from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.level_set import extract_surface
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
+from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
 from geogs.threads import on_one_torch_thread
 
 _log = logging.getLogger(__name__)
 _SAMPLED_VIEWS = 40
 _SAMPLED_POINTS = 400_000
+_MOST_OUT_OF_REACH = 0.05
+"""Part of the surface that may lie beyond the volume, as stray points do."""
 _FACES_PER_SQUARE = 2.4
 """Marching cubes makes about so many triangles per voxel face of surface."""
 
@@ -56,8 +58,8 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     triangle budget or the memory limit demand it. The depth range is twice the 95 % quantile,
     so that a few stray far pixels do not blow up the volume. Looks at 40 views at most.
 
-    Raises InputError if no pixel has a depth or a voxel size is given that does not fit into the
-    memory limit.
+    Raises InputError if no pixel has a depth, or a voxel size is given that does not fit into the
+    memory limit or whose volume does not reach as far as the scene.
     """
     stride = max(1, len(views) // _SAMPLED_VIEWS)
     depths, footprints, points = _sample_points(views[::stride])
@@ -67,6 +69,12 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     points = points[depths <= max_depth]
     limit = config.memory_limit * 2**30
     if config.voxel is not None:
+        reach = LIMIT * config.voxel
+        if float((points.abs() > reach).any(1).double().mean()) > _MOST_OUT_OF_REACH:
+            raise InputError(
+                f"A voxel of {config.voxel:g} is too small: the volume would end at {reach:.3g} "
+                f"map units, within the scene; use a larger voxel or leave it to be chosen."
+            )
         blocks = len(band_blocks(points, config.voxel, config.truncation))
         if blocks * BYTES_PER_BLOCK > limit:
             raise InputError(

@@ -45,7 +45,7 @@ class FlowTraining(TrainingSchedule):
     """Fraction of the edges, beside those from nothing, whose start is off by 16 to 64 pixels."""
     iterations: Count = 6
     """Iterations of the network per edge."""
-    decay: Annotated[float, Range(above=0, most=1)] = 0.8
+    decay: Annotated[float, Range(1e-9, 1)] = 0.8
     """Weight of an iteration's loss relative to the next."""
     likelihood: Literal["joint", "separate"] = "joint"
     """Whether the likelihood of the error trains the flow, too, or an absolute error does."""
