@@ -69,15 +69,18 @@ def compute(settings: RunSettings) -> None:
 
 def write_thumbnail(output: Path) -> None:
     """A small picture of the result, if its report has any."""
+    import cv2
     from PIL import Image
+
+    from geogs.io.pictures import decoded
 
     pictures = [output / "report" / name for name in _PICTURES]
     for path in pictures:
-        if path.is_file():
-            with Image.open(path) as picture:
-                small = picture.convert("RGB")
-                small.thumbnail(_LARGEST)
-                small.save(output / THUMBNAIL, "WEBP", quality=80)
+        rgb = decoded(path, cv2.IMREAD_COLOR).rgb
+        if rgb is not None:
+            small = Image.fromarray(rgb)
+            small.thumbnail(_LARGEST)
+            small.save(output / THUMBNAIL, "WEBP", quality=80)
             return
 
 

@@ -1,12 +1,12 @@
 """Photographs in a folder: which there are, how large, and by which camera."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
+from geogs.io.pictures import header_read
 from geogs.io.sources.formats.image_files import SUFFIXES, image_folder, natural_key
 
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
@@ -87,10 +87,8 @@ def _name(path: Path, root: Path) -> str:
 
 def _photograph(path: Path, root: Path) -> Photograph | None:
     """A picture with what its header says; none where it is damaged."""
-    from PIL import Image
-
     try:
-        with decoder_noise(), warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+        with decoder_noise(), header_read(path) as picture:
             width, height = picture.size
             base = picture.getexif()
             exif = base.get_ifd(_EXIF_IFD)

@@ -2,7 +2,10 @@
 
 from html.parser import HTMLParser
 
+import pytest
+
 from geogs.evaluation.pages.page import PictureSection, TableSection, TextSection, write_page
+from io_samples import empty_png
 
 
 class Elements(HTMLParser):
@@ -66,3 +69,15 @@ def test_table_without_titles_has_no_head(tmp_path):
     text = (tmp_path / "p.html").read_text()
     assert "<thead>" not in text
     assert "<h2>" not in text
+
+
+@pytest.mark.parametrize("size", [(40_000, 40_000), (12_000, 12_000)])
+def test_a_picture_that_promises_more_than_it_holds_is_left_out_in_silence(tmp_path, capfd, size):
+    (tmp_path / "bomb.png").write_bytes(empty_png(*size))
+    page = tmp_path / "p.html"
+    sections = [PictureSection("bomb", tmp_path / "bomb.png"), TextSection("rest", "here")]
+    write_page(page, "t", sections, is_whole=True)
+    text = page.read_text()
+    assert "bomb" not in text
+    assert "here" in text
+    assert capfd.readouterr() == ("", "")

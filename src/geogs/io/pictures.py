@@ -6,8 +6,11 @@ gives half a picture and such a line, and no error.
 
 import io
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,6 +19,9 @@ from jaxtyping import Bool, UInt8
 from geogs.documents import read_bytes
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 LARGEST_PICTURE = 1 << 31
 """Bytes of a file."""
@@ -83,7 +89,7 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
     if not path.is_file():
         return None
     try:
-        with decoder_noise(), Image.open(path) as picture:
+        with decoder_noise(), header_read(path) as picture:
             return picture.size, picture.mode
     except Image.DecompressionBombError:
         raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
@@ -91,15 +97,24 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
         return None
 
 
+@contextmanager
+def header_read(file: Path | IO[bytes]) -> Iterator["Image"]:
+    """A picture of which Pillow has read no more than the header, and warns of nothing.
+
+    What a damaged file makes one of its many readers stumble over is raised, whatever it is.
+    """
+    from PIL import Image
+
+    with warnings.catch_warnings(action="ignore"), Image.open(file) as picture:
+        yield picture
+
+
 def _promises_too_much(data: np.ndarray) -> bool:
     """Whether a header tells of more pixels than so few bytes can hold, which would be made up."""
     from PIL import Image
 
     try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(data.tobytes())) as picture,
-        ):
+        with header_read(io.BytesIO(data.tobytes())) as picture:
             pixels = picture.width * picture.height
     except Image.DecompressionBombError:
         pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)

@@ -149,12 +149,11 @@ def _picture(section: PictureSection, folder: Path | None) -> str:
     if not section.file.is_file():
         return ""
     if folder is None:
-        try:
-            place = _inside(section.file)
-        except OSError:  # no picture, or one that is cut off
-            return ""
+        place = _inside(section.file)
     else:
         place = quote(Path(os.path.relpath(section.file, folder)).as_posix())
+    if not place:
+        return ""
     caption = section.caption or section.heading
     below = f"<figcaption>{html.escape(section.caption)}</figcaption>" if section.caption else ""
     image = f'<img src="{place}" alt="{html.escape(caption)}">'
@@ -163,12 +162,17 @@ def _picture(section: PictureSection, folder: Path | None) -> str:
 
 
 def _inside(file: Path) -> str:
-    """A picture as an address that holds it."""
+    """A picture as an address that holds it; nothing where it is none, or a bomb."""
+    import cv2
     from PIL import Image
 
+    from geogs.io.pictures import decoded
+
+    rgb = decoded(file, cv2.IMREAD_COLOR).rgb
+    if rgb is None:
+        return ""
     stream = BytesIO()
-    with Image.open(file) as picture:
-        picture.convert("RGB").save(stream, "WEBP", quality=88, method=2)
+    Image.fromarray(rgb).save(stream, "WEBP", quality=88, method=2)
     return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 

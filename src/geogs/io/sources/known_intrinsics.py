@@ -2,12 +2,12 @@
 
 import logging
 import math
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
+from geogs.io.pictures import header_read
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_words, read_calibration
 
@@ -79,11 +79,8 @@ def calibration_from_exif(image: Path) -> Calibration | None:
 
     The equivalent compares diagonals (CIPA DCG-001): f / 43.27 mm is focal length by diagonal.
     """
-    from PIL import Image
-
     try:
-        with decoder_noise(), warnings.catch_warnings(), Image.open(image) as photograph:
-            warnings.simplefilter("ignore")
+        with decoder_noise(), header_read(image) as photograph:
             exif: Mapping[int, object] = photograph.getexif().get_ifd(_EXIF_IFD)
             width, height = photograph.size
     except Exception:  # whatever damaged EXIF makes its reader stumble over
