@@ -1,11 +1,37 @@
 """Ctrl-C and SIGTERM as a request: work stops at the next safe point and keeps what there is."""
 
+import os
 import signal
 import threading
 from collections.abc import Callable
 from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Those that ask to stop: of a terminal, and of systems and schedulers."""
+_AGAIN = 0.02
+"""Seconds until it is looked again whether modules are still being imported."""
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Handler of a signal: raises KeyboardInterrupt, in an import as soon as that is done.
+
+    A module of which an exception has left one half makes others fail with anything. The second
+    signal in an import, which may hang, ends the process.
+    """
+    if not (_is_importing(frame) and hasattr(signal, "setitimer")):
+        raise KeyboardInterrupt
+    if number in SIGNALS and signal.getitimer(signal.ITIMER_REAL)[0]:
+        os._exit(128 + number)
+    signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
 
 
 class Stop:
@@ -51,7 +77,7 @@ class Interruption(Stop):
         # Python takes signals in the main thread alone.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
-            self._before = {n: signal.signal(n, self._handle) for n in _SIGNALS}
+            self._before = {n: signal.signal(n, self._handle) for n in SIGNALS}
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -60,5 +86,6 @@ class Interruption(Stop):
                 signal.signal(number, before)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.check()
+        if self.requested:
+            interrupt(number, frame)
         self.requested = True

@@ -9,8 +9,10 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from types import FrameType
 
+from geogs.application.interrupt import SIGNALS, interrupt
 from geogs.cli.streams import make_unbreakable
 
 
@@ -24,10 +26,9 @@ def take_over() -> None:
     SIGTERM, by which systems and schedulers end programs, is taken as Ctrl-C: results so far are
     kept. Streams that are closed, full or gone end no command.
     """
+    _handle_signals(interrupt)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     make_unbreakable()
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, _interrupt)
 
 
 def show_warnings() -> None:
@@ -48,7 +49,9 @@ def leave(code: int) -> None:
     """End the process where PyTorch was loaded, once what was registered for its end is done.
 
     Taking modules and a GPU's memory apart, which the system takes back anyway, lasts a second.
+    Signals end it at once, without a word.
     """
+    _handle_signals(signal.SIG_DFL)
     if "torch" in sys.modules:
         atexit._run_exitfuncs()
         sys.stdout.flush()
@@ -56,5 +59,8 @@ def leave(code: int) -> None:
         os._exit(code)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+def _handle_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+    if threading.current_thread() is threading.main_thread():
+        for number in SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup asks for
+                signal.signal(number, handler)

@@ -54,5 +54,6 @@ def _unbreakable(number: int, before: TextIO | None) -> TextIO:
     with suppress(OSError, ValueError):
         if before is not None:
             before.flush()
-    buffer = io.BufferedWriter(_Dropping(number))
+    # Of its own: what decoders print is caught by leading the number elsewhere meanwhile.
+    buffer = io.BufferedWriter(_Dropping(os.dup(number)))
     return io.TextIOWrapper(buffer, encoding, "backslashreplace", line_buffering=True)
