@@ -165,8 +165,10 @@ def test_an_archive_that_finds_no_room_stays_where_it_was(tmp_path, monkeypatch)
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "pwrite", full)
-    with pytest.raises(Exception, match="No space left"):
-        archive.settle(CheckpointFolder(tmp_path))
+    place = tmp_path / "checkpoint"
+    place.mkdir()
+    with pytest.raises(OutputError, match=f"{place} .No space left.*larger disk for the results"):
+        archive.settle(CheckpointFolder(place))
     monkeypatch.setattr(os, "pwrite", write)
-    assert list(tmp_path.iterdir()) == []
+    assert list(place.iterdir()) == []
     assert (handle.load() == np.arange(1000)).all()

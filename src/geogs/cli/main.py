@@ -4,7 +4,9 @@ Nothing heavy is imported before a sub-command is chosen, so that help appears a
 """
 
 import errno
+import math
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 
@@ -19,6 +21,12 @@ EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells give it (128 + SIGINT)."""
 _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN error", "NVRTC")
 """What errors of PyTorch begin with that no command has said in its own words."""
+_UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EIO, errno.ESTALE, errno.EROFS)
+"""What systems say of paths, at the first look at them."""
+_LEAST_MEMORY = 1 << 30
+"""Bytes of addresses without which what is imported ends the process in words of its own."""
+_LONG_WORD = re.compile(r"(\S{80})\S{100,}(\S{80})")
+"""Such as a path that was put together by mistake, of which both ends are shown."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,6 +53,8 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     command = find_command(name)
     process.show_warnings()
+    if _memory_limit() < _LEAST_MEMORY:
+        raise MemoryError
     return command.run(arguments[1:])
 
 
@@ -69,7 +79,7 @@ def print_error(sentence: str) -> None:
     """Print one line to the standard error, in red on a terminal."""
     is_coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
     plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in sentence)
-    text = f"error: {plain}"
+    text = "error: " + _LONG_WORD.sub(r"\1...\2", plain)
     print(f"\033[31m{text}\033[0m" if is_coloured else text, file=sys.stderr)
 
 
@@ -106,7 +116,10 @@ def _of_the_system(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
         return "Too many files are open; raise the limit (ulimit -n)."
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return f"A disk is full ({error.filename or 'of temporary files, see TMPDIR'})."
+        which = "that of the results, or of temporary files (TMPDIR)"
+        return f"A disk is full ({error.filename or which}); free some space there."
+    if isinstance(error, OSError) and error.errno in _UNUSABLE and error.filename:
+        return f"{error.filename} cannot be used ({error.strerror}); give another path."
     if type(error).__name__ == "OutOfMemoryError" or said.startswith(_GPU_FAILS):
         first = said.splitlines()[0][:200].rstrip(".") if said else "out of memory"
         return f"The GPU failed ({first}); --device cpu computes without it."
@@ -116,7 +129,7 @@ def _of_the_system(error: Exception) -> str | None:
     is_told = isinstance(error, MemoryError) or any(words in said for words in lacks)
     # Libraries that cannot be loaded say so each in its own way.
     is_unloaded = isinstance(error, ImportError | OSError) and getattr(error, "errno", None) is None
-    if is_told or (is_unloaded and _has_memory_limit()):
+    if is_told or (is_unloaded and _memory_limit() < math.inf):
         return (
             "The memory is full, or may not be used (ulimit -v); use a smaller --long-edge or "
             "fewer frames, and go on with --resume where there is a checkpoint."
@@ -124,12 +137,14 @@ def _of_the_system(error: Exception) -> str | None:
     return None
 
 
-def _has_memory_limit() -> bool:
+def _memory_limit() -> float:
+    """Bytes of addresses that the process may use."""
     try:
         import resource
     except ImportError:  # not on this system
-        return False
-    return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else limit
 
 
 if __name__ == "__main__":

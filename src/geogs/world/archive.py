@@ -103,7 +103,7 @@ class Archive:
                 self._move(folder)
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._unwritable(error, folder.path) from error
         with self._lock:
             self._collect()
         self._releasing, self._withheld = self._releasing + self._withheld, []
@@ -194,15 +194,16 @@ class Archive:
             else:
                 self._free.setdefault(size, []).append(offset)
 
-    def _unwritable(self, error: OSError) -> OutputError:
-        reason = error.strerror or str(error)
+    def _unwritable(self, error: OSError, settled: Path | None = None) -> OutputError:
+        """The error of this file, or of the one that it becomes in a folder where it is settled."""
+        settled = settled or (self.folder if self._is_settled else None)
         remedy = (
-            "give a folder on a larger disk for the results" if self._is_settled
-            else "name a folder on a larger disk in TMPDIR"
+            "name a folder on a larger disk in TMPDIR" if settled is None
+            else "give a folder on a larger disk for the results"
         )  # fmt: skip
         return OutputError(
-            f"The keyframes of a long video cannot be kept in {self.folder} ({reason}); free some "
-            f"space, or {remedy}."
+            f"The keyframes of a long video cannot be kept in {settled or self.folder} "
+            f"({error.strerror or error}); free some space, or {remedy}."
         )
 
 
