@@ -44,6 +44,7 @@ def write_video(
     codec: str = "libx264",
     gop: int = 4,
     title: str = "",
+    index_first: bool = False,
 ) -> Path:
     """Write a video with the given presentation times (33 ms steps if none).
 
@@ -51,7 +52,8 @@ def write_video(
     """
     height, width = images[0].shape[:2]
     times = milliseconds or [33 * i for i in range(len(images))]
-    with av.open(str(path), "w") as container:
+    options = {"movflags": "faststart"} if index_first else {}
+    with av.open(str(path), "w", options=options) as container:
         container.metadata["title"] = title
         stream = container.add_stream(codec, rate=30)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

@@ -346,10 +346,14 @@ def run_on(frames: list[np.ndarray], folder: Path) -> list[str]:
 @pytest.mark.parametrize("name", some_long(TURNING, "pure rotation"))
 def test_a_camera_that_does_not_move_leaves_orientations(name, tmp_path, capsys):
     frames, words = TURNING[name]
-    assert cli.main(run_on(frames, tmp_path)) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    assert cli.main(run_on(frames, tmp_path)) == 2
+    told = capsys.readouterr()
+    said = " ".join(told.out.split())
     assert "Rotation only: no shape." in said
     assert words in said
+    end = told.err.splitlines()[-1]
+    assert end.startswith(f"error: There is no mesh; the rest is in {tmp_path / 'out'}/. ")
+    assert words in end
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert words in summary["not_started"]
     assert not summary["verdict"]["is_reliable"]

@@ -137,7 +137,19 @@ def test_an_image_of_another_size_is_skipped_and_named(tmp_path, caplog):
     write_image(tmp_path / "c.png", gradient_image(0, 48, 64))
     with caplog.at_level("WARNING", "geogs"):
         assert read_all(tmp_path) == 2
-    assert "c.png is 48x64 but the first image is 64x48; skipped." in caplog.text
+    assert "c.png is 48x64 but the others are 64x48; skipped." in caplog.text
+
+
+def test_the_size_that_most_images_have_is_that_of_the_recording(tmp_path, caplog):
+    write_images(tmp_path, [f"b{i}.png" for i in range(23)])
+    write_image(tmp_path / "a.png", gradient_image(0, 48, 64))
+    (tmp_path / "c.png").write_bytes(b"damaged")
+    with caplog.at_level("WARNING", "geogs"):
+        source = open_source(tmp_path, GIVEN)
+        frames = list(source)
+    assert {frame.image.shape for frame in frames} == {(48, 64, 3)}
+    assert (len(frames), source.place.skipped) == (23, 2)
+    assert "a.png is 48x64 but the others are 64x48; skipped." in caplog.text
 
 
 def test_image_list_with_missing_files(tmp_path):

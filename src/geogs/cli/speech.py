@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from geogs.application.run_settings import Verbosity
+from geogs.errors import TrackingLost
 
 if TYPE_CHECKING:
     from geogs.application.results.result import Written
@@ -21,7 +22,11 @@ NOT_JUDGED = (
 
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> "Written":
     """Do the work of a command, with a line of progress on the standard error, and say at its end
-    on the standard output what came of it."""
+    on the standard output what came of it.
+
+    Raises:
+        TrackingLost: there is no mesh in the end, of a work that nobody stopped; the rest is kept.
+    """
     from geogs.application.terminal_progress import TerminalProgress
 
     begin = time.perf_counter()
@@ -37,6 +42,10 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
         progress.note("\n".join(words))
     if not options.quiet:
         print("\n".join(words))
+    result = written.result
+    if result.mesh is None and not result.is_interrupted:
+        why = result.why_no_map or "Of what was seen no surface is known."
+        raise TrackingLost(f"There is no mesh; the rest is in {written.output}/. {why}")
     return written
 
 

@@ -27,6 +27,8 @@ LARGEST_PICTURE = 1 << 31
 """Bytes of a file."""
 _PIXELS_A_BYTE = 10_000
 """Pixels per byte of an all-black picture, compressed as well as any format can."""
+_ORIENTATION, _QUARTER_TURNED = 0x0112, (5, 6, 7, 8)
+"""Entry of the EXIF, and its values for which width and height are exchanged."""
 _HARMLESS = 1 << 24
 """Pixels that are decoded in no time, whatever the file holds."""
 
@@ -93,6 +95,18 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
             return picture.size, picture.mode
     except Image.DecompressionBombError:
         raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
+    except Exception:  # whatever a damaged file makes one of its many readers stumble over
+        return None
+
+
+def upright_size(path: Path) -> tuple[int, int] | None:
+    """Width and height as :func:`decoded` turns it; none where there is no picture."""
+    if not path.is_file():
+        return None
+    try:
+        with decoder_noise(), header_read(path) as picture:
+            is_turned = picture.getexif().get(_ORIENTATION) in _QUARTER_TURNED
+            return picture.size[::-1] if is_turned else picture.size
     except Exception:  # whatever a damaged file makes one of its many readers stumble over
         return None
 

@@ -1,6 +1,7 @@
 """Videos: real time stamps, rotation, damage, seeking by counting."""
 
 import logging
+from dataclasses import replace
 
 import av
 import numpy as np
@@ -87,13 +88,23 @@ def test_display_angle_to_quarter_turns():
     np.testing.assert_array_equal(turn_upright(image, 2), image[::-1, ::-1])
 
 
-def test_truncated_video_gives_the_frames_before_the_cut(tmp_path):
-    path = write_video(tmp_path / "v.mkv", noise(30))
+@pytest.mark.parametrize(
+    ("name", "said"), [("v.mkv", "it lasts 3.0 s, but"), ("v.mp4", "it has 90 images here, but")]
+)
+def test_truncated_video_gives_the_frames_before_the_cut_and_is_told(tmp_path, caplog, name, said):
+    path = write_video(tmp_path / name, noise(90), index_first=name.endswith("mp4"))
+    assert len(list(open_source(path, NATIVE))) == 90
+    assert caplog.messages == []
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    frames = list(open_source(path, NATIVE))
-    assert 10 <= len(frames) <= 20
+    with caplog.at_level(logging.WARNING, logger="geogs"):
+        frames = list(open_source(path, NATIVE))
+    assert 30 <= len(frames) <= 60
     np.testing.assert_allclose(np.diff([f.timestamp for f in frames]), 0.033, atol=1e-3)
+    assert f"{name} says that {said}" in caplog.messages[-1]
+    caplog.clear()
+    assert len(list(open_source(path, replace(NATIVE, stop=10)))) == 10
+    assert caplog.messages == []
 
 
 def test_damaged_packets_are_skipped_and_counted(tmp_path, caplog):

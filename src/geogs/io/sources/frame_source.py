@@ -231,6 +231,8 @@ class Source:
             pose = None if pose is None else replace(pose, world=number)
             yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows)
             index += 1
+        if short := images.why_short(here.frames + here.skipped, end - here.shift):
+            _log.warning("%s", short)
         if not here.frames:
             raise InputError(images.why_empty(here.skipped))
         if here.skipped > 1:

@@ -75,6 +75,8 @@ class RecordingInfo:
     """Who said the poses that come with images and are no truth; none where there are none."""
     is_capture: bool = False
     """Whether they are plainly those of an app that tracked its camera, in metres."""
+    seconds: float | None = None
+    """Time of its last image, about; none where nothing says it."""
 
 
 @runtime_checkable
@@ -94,13 +96,13 @@ class Reader(Protocol):
 
 
 def of_one_size(raw: RawFrame, info: RecordingInfo) -> RawFrame:
-    """The image as it is; without its picture if that has another size than the first."""
+    """The image as it is; without its picture if that has another size than the recording."""
     if raw.image is None:
         return raw
     height, width = raw.image.shape[:2]
     if (width, height) == (info.width, info.height):
         return raw
-    sizes = f"{width}x{height} but the first image is {info.width}x{info.height}"
+    sizes = f"{width}x{height} but the others are {info.width}x{info.height}"
     return replace(raw, image=None, why_not=f"is {sizes}")
 
 

@@ -39,6 +39,8 @@ from geogs.types import MeasuredDepth
 
 LEAST_EDGE = 12
 """Pixels of the shorter side of a working image."""
+MOST_OF = 0.97
+"""Part of what a recording says it holds that is enough not to be called cut off."""
 
 
 class WorkingImages:
@@ -228,6 +230,22 @@ class WorkingImages:
             image = self._rectifier.straightened(raw.image, moved)
             depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
             yield replace(raw, image=image, depth=depth, rows=rows)
+
+    def why_short(self, read: int, last: float) -> str:
+        """What to say where fewer images came than the recording says; nothing where all did.
+
+        Args:
+            read: images of the selection, those that cannot be used included.
+            last: time of the last of them, seconds.
+        """
+        seconds = None if self._config.stop is not None else self.reader.info.seconds
+        if self.length is not None and read < MOST_OF * self.length - 1:
+            missing = f"says that it has {self.length} images here, but only {read} came"
+        elif seconds is not None and last < MOST_OF * seconds - 0.5:
+            missing = f"says that it lasts {seconds:.1f} s, but its images end at {last:.1f} s"
+        else:
+            return ""
+        return f"{self.name} {missing}; is it cut off?"
 
     def why_empty(self, skipped: int) -> str:
         """What to say where there is no image but those that were skipped."""

@@ -3,6 +3,7 @@
 import os
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 
 from geogs.errors import InputError
-from geogs.io.pictures import decoded
+from geogs.io.pictures import decoded, upright_size
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
@@ -24,6 +25,8 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp",
 
 # Where other tools put the images of a project.
 _SUBFOLDERS = ("images", "image", "rgb", "color", "frames", "data", "mav0/cam0/data")
+_ASKED = 24
+"""Images that are asked for their size, about."""
 _SECONDS_BY_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
 
 
@@ -40,7 +43,7 @@ class ImageFile:
 
 
 class ImageList:
-    """Reader of image files; the first one that can be read sets the size."""
+    """Reader of image files; the size that most have is that of the recording."""
 
     def __init__(
         self,
@@ -53,11 +56,13 @@ class ImageList:
     ) -> None:
         """What it says of itself is described in :class:`RecordingInfo`."""
         self.files = files
-        images = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in files)
-        first = next((image for image in images if image is not None), None)
-        if first is None:
+        self.usual = usual_file(files)
+        """One of the images of that size; the first if none can be read."""
+        candidates = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in (self.usual, *files))
+        image = next((image for image in candidates if image is not None), None)
+        if image is None:
             raise InputError(f"{name}: none of its {len(files)} images can be read.")
-        height, width = first.shape[:2]
+        height, width = image.shape[:2]
         self.info = RecordingInfo(
             kind, name, width, height,
             fps=_median_rate([file.timestamp for file in files]),
@@ -88,12 +93,16 @@ def open_image_folder(folder: Path) -> ImageList:
     place = _folder_with_images(folder)
     files = in_order_of_time(_images(place))
     calibration = find_calibration(*dict.fromkeys(_folders_of_project(folder, place)))
-    return ImageList(
-        "images",
-        folder.resolve().name,
-        files,
-        calibration or calibration_from_exif(files[0].path),
-    )
+    calibration = calibration or calibration_from_exif(usual_file(files).path)
+    return ImageList("images", folder.resolve().name, files, calibration)
+
+
+def usual_file(files: Sequence[ImageFile]) -> ImageFile:
+    """The first of those images, from all over the list, that have the most frequent size."""
+    asked = files[:: max(1, len(files) // _ASKED)]
+    sizes = [upright_size(file.path) for file in asked]
+    counts = Counter(size for size in sizes if size is not None)
+    return asked[sizes.index(counts.most_common(1)[0][0])] if counts else files[0]
 
 
 def _folders_of_project(folder: Path, place: Path) -> list[Path]:

@@ -28,7 +28,7 @@ class VideoFile:
         self._path = path
         with _open(path) as container:
             stream = container.streams.video[0]
-            length = stream.frames or None
+            length, seconds = stream.frames or None, _seconds(container)
             fps = float(stream.average_rate or stream.guessed_rate or 30)
             first = next((frame for frame in _decoded(container, path) if frame), None)
             if first is None:
@@ -38,7 +38,7 @@ class VideoFile:
             turns = clockwise_quarter_turns(float(first.rotation))
             width, height = (first.width, first.height)[:: -1 if turns % 2 else 1]
         self.info = RecordingInfo(
-            "video", path.name, width, height, fps, length, quarter_turns=turns
+            "video", path.name, width, height, fps, length, quarter_turns=turns, seconds=seconds
         )
 
     @property
@@ -85,6 +85,14 @@ def turn_upright(
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Turn an image by clockwise quarter turns."""
     return np.ascontiguousarray(np.rot90(image, -quarter_turns))
+
+
+def _seconds(container: InputContainer) -> float | None:
+    """Time of the last image as the stream says it, or else the container."""
+    stream = container.streams.video[0]
+    if stream.duration is not None and stream.time_base is not None:
+        return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
+    return None if container.duration is None else container.duration / av.time_base
 
 
 def _container(path: Path) -> InputContainer:
