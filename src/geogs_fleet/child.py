@@ -68,20 +68,26 @@ def compute(settings: RunSettings) -> None:
 
 
 def write_thumbnail(output: Path) -> None:
-    """A small picture of the result, if its report has any."""
+    """A small picture of the result, if its report has any. Raises OutputError."""
     import cv2
     from PIL import Image
 
+    from geogs.application.results.output_folder import claimed
     from geogs.io.pictures import decoded
+    from geogs.io.writers.atomic import atomic_file
+    from geogs.io.writers.replacement import replaced
 
-    pictures = [output / "report" / name for name in _PICTURES]
-    for path in pictures:
-        rgb = decoded(path, cv2.IMREAD_COLOR).rgb
-        if rgb is not None:
-            small = Image.fromarray(rgb)
-            small.thumbnail(_LARGEST)
-            small.save(output / THUMBNAIL, "WEBP", quality=80)
-            return
+    pictures = (decoded(output / "report" / name, cv2.IMREAD_COLOR).rgb for name in _PICTURES)
+    rgb = next((picture for picture in pictures if picture is not None), None)
+    if rgb is not None:
+        small = Image.fromarray(rgb)
+        small.thumbnail(_LARGEST)
+        with (
+            claimed(output),
+            replaced(output, "part") as new,
+            atomic_file(new / THUMBNAIL) as stream,
+        ):
+            small.save(stream, "WEBP", quality=80)
 
 
 def _is_begun(output: Path, settings: RunSettings) -> bool:

@@ -5,11 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geogs.application.results.output_folder import only_writer
+from geogs.application.results.output_folder import claimed
 from geogs.cli.options import record
 from geogs.documents import read_json
 from geogs.errors import InputError
-from geogs.io.writers.atomic import prepare_output_folder
 from geogs_fleet.cluster import allocation_for, ray_cluster
 from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 from geogs_fleet.fleet_progress import FleetProgress
@@ -40,8 +39,7 @@ def run_join(
     path = StoragePath(settings.output).path if settings.output else None
     if path is None:
         raise InputError("The joint result needs a folder that all machines see; give one (-o).")
-    output = prepare_output_folder(path.absolute())
-    with only_writer(output), ray_cluster(settings.address) as ray:
+    with claimed(path.absolute()) as output, ray_cluster(settings.address) as ray:
         allocation = allocation_for(ray, settings)
         parts = _parts(settings, output, progress, say)
 

@@ -54,7 +54,7 @@ def supervise(
     """
     begin = time.monotonic()
     exceeded: Literal["", "time", "memory"] = ""
-    with TemporaryFile() as said, log.open("ab") as errors:
+    with TemporaryFile() as said, open(log, "ab", opener=_not_through_links) as errors:
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=said, stderr=errors, env=dict(environment)
         )
@@ -88,3 +88,7 @@ def resident(process: int) -> int:
     except (OSError, ValueError, IndexError):
         return 0
     return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def _not_through_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)

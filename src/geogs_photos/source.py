@@ -13,6 +13,7 @@ from geogs.io.sources.formats.colmap import open_colmap
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
+from geogs.io.writers.replacement import replaced
 from geogs_photos.photograph import PhotoFolder, find_photographs
 from geogs_photos.poses import FoundPoses, LeftOut, find_poses
 
@@ -47,8 +48,10 @@ def open_photographs(
             progress.stage(stage, fraction)
             stop.check()
 
-        found = find_poses(chosen, model, selection.intrinsics, config.seed, report)
-        write_text(note, json.dumps(asdict(found), indent=2))
+        with replaced(kept, "beside") as new:
+            model_new = new / model.relative_to(kept)
+            found = find_poses(chosen, model_new, selection.intrinsics, config.seed, report)
+            write_text(new / note.name, json.dumps(asdict(found), indent=2))
     source = _source(folder, chosen, model, found, config, hold_out)
     count = len(chosen.photographs) + len(chosen.damaged)
     _tell(found, source.left_out, count, progress)

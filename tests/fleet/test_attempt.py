@@ -1,16 +1,21 @@
 """One attempt at one source, without Ray: what is fetched, delivered and said."""
 
+import shutil
 import sys
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from disk_faults import full_disk
 from geogs.application.checkpoints import folder as checkpoint_folder
 from geogs.application.run_settings import RunSettings
 from geogs_fleet import work_folder
-from geogs_fleet.attempt import FleetJob, attempt, judged
+from geogs_fleet.attempt import LOG, FleetJob, attempt, judged
+from geogs_fleet.child import THUMBNAIL, write_thumbnail
 from geogs_fleet.row import FILE, read_row
 from geogs_fleet.sources import FleetSource
 from geogs_fleet.storage import StoragePath
@@ -64,6 +69,35 @@ def test_a_former_row_goes_before_the_work_begins(tmp_path):
     row = attempt(job(str(tmp_path / "clip.mp4"), str(tmp_path / "out")))
     assert (row.state, row.sentence) == ("failed", "Bad.")
     assert not (tmp_path / "out" / FILE).exists()
+
+
+def test_on_a_full_disk_no_row_says_that_it_is_done(tmp_path):
+    (tmp_path / "clip.mp4").write_text("ok")
+    out = tmp_path / "out"
+    for n in range(20):
+        shutil.rmtree(out, ignore_errors=True)
+        with full_disk(out, n):
+            row = attempt(job(str(tmp_path / "clip.mp4"), str(out)))
+        if row.state == "done":
+            break
+        assert (row.state, "No space left" in row.sentence) == ("failed", True)
+        assert not (out / FILE).exists()
+    assert n >= 4
+    assert (out / FILE).is_file()
+
+
+def test_neither_log_nor_picture_is_written_through_a_link(tmp_path):
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / "clip.mp4").write_text("ok")
+    out = tmp_path / "out"
+    (out / "report").mkdir(parents=True)
+    cv2.imwrite(str(out / "report" / "keyframes.png"), np.zeros((9, 9, 3), np.uint8))
+    for name in (LOG, THUMBNAIL):
+        (out / name).symlink_to(tmp_path / "precious")
+    assert attempt(job(str(tmp_path / "clip.mp4"), str(out))).state == "failed"
+    write_thumbnail(out)
+    assert (tmp_path / "precious").read_text() == "mine"
+    assert not (out / THUMBNAIL).is_symlink()
 
 
 def test_a_source_that_is_gone_is_a_row():

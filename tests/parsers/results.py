@@ -55,7 +55,7 @@ def results() -> dict[str, Parser]:
         "trajectory-of-a-result": ("trajectory.tum", mutations.text, whole),
         "trajectory-shown": ("trajectory.tum", mutations.text, shown),
         "uncertainty-of-a-result": ("trajectory_uncertainty.csv", mutations.text, whole),
-        "summary-of-a-result": ("summary.json", mutations.json_text, write_page_anew),
+        "summary-of-a-result": ("summary.json", mutations.json_text, page),
         "summary-evaluated": ("summary.json", mutations.json_text, judged),
         "camera-evaluated": ("intrinsics.json", mutations.json_text, judged),
         "summary-of-another": (
@@ -90,6 +90,12 @@ def complete(folder: Path) -> None:
     size = tuple(-(-n // CELL) + 2 for n in (CAMERA.height, CAMERA.width))
     seen = SeenRows(torch.zeros(*size, 2).half(), torch.zeros(size).half())
     write_rows(rows_path(folder), {3: seen})
+
+
+def page(folder: Path) -> None:
+    """The page of what is read."""
+    result = load_result(folder)
+    write_page_anew(folder, result, result.mesh)
 
 
 def whole(folder: Path) -> object:

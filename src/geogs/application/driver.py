@@ -1,9 +1,10 @@
 """The way of a command from its source to its files: the same for all that make a result."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,13 +16,14 @@ from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
 from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result, Written
 from geogs.application.results.surfaces import write_depth_mesh
-from geogs.application.results.write import write_results
+from geogs.application.results.write import write_files
 from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import ReconstructSettings, RunSettings
 from geogs.application.viewer.observer import RunObserver
-from geogs.errors import DeviceError
+from geogs.errors import DeviceError, OutputError
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.writers.replacement import replaced
 from geogs.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
@@ -45,8 +47,6 @@ class Work(ABC):
     """What is written, once the work has ended."""
     source: Source | PosedSource
     """What it was made from."""
-    stages: Collection[str] = ()
-    """Names of folders of the result that it has written on the way."""
 
     @property
     def stopwatch(self) -> Stopwatch:
@@ -63,14 +63,15 @@ class Work(ABC):
         return None
 
     @abstractmethod
-    def complete(self, driver: "Driver", checkpoint: Checkpoint) -> Outcome:
+    def complete(self, driver: "Driver", checkpoint: Checkpoint, new: Path) -> Outcome:
         """All of it up to the trained map, with checkpoints on the way.
 
+        What is to be in the result besides, and is known before its end, goes to ``new``.
         Raises KeyboardInterrupt where it was stopped before there was anything to keep.
         """
 
-    def write_more(self, driver: "Driver") -> None:  # noqa: B027  # most have none
-        """Write files besides those of every result."""
+    def write_more(self, driver: "Driver", new: Path) -> None:  # noqa: B027  # most have none
+        """Write files besides those of every result into its new folder."""
 
 
 @dataclass(frozen=True)
@@ -124,16 +125,15 @@ class Driver:
             return f" {work.way_on}" if work.way_on and has_checkpoint(output) else ""
 
         with full_memory_in_a_sentence(way_on), self.stop:
-            outcome = work.complete(self, checkpoint)
-            finished, scene = outcome is Outcome.FINISHED, work.scene
-            result = Result(scene, work.source, not finished, progress)
-
-            def write_more() -> None:
-                work.write_more(self)
-                if settings.depth_mesh:
-                    write_depth_mesh(output, scene, progress)
-
-            write_results(output, result, write_more, settings.keyframe_images, work.stages)
+            try:
+                with replaced(output, "result") as new:
+                    outcome = work.complete(self, checkpoint, new)
+                    finished, scene = outcome is Outcome.FINISHED, work.scene
+                    result = Result(scene, work.source, not finished, progress)
+                    write_more = partial(self._write_more, work, new)
+                    write_files(new, result, write_more, settings.keyframe_images)
+            except OutputError as error:
+                raise OutputError(f"{error}{way_on()}") from error
             if self.observer is not None:
                 self.observer.result(result)
         if outcome is Outcome.MEMORY_FULL:
@@ -144,3 +144,8 @@ class Driver:
         if finished and work.way_on:
             checkpoint.remove()
         return Written(output, result, not finished and checkpoint.is_complete)
+
+    def _write_more(self, work: Work, new: Path) -> None:
+        work.write_more(self, new)
+        if self.settings.depth_mesh:
+            write_depth_mesh(new, work.scene, self.progress)

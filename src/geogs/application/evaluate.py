@@ -13,6 +13,7 @@ from geogs.application.evaluate_surface import (
     photoconsistency,
 )
 from geogs.application.result_settings import EvalSettings
+from geogs.application.results.output_folder import claimed
 from geogs.application.results.result_page import shown_model, shown_views
 from geogs.application.results.saved_result import load_result
 from geogs.documents import read_json
@@ -31,6 +32,7 @@ from geogs.evaluation.trajectory_errors import (
 from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
 from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
+from geogs.io.writers.replacement import is_half_done, replaced
 from geogs.io.writers.uncertainty import read_states
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread
@@ -48,8 +50,15 @@ def evaluate(settings: EvalSettings) -> Evaluation:
         InputError: the result or the truth cannot be read, or they have too little in common.
         OutputError: a file cannot be written.
     """
-    if not (settings.output / "trajectory.tum").is_file():
-        raise InputError(f"{settings.output} holds no trajectory.tum; give the folder of a result.")
+    folder = settings.output
+    if not (folder / "trajectory.tum").is_file() and not is_half_done(folder):
+        raise InputError(f"{folder} holds no trajectory.tum; give the folder of a result.")
+    with claimed(folder) as output, replaced(output, "part") as new:
+        return _evaluated(settings, new)
+
+
+def _evaluated(settings: EvalSettings, new: Path) -> Evaluation:
+    """The errors; ``new`` is the folder for new files of the result."""
     scene = read_true_scene(settings.gt)
     summary = _summary(settings.output)
     alignment = _alignment(settings, summary)
@@ -84,15 +93,15 @@ def evaluate(settings: EvalSettings) -> Evaluation:
     against = doubts(trajectory, known, scene.trajectory, settings.max_diff, is_metric)
     told = _reliability(settings.output, trajectory)
     evaluation = Evaluation(trajectory, keyframes, scores, compared, photo, told, tuple(against))
-    pictures = _draw(settings, evaluation, surface) if settings.plots else _run_pictures(settings)
-    page = settings.output / "report" / "index.html"
+    pictures = (
+        _draw(settings, new, evaluation, surface) if settings.plots else _run_pictures(settings)
+    )
+    page = new / "report" / "index.html"
     title = str(summary.get("source", settings.output.resolve().name))
     run = run_sections(summary) if summary else []
     judged = figures(summary, run_figures(summary)[:4]) if summary else None
     model = _model_beside_truth(settings.output, trajectory, surface) if settings.plots else None
-    write_report(
-        evaluation, settings.output / "eval.json", page, pictures, run, title, judged, model
-    )
+    write_report(evaluation, new / "eval.json", page, pictures, run, title, judged, model)
     return evaluation
 
 
@@ -153,13 +162,13 @@ def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
 
 
 def _draw(
-    settings: EvalSettings, evaluation: Evaluation, surface: SurfaceComparison | None
+    settings: EvalSettings, new: Path, evaluation: Evaluation, surface: SurfaceComparison | None
 ) -> list[tuple[str, Path]]:
     """Pictures of this command, then those that the run left; titles and files."""
     from geogs.evaluation.pages import plots
     from geogs.evaluation.pages.shading import viewpoints
 
-    folder = settings.output / "report"
+    folder = new / "report"
     titles: dict[str, str] = {}
     trajectory = evaluation.trajectory
     if trajectory.ate_max_cm > SAME_POSES_CM:

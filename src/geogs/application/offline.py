@@ -1,6 +1,7 @@
 """A video without tracking: sharp frames, structure from motion, every frame against the map."""
 
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float64
@@ -43,7 +44,7 @@ class PlacedOffline(Work):
         """Seconds of placing and mapping."""
         return self._stopwatch
 
-    def complete(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
+    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
         """Place the frames, then map the sharp ones.
 
         Raises:

@@ -156,11 +156,11 @@ class MappedImages(Work):
             return None
         return ReconstructState(self._made_from, self.scene.settle())
 
-    def write_more(self, driver: Driver) -> None:
+    def write_more(self, driver: Driver, new: Path) -> None:
         """Write the snapshots."""
-        self._snapshots.write(driver.output, self.scene, driver.progress)
+        self._snapshots.write(new, self.scene, driver.progress)
 
-    def complete(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
+    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
         """Search the depths, grow and train the map; or go on from a checkpoint.
 
         Raises:

@@ -3,7 +3,7 @@
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -202,7 +202,6 @@ class TrackedVideo(Work):
     """That are left."""
     metadata: RunMetadata
     output: Path
-    stages: list[str] = field(default_factory=list)
 
     @property
     def way_on(self) -> str:
@@ -216,7 +215,7 @@ class TrackedVideo(Work):
             return None
         return run_state(self.metadata, self.scene, self.source)
 
-    def complete(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
+    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
         """The frames that are left, then the final stages."""
         slam, source, progress = self.scene, self.source, driver.progress
         progress.expect(source.length, slam.frames)
@@ -227,8 +226,8 @@ class TrackedVideo(Work):
         slam.end_stream()
         if outcome is Outcome.FINISHED:
             checkpoint.write()
-        self._write_stage("online", driver)
-        outcome = self._finish(driver, outcome)
+        self._write_stage("online", driver, new)
+        outcome = self._finish(driver, outcome, new)
         make_metric(slam, source, scale_source(self.metadata.settings.scale_from), progress)
         return outcome
 
@@ -263,11 +262,11 @@ class TrackedVideo(Work):
                 return
             checkpoint.write_if_due()
 
-    def _finish(self, driver: Driver, outcome: Outcome) -> Outcome:
+    def _finish(self, driver: Driver, outcome: Outcome, new: Path) -> Outcome:
         """The final stages; where these or the frames were cut short, a map in little time."""
         stop = driver.stop
         try:
-            if outcome is Outcome.FINISHED and stop.lets_finish(lambda: self._adjust(driver)):
+            if outcome is Outcome.FINISHED and stop.lets_finish(lambda: self._adjust(driver, new)):
                 return outcome
             self.scene.refine(driver.progress.stage, BRIEFLY)
         except torch.cuda.OutOfMemoryError:
@@ -277,17 +276,16 @@ class TrackedVideo(Work):
             )
         return Outcome.STOPPED if outcome is Outcome.FINISHED else outcome
 
-    def _adjust(self, driver: Driver) -> None:
+    def _adjust(self, driver: Driver, new: Path) -> None:
         self.scene.adjust(driver.report)
         if self.scene.will_refine:
-            self._write_stage("adjusted", driver)
+            self._write_stage("adjusted", driver, new)
         self.scene.refine(driver.report)
 
-    def _write_stage(self, name: Literal["online", "adjusted"], driver: Driver) -> None:
+    def _write_stage(self, name: Literal["online", "adjusted"], driver: Driver, new: Path) -> None:
         """What there is by now, if it is asked for, and if there is a map."""
         if self.metadata.settings.online_results and not self.scene.world.maps_at_end:
-            write_stage(self.output, self.scene, driver.progress, name)
-            self.stages.append(name)
+            write_stage(new, self.scene, driver.progress, name)
 
 
 def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:

@@ -8,6 +8,7 @@ from jaxtyping import Bool
 
 from geogs.application.calibrate import self_calibrated, with_shutter_found
 from geogs.application.results.keyframe_files import write_keyframes
+from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.write import write_config
@@ -17,9 +18,9 @@ from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map_with_views
+from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mesh.triangle_mesh import Mesh
@@ -117,7 +118,8 @@ def load_slam(
 def save_slam(slam: Slam, folder: str | Path) -> Path:
     """Keep the map as it is now, to be loaded by :func:`load_slam` and ``geogs.load_result``.
 
-    Trajectory, camera, disks, and the keyframes' poses and images; returns the folder.
+    Trajectory, camera, disks, and the keyframes' poses and images, in place of what an earlier
+    result in the folder had; returns the folder.
 
     Raises:
         InputError: there is no map yet.
@@ -126,16 +128,16 @@ def save_slam(slam: Slam, folder: str | Path) -> Path:
     renders = slam.renders()
     if not len(renders):
         raise InputError("There is no map to save yet; no keyframe has been mapped.")
-    output, trajectory = prepare_output_folder(folder), slam.trajectory()
-    write_trajectories(output, trajectory, slam.keyframe_trajectory())
-    known = slam.uncertainty()
-    if known is not None:
-        write_uncertainty(output / "trajectory_uncertainty.csv", trajectory, known)
-    write_intrinsics(output / "intrinsics.json", slam.camera)
-    write_config(output / "config.yaml", slam.config)
-    views = write_keyframes(output, slam, slam.camera, renders, with_images=True)
-    metadata = {"source": "a Python program", "seed": slam.config.seed}
-    save_map_with_views(output / "map.safetensors", slam.snapshot(), views, metadata)
+    trajectory, known = slam.trajectory(), slam.uncertainty()
+    with claimed(Path(folder)) as output, replaced(output, "result") as new:
+        write_trajectories(new, trajectory, slam.keyframe_trajectory())
+        if known is not None:
+            write_uncertainty(new / "trajectory_uncertainty.csv", trajectory, known)
+        write_intrinsics(new / "intrinsics.json", slam.camera)
+        write_config(new / "config.yaml", slam.config)
+        views = write_keyframes(new, slam, slam.camera, renders, with_images=True)
+        metadata = {"source": "a Python program", "seed": slam.config.seed}
+        save_map_with_views(new / "map.safetensors", slam.snapshot(), views, metadata)
     return output
 
 

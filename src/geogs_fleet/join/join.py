@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
-from geogs.application.results.output_folder import remove_previous_output
 from geogs.application.results.result_page import write_report
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import lost_spans
@@ -20,6 +19,7 @@ from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.map_file import load_map_file
 from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.replacement import replaced
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot
@@ -73,6 +73,7 @@ class _Join:
         self.parts, self.config, self.workers, self.device = list(parts), config, workers, device
         self.output = output
         self.work = output / "join"
+        self.work.mkdir()
         self.files = [self.work / f"views-{n:04d}.safetensors" for n in range(len(parts))]
         self.camera = opened(parts[0]).camera
         self.stopwatch = Stopwatch()
@@ -160,14 +161,11 @@ def join_parts(
         raise InputError("There is one part only, which is whole already; give two or more.")
     begin = time.perf_counter()
     output = prepare_output_folder(output)
-    join = _Join(parts, output, config, workers, device)
-    shutil.rmtree(join.work, ignore_errors=True)
-    join.work.mkdir(parents=True)
-    try:
+    with replaced(output, "result") as new:
+        join = _Join(parts, new, config, workers, device)
         joint = _joined(join, adjust, say, begin)
-    finally:
-        shutil.rmtree(join.work, ignore_errors=True)
-    return joint
+        shutil.rmtree(join.work)
+    return replace(joint, output=output)
 
 
 def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float) -> Joint:
@@ -210,7 +208,6 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     with join.stopwatch("moving and merging maps"):
         disks = join.disks(gauge, placements)
     say(f"{len(disks)} disks.")
-    remove_previous_output(join.output)
     trajectory = write_poses(join.output, placed_parts)
     write_map(join.output, placed_parts, disks, join.camera, config)
     with join.stopwatch("mesh"):

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,9 @@ from jaxtyping import Float64
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.results.write import write_config
 from geogs.config import Config
+from geogs.documents import read_bytes
 from geogs.geometry.camera import Camera
-from geogs.io.writers.atomic import write_text
+from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.keyframe_folder import image_path, rows_path, write_image, write_rows
 from geogs.io.writers.map_file import MapViews, save_map_with_views
@@ -82,8 +82,9 @@ def write_map(
         for n, id in enumerate(part.result.views.keyframe_id.tolist()):
             target = image_path(output, count)
             if part.result.camera == camera:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(image_path(part.result.folder, id), target)
+                part.result.image(n)  # a picture, wherever a link leads
+                with atomic_file(target) as stream:
+                    stream.write(read_bytes(image_path(part.result.folder, id)))
             else:
                 write_image(target, image_of(part.result, n, camera))
             if n in own:

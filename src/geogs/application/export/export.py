@@ -12,6 +12,7 @@ from geogs.application.export.image_sets import (
 )
 from geogs.application.export.seen_points import cloud
 from geogs.application.result_settings import ExportSettings, Format
+from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.errors import InputError
@@ -20,6 +21,7 @@ from geogs.io.writers.exports.gsplat import write_gsplat_start
 from geogs.io.writers.exports.las import write_las
 from geogs.io.writers.exports.mesh_writers import write_glb, write_obj, write_textured_glb
 from geogs.io.writers.ply_writer import write_points, write_splats
+from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_euroc, write_kitti, write_tum_trajectory
 from geogs.mesh.texture.textured import texture_mesh
 from geogs.mesh.triangle_mesh import median_edge
@@ -37,6 +39,8 @@ _FILES: dict[Format, tuple[str, ...]] = {
     "tum": ("trajectory.txt", ".txt", ".tum"),
 }
 """Formats of a single file: its usual name, and how it may end."""
+_WITH_OTHERS = ("kitti",)
+"""Those of a file that has another beside it."""
 _SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
 """Endings of files; a folder is not named so."""
 
@@ -51,9 +55,20 @@ def export(settings: ExportSettings) -> Path:
         DeviceError: the device cannot be used.
     """
     result = load_result(settings.result, require_device(settings.device))
-    path = settings.output or result.folder / "export" / settings.to
-    if settings.to in _FILES:
-        path = _file(path, *_FILES[settings.to])
+    to, place = settings.to, settings.output or result.folder / "export" / settings.to
+    path = _file(place, *_FILES[to]) if to in _FILES else place
+    if path == settings.output and to in _FILES and to not in _WITH_OTHERS:
+        _write(path, result, settings)
+        return path
+    # Nothing below the folder that the user named, or that of the result, is believed to be there.
+    folder = result.folder if settings.output is None else path if to not in _FILES else path.parent
+    with claimed(folder) as output, replaced(output, "beside") as new:
+        _write(new / path.relative_to(folder), result, settings)
+    return path
+
+
+def _write(path: Path, result: SavedResult, settings: ExportSettings) -> None:
+    """Write an export to a file or into a folder."""
     match settings.to:
         case "colmap":
             write_colmap_set(path, result, settings.points, settings.text)
@@ -77,7 +92,6 @@ def export(settings: ExportSettings) -> Path:
             write_tum_trajectory(path, result.trajectory.of("tracked"))
         case "glb" | "obj":
             _write_mesh(path, result, settings)
-    return path
 
 
 def _file(place: Path, name: str, *suffixes: str) -> Path:

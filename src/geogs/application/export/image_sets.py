@@ -8,7 +8,7 @@ import torch
 
 from geogs.application.export.seen_points import seen_points
 from geogs.application.results.saved_result import SavedResult
-from geogs.errors import InputError
+from geogs.documents import read_bytes
 from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.colmap_writer import write_colmap_model
 from geogs.io.writers.exports.exported import ExportedImage
@@ -100,12 +100,11 @@ def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:
     views = result.views
     result.require_images()
     images = []
-    for id, T_cw in zip(views.keyframe_id.tolist(), views.T_cw, strict=True):
+    for number, (id, T_cw) in enumerate(zip(views.keyframe_id.tolist(), views.T_cw, strict=True)):
         kept = image_path(result.folder, id)
-        if not kept.is_file():
-            raise InputError(f"{kept} is missing; the result needs it.")
+        result.image(number)  # a picture, wherever a link leads
         with atomic_file(folder / "images" / kept.name) as stream:
-            stream.write(kept.read_bytes())
+            stream.write(read_bytes(kept))
         images.append(ExportedImage(kept.name, T_cw))
     return images
 

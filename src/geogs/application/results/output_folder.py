@@ -1,9 +1,8 @@
-"""The folder of a result: which is free, who may write there, what of a previous output goes."""
+"""The folder of a result: which is free, and who may write there."""
 
 import fcntl
 import os
-import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -11,17 +10,8 @@ from pathlib import Path
 from geogs.documents import read_json
 from geogs.errors import InputError, OutputError
 from geogs.io.writers.atomic import prepare_output_folder
+from geogs.io.writers.replacement import recover
 
-_FILES = (
-    "summary.json", "eval.json", "trajectory.tum", "keyframes.tum", "trajectory_uncertainty.csv",
-    "orientations.tum", "intrinsics.json", "config.yaml", "mesh.ply", "splats.ply",
-    "map.safetensors", "depth_fusion/mesh.ply",
-)  # fmt: skip
-"""In the order in which they go: the summary first, so that no half of a result has one."""
-_STAGES = ("online", "adjusted")
-_OF_A_STAGE = ("trajectory.tum", "orientations.tum", "keyframes.tum", "mesh.ply")
-_KEYFRAME = re.compile(r"\d{6,}\.(jpg|mask\.png)|rows\.safetensors")
-_REPORT = re.compile(r"\w+\.(png|html|css|js)")
 LOCK = ".geogs.lock"
 """Name of the file that is locked."""
 
@@ -71,34 +61,15 @@ def _is_locked(file: int, path: Path) -> bool:
 def claimed(folder: Path) -> Iterator[Path]:
     """The folder of a result, made where there is none; inside, nobody else writes there.
 
+    What a command left there that was cut off is completed or undone.
+
     Raises:
         OutputError: it cannot be made or written, or another process writes there.
     """
     output = prepare_output_folder(folder)
     with only_writer(output):
+        recover(output)
         yield output
-
-
-def remove_previous_output(folder: Path, new_stages: Collection[str] = ()) -> None:
-    """Delete the files of a previous output, so that none stays beside those of a new one.
-
-    Only files of names that geogs gives are touched; exports and what others put there stay, and
-    the folders of stages that are of the new result already.
-    """
-    stages = [
-        f"{stage}/{name}" for stage in _STAGES for name in _OF_A_STAGE if stage not in new_stages
-    ]
-    for name in (*_FILES, *stages):
-        _delete(folder / name)
-    for inner, names in (("keyframes", _KEYFRAME), ("report", _REPORT)):
-        place = folder / inner
-        if place.is_dir() and not place.is_symlink():
-            for path in list(place.iterdir()):
-                if names.fullmatch(path.name):
-                    _delete(path)
-    for inner in ("depth_fusion", *_STAGES, "keyframes", "report"):
-        with suppress(OSError):  # not empty, or not there
-            (folder / inner).rmdir()
 
 
 def free_folder(wanted: Path, fingerprint: str) -> Path:
@@ -133,8 +104,3 @@ def _begun_with(folder: Path) -> str | None:
         return SavedRun(folder).metadata.fingerprint
     except InputError:
         return None
-
-
-def _delete(path: Path) -> None:
-    with suppress(OSError):
-        path.unlink()

@@ -4,8 +4,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from geogs.application.result_settings import RemeshSettings
+from geogs.application.results.output_folder import claimed
 from geogs.application.results.result_page import write_page_anew
-from geogs.application.results.saved_result import load_result
+from geogs.application.results.saved_result import SavedResult, load_result, result_folder
 from geogs.application.results.surfaces import fusion_views
 from geogs.application.run_progress import RunProgress
 from geogs.config import MeshConfig
@@ -14,7 +15,9 @@ from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.writers.ply_writer import write_mesh
+from geogs.io.writers.replacement import replaced
 from geogs.mesh.extract import extract_mesh
+from geogs.mesh.triangle_mesh import Mesh
 
 
 def mesh_settings(folder: Path) -> MeshConfig:
@@ -49,16 +52,25 @@ def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Pat
         DeviceError: the device cannot be used.
     """
     follow = progress or RunProgress()
-    path = settings.output or settings.result / "mesh.ply"
+    folder = result_folder(settings.result)
+    path = settings.output or folder / "mesh.ply"
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path} should end in .ply; geogs export writes other formats.")
-    result = load_result(settings.result, require_device(settings.device))
-    mesh = extract_mesh(
+    if path != folder / "mesh.ply":
+        mesh = _mesh_of(load_result(folder, require_device(settings.device)), settings, follow)
+        write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        return path
+    with claimed(folder), replaced(folder, "part") as new:
+        result = load_result(folder, require_device(settings.device))
+        mesh = _mesh_of(result, settings, follow)
+        write_mesh(new / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        write_page_anew(new, result, mesh)
+    return path
+
+
+def _mesh_of(result: SavedResult, settings: RemeshSettings, progress: RunProgress) -> Mesh:
+    return extract_mesh(
         fusion_views(result.keyframes),
         settings.mesh,
-        lambda part, done, of: follow.stage(f"mesh: {part}", done / of),
+        lambda part, done, of: progress.stage(f"mesh: {part}", done / of),
     )
-    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
-    if path == settings.result / "mesh.ply":
-        write_page_anew(settings.result)
-    return path

@@ -1,6 +1,7 @@
 """A result in metres by what is known of it afterwards, without running again."""
 
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,18 @@ from typing import Any
 import numpy as np
 
 from geogs.application.result_settings import RescaleSettings
+from geogs.application.results.output_folder import claimed
 from geogs.application.results.result_page import write_page_anew
-from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.scale.known_length import HOW, SensorScale, find_scale, scale_source
+from geogs.application.results.saved_result import SavedResult, load_result, result_folder
+from geogs.application.scale.known_length import (
+    HOW,
+    KnownLength,
+    SensorScale,
+    find_scale,
+    scale_source,
+)
 from geogs.application.scale.measurable_scene import SeenKeyframe, measurable
+from geogs.documents import UNUSABLE
 from geogs.errors import InputError
 from geogs.evaluation.true_scene import scaled
 from geogs.gpu.installation import require_device
@@ -19,11 +28,13 @@ from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.writers.atomic import write_text
-from geogs.io.writers.map_file import load_map_file, save_map_with_views
+from geogs.io.writers.map_file import MapViews, load_map_file, save_map_with_views
 from geogs.io.writers.ply_writer import SH_DEGREE_0, write_mesh, write_splats
+from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mesh.mesh_file import read_mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.on_demand import OnDemand
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, MetricScale
@@ -35,8 +46,7 @@ _STAGES = ("", "online/", "adjusted/")
 def rescale(settings: RescaleSettings) -> MetricScale:
     """Find metres to the map unit, and write trajectories, map, meshes and summary in metres.
 
-    The summary goes first and comes last, so that no half of a result has one. Exports that were
-    made before stay what they are.
+    All take the places of the former together. Exports that were made before stay what they are.
 
     Raises:
         InputError: there is no result, nothing is known, or the result does not tell its scale.
@@ -46,47 +56,75 @@ def rescale(settings: RescaleSettings) -> MetricScale:
     source = scale_source(settings.scale_from)
     if source is None or isinstance(source, SensorScale):
         raise InputError(f"Nothing is known of the scale; {HOW.replace(' or sensor', '')}.")
-    folder = settings.result
-    result = load_result(folder, require_device(settings.device))
-    summary, calibration = dict(result.summary), read_calibration(folder / "intrinsics.json")
-    camera = result.camera
+    folder = result_folder(settings.result)
+    with claimed(folder), replaced(folder, "part") as new:
+        result = load_result(folder, require_device(settings.device))
+        factor_before = _factor(result)
+        found = _found(result, source)
+        summary = {
+            **result.summary,
+            "scale": f"metric ({found.origin})",
+            "metric_scale": asdict(replace(found, factor=factor_before * found.factor)),
+        }
+        _scale_files(new, result, found.factor, summary)
+    return found
+
+
+def _factor(result: SavedResult) -> float:
+    """What lengths were multiplied by before. Raises InputError if the summary does not say."""
+    before = result.summary.get("metric_scale")
+    try:
+        factor = 1.0 if before is None else float(before["factor"])
+    except UNUSABLE:
+        factor = 0.0
+    if not 0 < factor < math.inf:
+        path = result.folder / "summary.json"
+        raise InputError(f"{path} does not say by which factor it is metric; was it changed?")
+    return factor
+
+
+def _found(result: SavedResult, source: KnownLength) -> MetricScale:
+    camera, views = result.camera, result.views
+    calibration = read_calibration(result.folder / "intrinsics.json")
     if calibration.width is None:
         calibration = replace(calibration, width=camera.width, height=camera.height)
-    views = result.views
 
     def seen(number: int) -> SeenKeyframe:
         return SeenKeyframe(views.T_cw[number], result.image(number))
 
     keyframes = OnDemand(range(len(views.keyframe_id)), seen)
     scene = measurable(camera, result.renderer, keyframes, result.trajectory)
-    found = find_scale(scene, source, calibration)
-    (folder / "summary.json").unlink()
-    _scale_files(result, found.factor)
-    write_text(folder / "summary.json", json.dumps(_scaled_summary(summary, found), indent=2))
-    write_page_anew(folder)
-    return found
+    return find_scale(scene, source, calibration)
 
 
-def _scale_files(result: SavedResult, factor: float) -> None:
+def _scale_files(new: Path, result: SavedResult, factor: float, summary: dict[str, Any]) -> None:
     """All files of a result that hold lengths, multiplied."""
     folder, disks = result.folder, result.disks
     world = replace(disks, position=factor * disks.position, scale=factor * disks.scale)
     colours = _splat_colours(folder / "splats.ply", len(disks))
-    _scale_map(result, world, factor)
+    moved = _scale_map(new, result, world, factor)
     for stage in _STAGES:
         for name in ("trajectory.tum", "keyframes.tum"):
-            _scale_poses(folder / f"{stage}{name}", factor)
-        _scale_mesh(folder / f"{stage}mesh.ply", factor)
-    _scale_mesh(folder / "depth_fusion" / "mesh.ply", factor)
-    _scale_table(folder / "trajectory_uncertainty.csv", factor)
+            _scale_poses(folder, new, f"{stage}{name}", factor)
+    meshes = [
+        _scale_mesh(folder, new, f"{stage}mesh.ply", factor)
+        for stage in (*_STAGES, "depth_fusion/")
+    ]
+    table = "trajectory_uncertainty.csv"
+    if (folder / table).is_file():
+        write_text(new / table, "\n".join([HEADER, *moved_rows(folder / table, factor), ""]))
     if colours is not None:
-        write_splats(folder / "splats.ply", world, colours)
+        write_splats(new / "splats.ply", world, colours)
+    write_text(new / "summary.json", json.dumps(summary, indent=2))
+    trajectory = scaled(result.trajectory, factor)
+    write_page_anew(new, replace(result, disks=world, views=moved), meshes[0], trajectory, summary)
 
 
-def _scale_map(result: SavedResult, world: MapSnapshot, factor: float) -> None:
+def _scale_map(new: Path, result: SavedResult, world: MapSnapshot, factor: float) -> MapViews:
     """``map.safetensors`` with the disks as they are in metres."""
-    path, views = result.folder / "map.safetensors", result.views
-    said = {k: v for k, v in load_map_file(path).metadata.items() if k != "views"}
+    views = result.views
+    metadata = load_map_file(result.folder / "map.safetensors").metadata
+    said = {k: v for k, v in metadata.items() if k != "views"}
     T_cw = views.T_cw.copy()
     T_cw[:, :3, 3] *= factor
     # A map in the world's own frame stays in it; another keeps its digits in its own unit.
@@ -98,7 +136,8 @@ def _scale_map(result: SavedResult, world: MapSnapshot, factor: float) -> None:
         disks=world if own is None else own,
         T_cw=T_cw,
     )
-    save_map_with_views(path, world, moved, said)
+    save_map_with_views(new / "map.safetensors", world, moved, said)
+    return moved
 
 
 def _splat_colours(path: Path, count: int) -> np.ndarray | None:
@@ -113,25 +152,15 @@ def _splat_colours(path: Path, count: int) -> np.ndarray | None:
     return colours
 
 
-def _scale_poses(path: Path, factor: float) -> None:
-    if path.is_file():
-        write_tum_trajectory(path, scaled(read_tum_trajectory(path), factor))
+def _scale_poses(folder: Path, new: Path, name: str, factor: float) -> None:
+    if (folder / name).is_file():
+        write_tum_trajectory(new / name, scaled(read_tum_trajectory(folder / name), factor))
 
 
-def _scale_mesh(path: Path, factor: float) -> None:
-    if path.is_file():
-        mesh = read_mesh(path)
-        write_mesh(path, factor * mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
-
-
-def _scale_table(path: Path, factor: float) -> None:
-    if path.is_file():
-        write_text(path, "\n".join([HEADER, *moved_rows(path, factor), ""]))
-
-
-def _scaled_summary(summary: dict[str, Any], found: MetricScale) -> dict[str, Any]:
-    """The summary with the scale; what had multiplied lengths before is multiplied in."""
-    before = summary.get("metric_scale")
-    factor = float(before["factor"]) if isinstance(before, dict) else 1.0
-    metric = asdict(replace(found, factor=factor * found.factor))
-    return {**summary, "scale": f"metric ({found.origin})", "metric_scale": metric}
+def _scale_mesh(folder: Path, new: Path, name: str, factor: float) -> Mesh | None:
+    if not (folder / name).is_file():
+        return None
+    mesh = read_mesh(folder / name)
+    mesh = replace(mesh, vertices=factor * mesh.vertices)
+    write_mesh(new / name, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    return mesh

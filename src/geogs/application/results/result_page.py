@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.application.results.saved_result import SavedResult, load_result
+from geogs.application.results.saved_result import SavedResult
 from geogs.evaluation.model_view.shown_model import (
     Colouring,
     DiskModel,
@@ -58,7 +59,6 @@ def write_report(
     from geogs.evaluation.pages import run_pictures
     from geogs.evaluation.pages.run_page import write_run_page
 
-    folder.mkdir(exist_ok=True)
     run_pictures.draw_path(folder / "trajectory.png", trajectory)
     if renders:
         numbers = np.linspace(0, len(renders) - 1, min(5, len(renders))).round().astype(int)
@@ -75,21 +75,32 @@ def write_report(
     write_run_page(folder, summary, model)
 
 
-def write_page_anew(folder: Path) -> None:
+def write_page_anew(
+    new: Path,
+    result: SavedResult,
+    mesh: Mesh | None,
+    trajectory: Trajectory | None = None,
+    summary: Mapping[str, Any] | None = None,
+) -> None:
     """The page of a result whose mesh is another now; where it has none, nothing.
 
+    ``new`` is the folder of its new files. Trajectory and summary are those of the result where
+    none are given.
+
     Raises:
+        InputError: what it shows is damaged.
         OutputError: it cannot be written.
     """
     from geogs.evaluation.pages.run_page import write_run_page
 
-    if not (folder / "summary.json").is_file() or not (folder / "report").is_dir():
+    if not (result.folder / "summary.json").is_file() or not (result.folder / "report").is_dir():
         return
-    result = load_result(folder)
-    mesh, disks = result.mesh, result.disks
+    trajectory = result.trajectory if trajectory is None else trajectory
+    summary = result.summary if summary is None else summary
     faces = 0 if mesh is None else len(mesh.faces)
-    model = shown_model(result.trajectory, shown_views(result), result.camera, mesh, disks)
-    write_run_page(folder / "report", {**result.summary, "mesh_faces": faces}, model)
+    model = shown_model(trajectory, shown_views(result), result.camera, mesh, result.disks)
+    pictures = result.folder / "report"
+    write_run_page(new / "report", {**summary, "mesh_faces": faces}, model, pictures)
 
 
 def shown_views(result: SavedResult) -> list[ShownView]:

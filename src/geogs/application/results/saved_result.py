@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from geogs.application.results.output_folder import claimed
 from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -26,6 +27,7 @@ from geogs.io.writers.keyframe_folder import (
     rows_path,
 )
 from geogs.io.writers.map_file import MapViews, load_map_views
+from geogs.io.writers.replacement import is_half_done
 from geogs.io.writers.uncertainty import read_states
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
@@ -187,11 +189,26 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
 
     Raises:
         InputError: there is no result, it is damaged, or an older geogs wrote it.
+        OutputError: a command was cut off as it replaced it, and that cannot be completed.
+    """
+    folder = result_folder(folder)
+    return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
+
+
+def result_folder(folder: str | Path) -> Path:
+    """The folder of a result, in which nothing is half replaced.
+
+    Raises:
+        InputError: there is no result.
+        OutputError: as of ``load_result``.
     """
     folder = expanded(folder)
+    if is_half_done(folder):
+        with claimed(folder):
+            pass
     if not (folder / "map.safetensors").is_file():
         raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
-    return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
+    return folder
 
 
 def _check_size(path: Path, picture: np.ndarray, camera: Camera) -> None:

@@ -1,48 +1,57 @@
 """Everything that a run or a reconstruction leaves in its folder."""
 
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
-from geogs.application.results.output_folder import remove_previous_output
+from geogs.application.results.output_folder import claimed
 from geogs.application.results.result import Result
 from geogs.application.results.result_page import write_report
 from geogs.application.results.summary import summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import Config, ReconstructConfig
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map_with_views
 from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
 from geogs.types import RenderedKeyframe
 
 
-@on_one_torch_thread
-def write_results(
-    output: str | Path,
-    result: Result,
-    write_more: Callable[[], None] = lambda: None,
-    keyframe_images: bool = True,
-    new_stages: Collection[str] = (),
-) -> None:
-    """Write poses first, then map and mesh beside each other, what else was asked for, the report.
+def write_results(output: str | Path, result: Result, keyframe_images: bool = True) -> None:
+    """Write all files of a result into a folder, in place of those of an earlier one.
 
-    ``write_more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether
-    the images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
-    ``new_stages`` names folders of stages that are of this one.
+    ``keyframe_images`` says whether the images of the keyframes are kept, too. Where a file cannot
+    be written, the earlier result stays.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    output = prepare_output_folder(output)
-    remove_previous_output(output, new_stages)
+    with claimed(Path(output)) as folder, replaced(folder, "result") as new:
+        write_files(new, result, keyframe_images=keyframe_images)
+
+
+@on_one_torch_thread
+def write_files(
+    output: Path,
+    result: Result,
+    write_more: Callable[[], None] = lambda: None,
+    keyframe_images: bool = True,
+) -> None:
+    """Write poses first, then map and mesh beside each other, what else was asked for, the report.
+
+    ``write_more`` writes the rest, which the summary then counts.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
     scene, source, progress = result.scene, result.source, result.progress
     write_trajectories(output, result.trajectory, result.keyframes)
     if result.uncertainty is not None:

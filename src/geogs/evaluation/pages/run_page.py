@@ -28,14 +28,18 @@ Show = Callable[[Any], str]
 
 
 def write_run_page(
-    folder: Path, summary: Mapping[str, Any], model: ShownModel | None = None
+    folder: Path,
+    summary: Mapping[str, Any],
+    model: ShownModel | None = None,
+    pictures: Path | None = None,
 ) -> None:
-    """Write ``index.html`` into the folder of the pictures; it holds all that it shows.
+    """Write ``index.html``, which holds all that it shows.
 
     Args:
         folder: ``report/`` of a result.
         summary: what ``summary.json`` holds; numbers that are not there are left out.
         model: what turns at its head.
+        pictures: folder of the run's pictures; the same if none is given.
 
     Raises:
         OutputError: it cannot be written.
@@ -43,8 +47,9 @@ def write_run_page(
     name = _shown(str, summary.get("source")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
     head += [HtmlSection(model_html(model))] if model is not None else []
-    pictures = [PictureSection(title, folder / file) for file, title in PICTURES.items()]
-    sections = [*head, *pictures, *run_sections(summary)]
+    place = folder if pictures is None else pictures
+    shown = [PictureSection(title, place / file) for file, title in PICTURES.items()]
+    sections = [*head, *shown, *run_sections(summary)]
     write_page(folder / "index.html", name, sections, "geogs", is_whole=True)
 
 

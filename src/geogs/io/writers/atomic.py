@@ -13,6 +13,7 @@ from geogs.documents import expanded
 from geogs.errors import OutputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_ELSEWHERE = "give another output folder"
 
 
 @contextmanager
@@ -36,7 +37,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
             os.fsync(stream.fileno())
         os.replace(unfinished, path)
     except OSError as error:
-        raise OutputError(_sentence(path, error)) from error
+        raise unwritable(path, error) from error
     finally:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
@@ -64,14 +65,13 @@ def prepare_output_folder(path: str | Path) -> Path:
         with TemporaryFile(dir=folder):
             return folder
     except OSError as error:
-        raise OutputError(_sentence(folder, error)) from error
+        raise unwritable(folder, error) from error
 
 
-def _sentence(path: Path, error: OSError) -> str:
-    reason = error.strerror or str(error)
-    if error.errno in _FULL:
-        return f"{path} cannot be written ({reason}); free some space on {_disk_of(path)}."
-    return f"{path} cannot be written ({reason}); give another output folder."
+def unwritable(path: Path, error: OSError) -> OutputError:
+    """What to raise where a file or folder cannot be written."""
+    remedy = f"free some space on {_disk_of(path)}" if error.errno in _FULL else _ELSEWHERE
+    return OutputError(f"{path} cannot be written ({error.strerror or error}); {remedy}.")
 
 
 def _disk_of(path: Path) -> str:

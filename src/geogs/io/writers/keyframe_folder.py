@@ -79,7 +79,6 @@ def write_rows(path: Path, rows: Mapping[int, SeenRows]) -> None:
         "seconds": torch.stack([r.seconds for r in seen]).cpu().half(),
         "doubt": torch.tensor([r.doubt for r in seen], dtype=torch.float64),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as stream:
         stream.write(save(tensors))
 

@@ -57,8 +57,15 @@ def save_map(
         "version": str(FORMAT_VERSION),
         "metadata": json.dumps(dict(metadata)),
     }
+    # The library would write the metadata in an order of its own, another in every process.
+    data = memoryview(save({**more, **own}))
+    end = 8 + int.from_bytes(data[:8], "little")
+    table = {"__metadata__": header, **json.loads(bytes(data[8:end]))}
+    text = json.dumps(table, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
     with atomic_file(path) as stream:
-        stream.write(save({**more, **own}, metadata=header))
+        stream.write(len(text).to_bytes(8, "little") + text)
+        stream.write(data[end:])
 
 
 def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapshot:

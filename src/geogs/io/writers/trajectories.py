@@ -26,8 +26,6 @@ def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) 
     if len(turned.timestamps):
         turned.T_wc[:, :3, 3] = 0
         write_tum_trajectory(folder / ORIENTATIONS, turned)
-    else:
-        (folder / ORIENTATIONS).unlink(missing_ok=True)  # of an earlier result
     write_tum_trajectory(folder / "keyframes.tum", keyframes)
 
 

@@ -1,0 +1,182 @@
+"""A folder held open: what is done in it by name stays in it, as no link in it is followed."""
+
+import errno
+import hashlib
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import BufferedReader
+from pathlib import Path
+
+_BY_HANDLE = hasattr(os, "O_NOFOLLOW") and os.supports_dir_fd >= {
+    os.open, os.mkdir, os.rename, os.unlink, os.rmdir, os.stat,
+}  # fmt: skip
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
+_FILE = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+
+
+class Directory:
+    """A folder, by its handle; where the system has none, by its path, looked at before each use.
+
+    Names have ``/`` between folders. Whatever a name leads through has to be a folder in the one
+    before, and what it names is taken as it is: a link is moved or deleted itself.
+
+    Every method raises OSError, also for a name that leads elsewhere.
+    """
+
+    def __init__(self, path: Path, handle: int | None) -> None:
+        self.path = path
+        self._handle = handle
+
+    @staticmethod
+    @contextmanager
+    def opened(path: Path) -> Iterator["Directory"]:
+        """The folder of a path that the user gave: links may lead to it, but not on from it."""
+        if not _BY_HANDLE:
+            yield Directory(path, None)
+            return
+        handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            yield Directory(path, handle)
+        finally:
+            os.close(handle)
+
+    @contextmanager
+    def inner(self, name: str) -> Iterator["Directory"]:
+        """A folder in this one."""
+        with self._parent(name) as (parent, last), parent._folder(last) as folder:
+            yield folder
+
+    def names(self) -> list[str]:
+        """What is in it, in order."""
+        return sorted(os.listdir(self.path if self._handle is None else self._handle))
+
+    def folders(self) -> Iterator[str]:
+        """Names of all folders below, each before those in it."""
+        for name in self.names():
+            if self.is_folder(name):
+                yield name
+                with self.inner(name) as inner:
+                    yield from (f"{name}/{below}" for below in inner.folders())
+
+    def files(self) -> Iterator[str]:
+        """Names of all below that is no folder."""
+        for folder in (".", *self.folders()):
+            with self.inner(folder) as inner:
+                yield from (
+                    name if folder == "." else f"{folder}/{name}"
+                    for name in inner.names()
+                    if not inner.is_folder(name)
+                )
+
+    def is_folder(self, name: str) -> bool:
+        """Whether there is a folder of that name; a link is none."""
+        with self._parent(name) as (parent, last), suppress(FileNotFoundError):
+            return stat.S_ISDIR(parent._status(last).st_mode)
+        return False
+
+    def number(self, name: str) -> int:
+        """The number by which the file system knows what has that name."""
+        with self._parent(name) as (parent, last):
+            return parent._status(last).st_ino
+
+    def read(self, name: str, largest: int) -> bytes:
+        """The beginning of a plain file, up to so many bytes."""
+        with self._file(name) as file:
+            return file.read(largest)
+
+    def sha256(self, name: str) -> str:
+        """Digest of a plain file."""
+        with self._file(name) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    def make(self, name: str) -> bool:
+        """Make a folder; whether there was none."""
+        with self._parent(name) as (parent, last):
+            if parent.is_folder(last):
+                return False
+            try:
+                os.mkdir(parent._at(last), dir_fd=parent._handle)
+            except FileExistsError:
+                with parent._folder(last):
+                    return False
+            return True
+
+    def move(self, name: str, target: "Directory", new_name: str) -> None:
+        """Give it a name in another folder, in place of what had that."""
+        with self._parent(name) as (here, old), target._parent(new_name) as (there, new):
+            os.replace(
+                here._at(old), there._at(new), src_dir_fd=here._handle, dst_dir_fd=there._handle
+            )
+
+    def delete(self, name: str) -> None:
+        """Delete a file, and the folders that it lay in as far as they are empty now."""
+        with self._parent(name) as (parent, last):
+            os.unlink(parent._at(last), dir_fd=parent._handle)
+        with suppress(OSError):
+            while "/" in name:
+                name = name.rpartition("/")[0]
+                self.delete_empty(name)
+
+    def delete_empty(self, name: str) -> None:
+        """Delete a folder that has nothing in it."""
+        with self._parent(name) as (parent, last):
+            os.rmdir(parent._at(last), dir_fd=parent._handle)
+
+    def delete_all(self, name: str) -> None:
+        """Delete a folder with all that is in it, as far as that can be."""
+        with self._parent(name) as (parent, last):
+            shutil.rmtree(parent._at(last), ignore_errors=True, dir_fd=parent._handle)
+
+    def sync(self) -> None:
+        """Wait until its names are on the disk."""
+        if self._handle is not None:
+            with suppress(OSError):  # not every file system does that
+                os.fsync(self._handle)
+
+    def _at(self, name: str) -> str:
+        """What the system is given for a name in this folder."""
+        return name if self._handle is not None else str(self.path / name)
+
+    def _status(self, name: str) -> os.stat_result:
+        return os.stat(self._at(name), dir_fd=self._handle, follow_symlinks=False)
+
+    @contextmanager
+    def _parent(self, name: str) -> Iterator[tuple["Directory", str]]:
+        """The folder in which the last part of a name lies, and that part."""
+        first, _, rest = name.partition("/")
+        if not first or first == ".." or "\0" in name or (first == "." and rest):
+            raise FileNotFoundError(f"{name!r} is no name of what is in a folder")
+        if not rest:
+            yield self, first
+            return
+        with self._folder(first) as folder, folder._parent(rest) as found:
+            yield found
+
+    @contextmanager
+    def _folder(self, name: str) -> Iterator["Directory"]:
+        path = self.path / name
+        if not stat.S_ISDIR(self._status(name).st_mode):
+            reason = f"{path} is a link or no folder, and no link is followed"
+            raise NotADirectoryError(errno.ENOTDIR, reason)
+        if self._handle is None:
+            yield Directory(path, None)
+            return
+        handle = os.open(name, _FOLDER, dir_fd=self._handle)
+        try:
+            yield Directory(path, handle)
+        finally:
+            os.close(handle)
+
+    @contextmanager
+    def _file(self, name: str) -> Iterator[BufferedReader]:
+        with self._parent(name) as (parent, last):
+            if self._handle is None and not stat.S_ISREG(parent._status(last).st_mode):
+                raise FileNotFoundError(f"{name} is no plain file")
+            number = os.open(parent._at(last), _FILE, dir_fd=parent._handle)
+        with os.fdopen(number, "rb") as file:
+            if not stat.S_ISREG(os.fstat(number).st_mode):
+                raise FileNotFoundError(f"{name} is no plain file")
+            yield file

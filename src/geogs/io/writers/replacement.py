@@ -1,0 +1,202 @@
+"""The files of a command take their places together, or none of them does.
+
+New files are written into a folder of their own beside the old ones, which geogs makes and so has
+no links in it. Until the last of them is on the disk nothing else in the folder is touched; where
+the disk is full or the command ends before, it goes, and all is as it was. Then
+
+1. the folders that the files need are made, or are seen to be folders and no links,
+2. the new folder is renamed from ``.geogs.N.new`` to ``.geogs.N.ready``, by which it counts,
+3. every file is renamed into its place, files of the previous result that the new one has no others
+   for are deleted, and last the list of the result's files is renamed into its place.
+
+A process that is killed before the second step leaves a folder that the next command deletes; one
+that is killed after it a folder whose files the next command puts into their places. Of the third
+step every part may be done twice. It takes no space but what folders grow by for new names, so a
+disk that was not full before the second step is not full in it.
+
+Other programs open files by their names, which stay what they are: they see each file old or new
+and whole, and for as long as the third step takes some old beside some new ones. (A link to a
+folder of one result or the next would spare them that, but on many disks there are no links, and
+copies of the folder would be of the link.) Nothing of geogs reads such a mixture.
+
+What may be deleted says the list, ``.geogs.json``: the names and SHA-256 of the files of the
+result, which lies among the new files before any of these has its place. A list may come from
+somebody else: names in it lead nowhere out of the folder, and a file that holds anything else than
+geogs wrote stays. Folders of new files say in their names (N) by which number the file system knows
+them, so that one that was made elsewhere and copied here is not taken for one of ours.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from secrets import token_hex
+from typing import Literal
+
+from geogs.documents import UNUSABLE
+from geogs.errors import OutputError
+from geogs.io.writers.atomic import unwritable, write_text
+from geogs.io.writers.directory import Directory
+
+LIST = ".geogs.json"
+"""Name of the list of a result's files."""
+_NEW = re.compile(r"\.geogs\.(\d{1,20})\.(new|ready)")
+_MARKS = ("summary.json", "map.safetensors")
+"""What every result has, so that what it is can be told without a list."""
+_FOLDERS = ("adjusted", "depth_fusion", "keyframes", "online", "report", "snapshots")
+"""What a result may need, looked at before it is worked for."""
+_LARGEST_LIST = 1 << 26
+"""Bytes; there are about a hundred for every file."""
+
+Extent = Literal["result", "part", "beside"]
+"""A whole result, in place of the previous one; some files of the one that is there; or files that
+no later result replaces, such as exports."""
+
+
+@contextmanager
+def replaced(folder: Path, what: Extent) -> Iterator[Path]:
+    """Yield a folder for new files; they take their places when the block ends without an error.
+
+    Nobody else may write there meanwhile. What is new has the name that it has in the new folder.
+
+    Raises:
+        OutputError: something cannot be written, a link or something else is in the way, or a
+            result is to take the place of one that has no list of its files.
+    """
+    with _sentence(folder), Directory.opened(folder) as place:
+        if what == "result":
+            _check(place)
+        new = _begun(place)
+    try:
+        yield folder / new
+    except BaseException:
+        with suppress(OSError), Directory.opened(folder) as place:
+            place.delete_all(new)
+        raise
+    with _sentence(folder), Directory.opened(folder) as place:
+        _put_in_place(place, _committed(place, new, what))
+
+
+def is_half_done(folder: Path) -> bool:
+    """Whether a command was cut off there while it put new files into their places."""
+    with suppress(OSError), Directory.opened(folder) as place:
+        return any(name.endswith(".ready") for name in _ours(place))
+    return False
+
+
+def recover(folder: Path) -> None:
+    """Complete or undo what a command left that was cut off; nobody else may write there meanwhile.
+
+    Raises:
+        OutputError: that cannot be done.
+    """
+    with _sentence(folder), Directory.opened(folder) as place:
+        for name in _ours(place):
+            if name.endswith(".ready"):
+                _put_in_place(place, name)
+            else:
+                place.delete_all(name)
+
+
+def _check(place: Directory) -> None:
+    """Raises what a whole result would raise at its end, where that can be told before."""
+    names, listed = place.names(), _listed(place)
+    if any(mark in names and mark not in listed for mark in _MARKS):
+        raise OutputError(
+            f"{place.path} holds a result that has no list of its files ({LIST}), as an earlier "
+            "geogs wrote it: delete it, or give another folder (-o)."
+        )
+    for name in _FOLDERS:
+        if name in names:
+            with place.inner(name):
+                pass
+
+
+def _begun(place: Directory) -> str:
+    """Name of a folder for new files, which is there now."""
+    name = f".geogs.{token_hex(6)}.part"
+    place.make(name)
+    new = f".geogs.{place.number(name)}.new"
+    place.move(name, place, new)
+    return new
+
+
+def _ours(place: Directory) -> list[str]:
+    """Folders of new files that were made there."""
+    found = [match for name in place.names() if (match := _NEW.fullmatch(name))]
+    return [match[0] for match in found if place.number(match[0]) == int(match[1])]
+
+
+def _committed(place: Directory, new: str, what: Extent) -> str:
+    """The name of the new folder from where on it counts."""
+    made: list[str] = []
+    try:
+        with place.inner(new) as files:
+            if what != "beside":
+                own = {name: files.sha256(name) for name in files.files()}
+                listed = own if what == "result" else {**_listed(place), **own}
+                text = json.dumps({"files": listed}, indent=0, sort_keys=True)
+                write_text(files.path / LIST, text + "\n")
+            for folder in files.folders():
+                if place.make(folder):
+                    made.append(folder)
+            for name in files.files():
+                if place.is_folder(name):
+                    raise OutputError(f"{place.path / name} is a folder; a file is to be there.")
+        ready = new.replace(".new", ".ready")
+        place.move(new, place, ready)
+    except BaseException:
+        place.delete_all(new)
+        with suppress(OSError):
+            for folder in reversed(made):
+                place.delete_empty(folder)
+        raise
+    place.sync()
+    return ready
+
+
+def _put_in_place(place: Directory, ready: str) -> None:
+    """The third step, or what is left of it."""
+    try:
+        _move_all(place, ready)
+    except OSError as error:
+        raise OutputError(
+            f"Some files of {place.path} are new and some old ({error.strerror or error}); the "
+            "next command there puts the others into their places."
+        ) from error
+
+
+def _move_all(place: Directory, ready: str) -> None:
+    with place.inner(ready) as new:
+        for folder in new.folders():
+            place.make(folder)
+        names = [name for name in new.files() if name != LIST]
+        # Whoever waits for a result waits for its summary.
+        for name in sorted(names, key=lambda name: name == "summary.json"):
+            new.move(name, place, name)
+        if LIST in new.names():
+            listed = _listed(place)
+            for name in listed.keys() - _listed(new).keys():
+                with suppress(OSError):  # not there, or not what geogs wrote
+                    if place.sha256(name) == listed[name]:
+                        place.delete(name)
+            new.move(LIST, place, LIST)
+    place.delete_all(ready)
+
+
+def _listed(place: Directory) -> dict[str, str]:
+    """Names and digests of the files of a result; none where there is no list."""
+    try:
+        files = json.loads(place.read(LIST, _LARGEST_LIST))["files"]
+        return {str(name): str(digest) for name, digest in files.items()}
+    except (OSError, *UNUSABLE):
+        return {}
+
+
+@contextmanager
+def _sentence(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(folder, error) from error
