@@ -1,6 +1,5 @@
 """The frames of a video that structure from motion works on: the sharp ones, evenly spread."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -10,11 +9,6 @@ from jaxtyping import Float64, UInt8
 
 from geogs.types import Frame
 
-SECONDS = 0.33
-"""Time from which one frame is taken."""
-FEWEST, MOST = 40, 250
-"""Frames to take of a video whose length is known, at least and at most."""
-
 
 @dataclass(frozen=True, slots=True)
 class ChosenFrames:
@@ -23,14 +17,6 @@ class ChosenFrames:
     frames: tuple[Frame, ...]
     timestamps: Float64[np.ndarray, "n"]
     """Times of all frames of the video, seconds."""
-
-
-def stretch_length(fps: float, length: int | None) -> int:
-    """Frames of which one is taken."""
-    every = max(1, round(SECONDS * fps))
-    if length is not None:
-        every = max(math.ceil(length / MOST), min(every, max(1, length // FEWEST)))
-    return every
 
 
 def sharpest_frames(frames: Iterable[Frame], every: int) -> ChosenFrames:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from geogs.application.photos import PlacedVideo
+from geogs.application.photos import PlacedVideo, stretch_length
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
@@ -22,7 +22,7 @@ from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.poses import Progress, structure_of
 from geogs_photos.pycolmap_library import load_colmap
-from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
+from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames
 from geogs_photos.upright import upright_rotation
 
 NEXT = 6

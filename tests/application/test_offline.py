@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application import offline
+from geogs.application import offline, photos
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
-from geogs_photos import sharp_frames
 from io_samples import write_image
 from posed_layouts import render_room
 from posed_scene import SMALL
@@ -21,8 +20,8 @@ FRAMES = 12
 @pytest.mark.system
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(sharp_frames, "FEWEST", FRAMES // 2)
-    monkeypatch.setattr(offline, "ReconstructConfig", lambda: SMALL)
+    monkeypatch.setattr(photos, "FEWEST", FRAMES // 2)
+    monkeypatch.setattr(offline, "reconstruct_preset", lambda _: SMALL)
     room = render_room(FRAMES, 3, 320, 240)
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.photos import PlacedVideo
+from geogs.application.photos import PlacedVideo, stretch_length
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
 from geogs_photos.localise import Localiser, matches_to_points
 from geogs_photos.photo_features import find_features
-from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, sharpness, stretch_length
+from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, sharpness
 from geogs_photos.video import place_frames
 from lit_rooms import lit_room
 from posed_layouts import render_room
@@ -31,7 +31,7 @@ def test_of_each_stretch_the_sharpest_frame_is_taken():
 
 @pytest.mark.parametrize(
     ("fps", "length", "every"),
-    [(30.0, None, 10), (30.0, 1000, 10), (30.0, 100, 2), (30.0, 10_000, 40)],
+    [(30.0, None, 10), (30.0, 1000, 10), (30.0, 100, 2), (30.0, 10_000, 40), (5.0, 90, 1)],
 )
 def test_about_three_frames_a_second_but_neither_few_nor_very_many(fps, length, every):
     assert stretch_length(fps, length) == every

@@ -10,34 +10,37 @@ from torch import Tensor
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.photos import PlacedVideo, localiser, place_video
-from geogs.config import Config, ReconstructConfig
+from geogs.application.results.verdict import Verdict, verdict
+from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_preset
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
-from geogs.types import Uncertainty
+from geogs.types import Trajectory, Uncertainty
 
 
 class PlacedOffline(Work):
     """Sharp frames of a video placed by structure from motion, all others against them.
 
-    For a video that tracking cannot follow. The map is that of ``geogs reconstruct`` with its
-    default settings; of the run's, input, mesh and seed count.
+    For a video that tracking cannot follow. The map is that of ``geogs reconstruct`` with the
+    preset of the run, as far as its map is one's; else of its settings input, mesh and seed count.
     """
 
     scene: "OfflineScene"
     """The map and all poses, once there are any."""
     source: Source
     """The video, calibrated as soon as its sharp frames have been placed."""
+    trajectory: Trajectory
+    """Poses of all frames, once these have been placed."""
 
-    def __init__(self, config: Config, video: Source) -> None:
-        self._config = replace(
-            ReconstructConfig(), seed=config.seed, input=config.input, mesh=config.mesh
-        )
+    def __init__(self, config: Config, video: Source, stopwatch: Stopwatch | None = None) -> None:
+        """Settings are those of a run; a ``stopwatch`` may have run before."""
+        made = reconstruct_preset(preset_of(config))
+        self._config = replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
         self.source = video
-        self._stopwatch = Stopwatch()
+        self._stopwatch = stopwatch or Stopwatch()
 
     @property
     def stopwatch(self) -> Stopwatch:
@@ -50,6 +53,16 @@ class PlacedOffline(Work):
         Raises:
             InputError: pycolmap is missing, or the frames do not tell where they were taken.
             KeyboardInterrupt: it was stopped before there was a map.
+        """
+        self.place(driver)
+        return self.map(driver, checkpoint)
+
+    def place(self, driver: Driver) -> None:
+        """Poses of the sharp frames by structure from motion, of the others against their points.
+
+        Raises:
+            InputError: pycolmap is missing, or the frames do not tell where they were taken.
+            KeyboardInterrupt: it was stopped.
         """
         config = self._config
         placed = place_video(self.source, config.seed, driver.report, self._stopwatch)
@@ -64,11 +77,24 @@ class PlacedOffline(Work):
         self.scene = scene
         with self._stopwatch("placing frames"):
             T_cw = _place_all(self.source, scene, placed, config, driver.report)
-        points = placed.all_points()
-        outcome = driver.map_known(scene, lambda: scene.finish(points, driver.report), checkpoint)
+        self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
+
+    def judged(self) -> Verdict:
+        """How far the poses are to be relied on, once there are some."""
+        scene = self.scene
+        return verdict(self.trajectory, scene.keyframe_trajectory(), scene.uncertainty())
+
+    def map(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
+        """The map from the sharp frames, once they have been placed.
+
+        Raises:
+            InputError: no two of them show the same thing from two places.
+            KeyboardInterrupt: it was stopped before there was a map.
+        """
+        scene = self.scene
+        outcome = driver.map_known(scene, lambda: scene.map(driver.report), checkpoint)
         # Not before, as it would say of which frames the map is to be made.
-        times = placed.timestamps[: len(T_cw)]
-        scene.know(bridged(times, T_cw, [None] * len(T_cw)))
+        scene.know(self.trajectory)
         return outcome
 
 
@@ -83,9 +109,14 @@ class OfflineScene(Reconstruction):
         self.localised = 0
         """Frames placed against the points of the others."""
 
+    def map(self, progress: StageProgress) -> None:
+        """Depths of the sharp frames, and the map from them."""
+        self.finish(self._placed.all_points(), progress)
+
     def uncertainty(self) -> Uncertainty:
         """What the adjustment leaves open."""
-        times, placed = self.keyframe_trajectory().timestamps, self._placed
+        placed = self._placed
+        times = placed.timestamps[list(placed.numbers)]
         return Uncertainty(times, placed.deviation, placed.rotation, placed.depth)
 
     def statistics(self) -> dict[str, object]:

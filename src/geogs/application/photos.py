@@ -1,5 +1,7 @@
 """Structure from motion of photographs and of videos, as another package registers it."""
 
+import importlib.util
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -18,6 +20,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.stopwatch import StageProgress, Stopwatch
+from geogs.threads import worker_count
 from geogs.types import Frame
 
 GROUP = "geogs.photos"
@@ -25,6 +28,19 @@ GROUP = "geogs.photos"
 
 Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
+
+SECONDS = 0.33
+"""Time of a video from which structure from motion is given one frame."""
+SPARSE = 6.0
+"""Frames a second up to which it is given all: neighbours share little enough as it is."""
+FEWEST, MOST = 40, 250
+"""Frames that it is given of a video whose length is known, at least and at most."""
+SECONDS_PER_FRAME = 2.5
+"""Of one core, to find where such a frame was taken: about 0.15 for features, 0.2 to choose
+pairs, 1 to match some 22 of them and 0.6 to put all together (50 frames of 512 pixels, and 90 of
+320)."""
+SECONDS_PER_OTHER = 0.3
+"""Of one core, to place another frame against their points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +74,26 @@ class PlacedVideo:
     def all_points(self) -> Float64[np.ndarray, "k 3"]:
         """Every point once."""
         return np.unique(np.concatenate(self.positions), axis=0)
+
+
+def stretch_length(fps: float, length: int | None) -> int:
+    """Frames of a video of which structure from motion is given one."""
+    every = max(1, round(SECONDS * fps)) if fps > SPARSE else 1
+    if length is not None:
+        every = max(math.ceil(length / MOST), min(every, max(1, length // FEWEST)))
+    return every
+
+
+def seconds_to_place(fps: float, length: int) -> float:
+    """About how long it takes to find where the frames of a video were taken."""
+    given = length / stretch_length(fps, length)
+    core_seconds = SECONDS_PER_FRAME * given + SECONDS_PER_OTHER * (length - given)
+    return core_seconds / worker_count()
+
+
+def has_pycolmap() -> bool:
+    """Whether the library that finds where pictures were taken is installed."""
+    return importlib.util.find_spec("pycolmap") is not None
 
 
 def place_video(

@@ -1,35 +1,28 @@
 """A run, from the paths of its videos to the files of its result; or on from a checkpoint."""
 
-from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
-
-import torch
 
 from geogs.application.calibrate import self_calibrated, with_shutter_found
-from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
+from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import (
     RunMetadata,
-    RunState,
     SavedRun,
-    run_state,
 )
-from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.driver import Driver
+from geogs.application.fallback import TrackedOrPlaced
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.prior_choice import open_prior
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.results.surfaces import write_stage
 from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
-from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import SensorScale, scale_source
 from geogs.application.slam_in_python import go_on_in
+from geogs.application.tracked_video import TrackedVideo
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
@@ -38,12 +31,7 @@ from geogs.gpu.installation import require_device
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
-from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
-from geogs.types import Frame
-
-BRIEFLY = 40.0
-"""Seconds for a map after an interruption, where there is none yet."""
 
 
 @on_one_torch_thread
@@ -86,7 +74,7 @@ def run(
             from geogs.application.offline import PlacedOffline
 
             return driver.complete(PlacedOffline(config, opened))
-        return driver.complete(_begun(settings, driver, opened, base))
+        return driver.complete(TrackedOrPlaced(_begun(settings, driver, opened, base), opened))
 
 
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
@@ -106,7 +94,7 @@ def seen_by(base: SavedResult, config: Config) -> InputConfig:
 
 def _begun(
     settings: RunSettings, driver: Driver, opened: Source, base: SavedResult | None
-) -> "TrackedVideo":
+) -> TrackedVideo:
     """A system for an opened source, calibrated; in the map of ``base`` if that is given."""
     config, progress, stop = settings.config, driver.progress, driver.stop
     calibrated = self_calibrated(opened, config, driver.device, progress, stop)
@@ -156,7 +144,8 @@ def resume(
     saved = SavedRun(output)
     settings = continued(saved.metadata, settings or saved.metadata.settings, output)
     config, device = settings.config, require_device(settings.device)
-    source = saved.calibrated(open_source(settings.source, config.input))
+    opened = open_source(settings.source, config.input)
+    source = saved.calibrated(opened)
     with claimed(output) as folder:
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
@@ -169,7 +158,8 @@ def resume(
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, metadata, folder)
-        return Driver(settings, folder, device, progress, stop, observer).complete(work)
+        driver = Driver(settings, folder, device, progress, stop, observer)
+        return driver.complete(TrackedOrPlaced(work, opened))
 
 
 def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:
@@ -182,117 +172,10 @@ def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSet
     if elsewhere or settings.deciding() != begun.settings.deciding():
         raise InputError(
             "--resume goes on with the source and the settings of the run; leave out everything "
-            "else but --device, --mesh, --checkpoint-every, --online-results, --depth-mesh, "
-            "--keyframe-images and --scale-from."
+            "else but --device, --mesh, --checkpoint-every, --fallback, --online-results, "
+            "--depth-mesh, --keyframe-images and --scale-from."
         )
     device = begun.device if settings.device == "auto" else settings.device
     if not device.startswith(begun.device) and device != "cpu":
         raise InputError(f"The run was on {begun.device}, and can only go on there.")
     return replace(settings, device=device)
-
-
-@dataclass
-class TrackedVideo(Work):
-    """A video whose frames are tracked one by one, by a system that has been made ready."""
-
-    scene: Slam
-    source: Source
-    """Calibrated."""
-    frames: Generator[Frame, None, None]
-    """That are left."""
-    metadata: RunMetadata
-    output: Path
-
-    @property
-    def way_on(self) -> str:
-        """The command that goes on from the last checkpoint."""
-        on_cpu = ", with --device cpu on the CPU" if self.metadata.device != "cpu" else ""
-        return f"geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
-
-    def state(self) -> RunState | None:
-        """What a checkpoint holds; nothing of what cannot be gone on with."""
-        if self.metadata.settings.map is not None or self.source.is_live:
-            return None
-        return run_state(self.metadata, self.scene, self.source)
-
-    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
-        """The frames that are left, then the final stages."""
-        slam, source, progress = self.scene, self.source, driver.progress
-        progress.expect(source.length, slam.frames)
-        with closing(self.frames):
-            outcome = self._track(driver, checkpoint)
-        if outcome is not Outcome.MEMORY_FULL and outcome is not Outcome.FINISHED:
-            checkpoint.write()
-        slam.end_stream()
-        if outcome is Outcome.FINISHED:
-            checkpoint.write()
-        self._write_stage("online", driver, new)
-        outcome = self._finish(driver, outcome, new)
-        make_metric(slam, source, scale_source(self.metadata.settings.scale_from), progress)
-        return outcome
-
-    def _track(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
-        """All frames through the system, until a request to stop."""
-        stop = driver.stop
-        try:
-            if self.scene.world.is_ended:
-                next(self.frames, None)  # only what the source says of itself at its end
-            else:
-                self._track_each(driver, checkpoint)
-        except torch.cuda.OutOfMemoryError:
-            torch.cuda.empty_cache()
-            driver.stop_early("The GPU has no memory left")
-            return Outcome.MEMORY_FULL
-        if self.source.is_live and stop.requested:  # the usual end of what has none
-            stop.requested = False
-            driver.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
-        if not stop.requested:
-            return Outcome.FINISHED
-        driver.stop_early()
-        return Outcome.STOPPED
-
-    def _track_each(self, driver: Driver, checkpoint: Checkpoint) -> None:
-        slam = self.scene
-        for frame in _timed(self.frames, slam.stopwatch):
-            status = slam.process(frame)
-            driver.progress.frame(status)
-            if driver.observer is not None:
-                driver.observer.frame(frame, status, slam)
-            if driver.stop.requested:
-                return
-            checkpoint.write_if_due()
-
-    def _finish(self, driver: Driver, outcome: Outcome, new: Path) -> Outcome:
-        """The final stages; where these or the frames were cut short, a map in little time."""
-        stop = driver.stop
-        try:
-            if outcome is Outcome.FINISHED and stop.lets_finish(lambda: self._adjust(driver, new)):
-                return outcome
-            self.scene.refine(driver.progress.stage, BRIEFLY)
-        except torch.cuda.OutOfMemoryError:
-            torch.cuda.empty_cache()
-            driver.progress.write(
-                "The GPU has no memory left for the final stages; keeping what there is."
-            )
-        return Outcome.STOPPED if outcome is Outcome.FINISHED else outcome
-
-    def _adjust(self, driver: Driver, new: Path) -> None:
-        self.scene.adjust(driver.report)
-        if self.scene.will_refine:
-            self._write_stage("adjusted", driver, new)
-        self.scene.refine(driver.report)
-
-    def _write_stage(self, name: Literal["online", "adjusted"], driver: Driver, new: Path) -> None:
-        """What there is by now, if it is asked for, and if there is a map."""
-        if self.metadata.settings.online_results and not self.scene.world.maps_at_end:
-            write_stage(new, self.scene, driver.progress, name)
-
-
-def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:
-    """The frames; waiting for them is a stage, too."""
-    while True:
-        with stopwatch("reading"):
-            frame = next(frames, None)
-        if frame is None:
-            return
-        yield frame

@@ -35,7 +35,8 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
     resume: Path | None = None
     """Go on with the run that was interrupted or killed in this folder, with its source and its
     settings; beside it may be given what decides nothing about poses and map: --device, --mesh,
-    --checkpoint-every, --online-results, --depth-mesh, --keyframe-images and --scale-from."""
+    --checkpoint-every, --fallback, --online-results, --depth-mesh, --keyframe-images and
+    --scale-from."""
 
 
 def main(argv: Sequence[str]) -> int:

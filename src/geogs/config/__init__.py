@@ -20,7 +20,7 @@ from geogs.config.reconstruct_config import (
     known_pose_mapping,
     reconstruct_preset,
 )
-from geogs.config.run_config import Config, Preset, Seed, preset
+from geogs.config.run_config import Config, Preset, Seed, preset, preset_of
 from geogs.config.tracking_config import CalibrationConfig, LoopConfig, TrackingConfig
 
 __all__ = [
@@ -46,5 +46,6 @@ __all__ = [
     "TrackingConfig",
     "known_pose_mapping",
     "preset",
+    "preset_of",
     "reconstruct_preset",
 ]

@@ -1,7 +1,7 @@
 """All settings of a run, and their presets."""
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from geogs.config.input_config import InputConfig
 from geogs.config.mapping_config import MappingConfig
@@ -33,6 +33,12 @@ class Config(Settings):
     loop: LoopConfig = field(default_factory=LoopConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
+
+
+def preset_of(config: Config) -> Preset:
+    """The preset by which a run makes its map; the default where that is none of any."""
+    mapped = (name for name in get_args(Preset) if preset(name).mapping == config.mapping)
+    return next(mapped, "default")
 
 
 def preset(name: Preset) -> Config:

@@ -1,0 +1,182 @@
+"""A tracked video; where tracking lost much of it, its frames placed by structure from motion."""
+
+import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from geogs.application.checkpoints.checkpoint import Checkpoint
+from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.photos import has_pycolmap, seconds_to_place
+from geogs.application.results.result import Result
+from geogs.application.results.verdict import (
+    MAX_DEPTH_DEVIATION,
+    MAX_POSITION_DEVIATION,
+    Verdict,
+)
+from geogs.application.run_settings import RunSettings
+from geogs.application.tracked_video import TrackedVideo
+from geogs.errors import InputError, TrackingLost
+from geogs.evaluation.duration import duration
+from geogs.io.sources.frame_source import Source
+
+if TYPE_CHECKING:
+    from geogs.application.offline import PlacedOffline
+
+MAX_UNKNOWN = 0.1
+"""Part of the frames without a place from which on structure from motion is tried."""
+CLEARLY_MORE = 0.05
+"""Part of the frames by which it has to place more than tracking did; a result that is to be relied
+on, where the tracked one is not, need only place as many."""
+
+
+class TrackedOrPlaced(Work):
+    """A tracked video, or its frames placed by structure from motion where that is clearly better.
+
+    That is tried after the last frame and the adjustment, before there is a map, where the verdict
+    is that tracking is not to be relied on, or where many frames have no place. Until it is known
+    to be better, and wherever it fails or is stopped, the tracked result is what is kept.
+    """
+
+    def __init__(self, tracked: TrackedVideo, opened: Source) -> None:
+        """``opened`` is the video as it came, before the run calibrated it."""
+        self._tracked, self._opened = tracked, opened
+        self._take(tracked)
+
+    @property
+    def way_on(self) -> str:
+        """As of the tracked video."""
+        return self._tracked.way_on
+
+    def state(self) -> object | None:
+        """That of tracking."""
+        return self._tracked.state()
+
+    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
+        """Track; place the frames otherwise if need be; map what is better.
+
+        Raises TrackingLost if no frame could be tracked, nor placed.
+        """
+        tracked, failure = self._tracked, None
+        try:
+            outcome = tracked.locate(driver, checkpoint, new)
+        except TrackingLost as error:
+            outcome, failure = Outcome.FINISHED, error
+        if outcome is Outcome.FINISHED:
+            judged = None if failure else Result(tracked.scene, tracked.source).verdict
+            if is_wanted(judged):
+                placed = self._placed(driver, judged)
+                if placed is not None and self._is_mapped(placed, driver, checkpoint):
+                    return Outcome.STOPPED if driver.stop.requested else outcome
+            outcome = Outcome.STOPPED if driver.stop.requested else outcome
+        if failure is not None:
+            raise failure
+        return tracked.map(driver, outcome)
+
+    def _take(self, work: "TrackedVideo | PlacedOffline") -> None:
+        self.scene, self.source = work.scene, work.source
+
+    def _placed(self, driver: Driver, tracked: Verdict | None) -> "PlacedOffline | None":
+        """The frames placed otherwise, if that can be tried and is better; what is said of it."""
+        say, settings = driver.progress.write, self._tracked.metadata.settings
+        if not settings.fallback:
+            return None
+        why_not = impossible(settings, self._opened)
+        if why_not:
+            say(f"note: Structure from motion, which may place more frames, is left out: {why_not}")
+            return None
+        seconds = seconds_to_place(self._opened.fps, self.scene.frames)
+        if not has_pycolmap():
+            say(
+                "warning: structure from motion may place more frames: pip install 'geogs[photos]' "
+                f"brings it, and geogs run {_command(settings)} --offline does it in about "
+                f"{duration(seconds)} and the time of the map."
+            )
+            return None
+        say(
+            f"{_in_words(tracked)} Trying structure from motion, about {duration(seconds)}; Ctrl-C "
+            "keeps what was tracked."
+        )
+        from geogs.application.offline import PlacedOffline
+
+        stopwatch = self._tracked.scene.stopwatch
+        placed = PlacedOffline(settings.config, self._video(), stopwatch)
+        if not self._succeeds(driver, lambda: placed.place(driver)):
+            return None
+        found = placed.judged()
+        is_taken = is_better(found, tracked)
+        say(
+            f"Structure from motion places {_placed_part(found):.0%} of the frames, tracking "
+            f"{_placed_part(tracked):.0%}: "
+            + ("that is mapped now." if is_taken else "what was tracked stays.")
+        )
+        return placed if is_taken else None
+
+    def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
+        """Map the placed frames; false where nothing came of it."""
+        if not self._succeeds(driver, lambda: placed.map(driver, checkpoint)):
+            return False
+        self._take(placed)
+        return True
+
+    def _succeeds(self, driver: Driver, work: Callable[[], object]) -> bool:
+        """Whether some work ended with something to go on with; else it is said why not."""
+        try:
+            if driver.stop.lets_finish(work):
+                return True
+            driver.stop_early("Structure from motion is stopped")
+        except InputError as error:
+            driver.progress.write(f"{error} What was tracked stays.")
+        return False
+
+    def _video(self) -> Source:
+        """The video with what the run found of its camera, where nobody gave that only to begin
+        with."""
+        opened, found = self._opened, self._tracked.source
+        video = opened.with_shutter(found.shutter)
+        if not opened.is_calibration_open:
+            return video
+        begin = found.calibration
+        return video.with_calibration(replace(opened.calibration, fx=begin.fx, fy=begin.fy))
+
+
+def is_wanted(tracked: Verdict | None) -> bool:
+    """Whether another way to place the frames is worth its time; none where nothing was tracked."""
+    return tracked is None or not tracked.is_reliable or _placed_part(tracked) < 1 - MAX_UNKNOWN
+
+
+def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
+    """Whether frames that were placed by structure from motion are to be taken.
+
+    Their places and depths have to be well known, and they clearly more, or as many and to be
+    relied on where what was tracked is not.
+    """
+    if not (placed.position <= MAX_POSITION_DEVIATION and placed.depth <= MAX_DEPTH_DEVIATION):
+        return False
+    more = _placed_part(placed) - _placed_part(tracked)
+    is_relied_on = tracked is not None and tracked.is_reliable
+    return more >= (0.0 if placed.is_reliable and not is_relied_on else CLEARLY_MORE)
+
+
+def impossible(settings: RunSettings, source: Source) -> str:
+    """Why the frames of a source cannot be placed once more; empty where they can."""
+    if source.is_live:
+        return "a live source comes but once; geogs run on its recording would."
+    if settings.map is not None:
+        return "a saved map is gone on with by tracking alone."
+    if settings.scale_from or source.uses_depth or source.uses_poses:
+        return "it knows no metres; geogs run --offline without them does it."
+    return ""
+
+
+def _placed_part(judged: Verdict | None) -> float:
+    return 0.0 if judged is None else 1 - judged.lost - judged.orientation_only
+
+
+def _in_words(tracked: Verdict | None) -> str:
+    return "No frame could be tracked." if tracked is None else tracked.sentence
+
+
+def _command(settings: RunSettings) -> str:
+    return shlex.join(str(path) for path in settings.source)

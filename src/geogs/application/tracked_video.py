@@ -1,0 +1,151 @@
+"""A video whose frames are tracked one by one, mapped, and checkpointed on the way."""
+
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from geogs.application.checkpoints.checkpoint import Checkpoint
+from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
+from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.results.surfaces import write_stage
+from geogs.application.scale.apply import make_metric
+from geogs.application.scale.known_length import scale_source
+from geogs.io.sources.frame_source import Source
+from geogs.slam import Slam
+from geogs.stopwatch import Stopwatch
+from geogs.types import Frame
+
+BRIEFLY = 40.0
+"""Seconds for a map after an interruption, where there is none yet."""
+
+
+@dataclass
+class TrackedVideo(Work):
+    """A video whose frames are tracked one by one, by a system that has been made ready."""
+
+    scene: Slam
+    source: Source
+    """Calibrated."""
+    frames: Generator[Frame, None, None]
+    """That are left."""
+    metadata: RunMetadata
+    output: Path
+
+    @property
+    def way_on(self) -> str:
+        """The command that goes on from the last checkpoint."""
+        on_cpu = ", with --device cpu on the CPU" if self.metadata.device != "cpu" else ""
+        return f"geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
+
+    def state(self) -> RunState | None:
+        """What a checkpoint holds; nothing of what cannot be gone on with."""
+        if self.metadata.settings.map is not None or self.source.is_live:
+            return None
+        return run_state(self.metadata, self.scene, self.source)
+
+    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
+        """The frames that are left, then the final stages."""
+        return self.map(driver, self.locate(driver, checkpoint, new))
+
+    def locate(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
+        """Poses: the frames that are left, then the adjustment of all keyframes.
+
+        Raises TrackingLost if no frame could be tracked.
+        """
+        slam, source, progress = self.scene, self.source, driver.progress
+        progress.expect(source.length, slam.frames)
+        with closing(self.frames):
+            outcome = self._track(driver, checkpoint)
+        if outcome is not Outcome.MEMORY_FULL and outcome is not Outcome.FINISHED:
+            checkpoint.write()
+        slam.end_stream()
+        if outcome is Outcome.FINISHED:
+            checkpoint.write()
+        self._write_stage("online", driver, new)
+        is_adjusted = False
+        with _full_memory_said(driver):
+            is_adjusted = outcome is Outcome.FINISHED and driver.stop.lets_finish(
+                lambda: self._adjust(driver, new)
+            )
+        return Outcome.STOPPED if outcome is Outcome.FINISHED and not is_adjusted else outcome
+
+    def map(self, driver: Driver, outcome: Outcome) -> Outcome:
+        """The map after :meth:`locate` came to ``outcome``: where it was cut short or this is, one
+        in little time."""
+        slam, is_mapped = self.scene, False
+        with _full_memory_said(driver):
+            is_mapped = outcome is Outcome.FINISHED and driver.stop.lets_finish(
+                lambda: slam.refine(driver.report)
+            )
+            if not is_mapped:
+                slam.refine(driver.progress.stage, BRIEFLY)
+        scale = scale_source(self.metadata.settings.scale_from)
+        make_metric(slam, self.source, scale, driver.progress)
+        return Outcome.STOPPED if outcome is Outcome.FINISHED and not is_mapped else outcome
+
+    def _track(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
+        """All frames through the system, until a request to stop."""
+        stop = driver.stop
+        try:
+            if self.scene.world.is_ended:
+                next(self.frames, None)  # only what the source says of itself at its end
+            else:
+                self._track_each(driver, checkpoint)
+        except torch.cuda.OutOfMemoryError:
+            torch.cuda.empty_cache()
+            driver.stop_early("The GPU has no memory left")
+            return Outcome.MEMORY_FULL
+        if self.source.is_live and stop.requested:  # the usual end of what has none
+            stop.requested = False
+            driver.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
+        if not stop.requested:
+            return Outcome.FINISHED
+        driver.stop_early()
+        return Outcome.STOPPED
+
+    def _track_each(self, driver: Driver, checkpoint: Checkpoint) -> None:
+        slam = self.scene
+        for frame in _timed(self.frames, slam.stopwatch):
+            status = slam.process(frame)
+            driver.progress.frame(status)
+            if driver.observer is not None:
+                driver.observer.frame(frame, status, slam)
+            if driver.stop.requested:
+                return
+            checkpoint.write_if_due()
+
+    def _adjust(self, driver: Driver, new: Path) -> None:
+        self.scene.adjust(driver.report)
+        if self.scene.will_refine:
+            self._write_stage("adjusted", driver, new)
+
+    def _write_stage(self, name: Literal["online", "adjusted"], driver: Driver, new: Path) -> None:
+        """What there is by now, if it is asked for, and if there is a map."""
+        if self.metadata.settings.online_results and not self.scene.world.maps_at_end:
+            write_stage(new, self.scene, driver.progress, name)
+
+
+def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:
+    """The frames; waiting for them is a stage, too."""
+    while True:
+        with stopwatch("reading"):
+            frame = next(frames, None)
+        if frame is None:
+            return
+        yield frame
+
+
+@contextmanager
+def _full_memory_said(driver: Driver) -> Iterator[None]:
+    """A final stage that ends where the memory of the GPU is full, in a sentence."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        driver.progress.write(
+            "The GPU has no memory left for the final stages; keeping what there is."
+        )

@@ -1,0 +1,165 @@
+"""What tracking lost is placed by structure from motion, where that is better, and else kept."""
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geogs.application import fallback, offline
+from geogs.application.fallback import impossible, is_better, is_wanted
+from geogs.application.offline import PlacedOffline
+from geogs.application.results.verdict import Verdict
+from geogs.application.run_settings import RunSettings
+from geogs.cli.main import main
+from geogs.config import Config, preset, preset_of
+from geogs.errors import InputError
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.sources.frame_source import Source
+from io_samples import write_image
+from posed_layouts import render_room
+from posed_scene import SMALL
+
+GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
+LOST = replace(GOOD, is_reliable=False, lost=0.3)
+TURNED = Verdict(False, "Rotation only.", 0.0, 1.0, np.inf, np.inf, np.inf)
+FRAMES = 24
+
+
+def test_another_way_is_wanted_where_frames_are_missing_or_nothing_is_to_be_relied_on():
+    assert not is_wanted(GOOD)
+    assert not is_wanted(replace(GOOD, lost=0.08))
+    for judged in (None, LOST, TURNED, replace(GOOD, lost=0.12), replace(GOOD, is_reliable=False)):
+        assert is_wanted(judged)
+
+
+@pytest.mark.parametrize(
+    ("placed", "tracked", "better"),
+    [
+        (GOOD, None, True),
+        (GOOD, LOST, True),
+        (GOOD, TURNED, True),
+        (GOOD, replace(GOOD, lost=0.12), True),
+        (GOOD, replace(GOOD, lost=0.03), False),  # hardly more, and tracking is to be relied on
+        (GOOD, replace(GOOD, is_reliable=False, position=0.1), True),  # as many, better known
+        (replace(GOOD, lost=0.4), LOST, False),  # fewer
+        (replace(LOST, lost=0.28), LOST, False),  # hardly more
+        (replace(GOOD, position=0.08), LOST, False),  # more, but nobody knows where
+        (replace(GOOD, depth=0.5), LOST, False),
+        (replace(GOOD, position=np.nan), LOST, False),
+    ],
+)
+def test_the_better_of_two_worlds(placed, tracked, better):
+    assert is_better(placed, tracked) is better
+
+
+@pytest.mark.parametrize(
+    ("settings", "source", "reason"),
+    [
+        ({}, {}, ""),
+        ({}, {"is_live": True}, "comes but once"),
+        ({"map": Path("old")}, {}, "saved map"),
+        ({"scale_from": "height:1.6"}, {}, "no metres"),
+        ({}, {"uses_depth": True}, "no metres"),
+        ({}, {"uses_poses": True}, "no metres"),
+    ],
+)
+def test_what_cannot_be_placed_once_more(settings, source, reason):
+    flags = {"is_live": False, "uses_depth": False, "uses_poses": False} | source
+    kind = type("Some", (Source,), flags)
+    found = impossible(RunSettings(**settings), kind.__new__(kind))
+    assert reason in found
+    assert bool(reason) == bool(found)
+
+
+def test_the_map_is_made_by_the_preset_of_the_run():
+    for name in ("default", "fast", "accurate", "paper"):
+        assert preset_of(replace(preset(name), seed=7)) == name
+    own = replace(Config().mapping, render_long_edge=111)
+    assert preset_of(replace(Config(), mapping=own)) == "default"
+
+
+@pytest.fixture
+def video(tmp_path, monkeypatch):
+    """A few small frames of a room, of which tracking is taken to have lost too many."""
+    pytest.importorskip("pycolmap")
+    room = render_room(FRAMES, 3, 160, 120)
+    for k, image in enumerate(room.images):
+        write_image(tmp_path / "video" / f"{k:03d}.png", image)
+    monkeypatch.setattr(offline, "reconstruct_preset", lambda _: SMALL)
+    monkeypatch.setattr(fallback, "is_wanted", lambda _: True)
+    monkeypatch.setattr("geogs.application.results.write.write_report", lambda *_: None)
+    return tmp_path / "video", room.camera, room.T_wc
+
+
+def run(video, output, *more: str) -> dict:
+    folder, c, _ = video
+    code = main([
+        "run", str(folder), "-o", str(output), "--device", "cpu",
+        "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}", "--mapping.render-long-edge", "64",
+        "--mapping.final-iterations", "5", "--tracking.init-keyframes", "6",
+        "--mapping.depth.planes", "32", *more,
+    ])  # fmt: skip
+    assert code == 0
+    return json.loads((output / "summary.json").read_text())
+
+
+@pytest.mark.system
+def test_placed_frames_are_taken_where_they_are_better(video, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(fallback, "is_better", lambda *_: True)
+    summary = run(video, tmp_path / "out")
+    assert summary["offline"]["sharp_frames"] == FRAMES
+    assert summary["seconds"]["tracking"] > 0
+    assert summary["seconds"]["structure from motion"] > 0
+    assert summary["interrupted"] is False
+    said = capfd.readouterr().err
+    assert "Trying structure from motion, about" in said
+    assert "that is mapped now" in said
+    placed = read_tum_trajectory(tmp_path / "out" / "trajectory.tum").T_wc[:, :3, 3]
+    steps, truth = (
+        np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (placed, video[2][:, :3, 3])
+    )
+    np.testing.assert_allclose(steps / steps.sum(), truth / truth.sum(), atol=0.01)
+    assert not (tmp_path / "out" / "checkpoint").exists()
+
+
+@pytest.mark.system
+def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
+    video, tmp_path, monkeypatch, capfd
+):
+    def fails(*_: object) -> None:
+        raise InputError("Of 24 sharp frames no three tell where they were taken.")
+
+    plain = run(video, tmp_path / "plain", "--no-fallback")
+    assert "structure from motion" not in capfd.readouterr().err
+    monkeypatch.setattr(PlacedOffline, "place", fails)
+    summary = run(video, tmp_path / "out")
+    assert "What was tracked stays." in capfd.readouterr().err
+    assert "offline" not in summary
+    assert summary["verdict"] == plain["verdict"]
+    one, other = (tmp_path / name / "trajectory.tum" for name in ("plain", "out"))
+    assert one.read_bytes() == other.read_bytes()
+    monkeypatch.setattr(fallback, "has_pycolmap", lambda: False)
+    run(video, tmp_path / "without")
+    said = " ".join(capfd.readouterr().err.split())
+    assert "pip install 'geogs[photos]'" in said
+    assert f"geogs run {video[0]} --offline" in said
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("stage", ["place", "map"])
+def test_ctrl_c_keeps_what_was_tracked(video, tmp_path, monkeypatch, capfd, stage):
+    def is_stopped(self: PlacedOffline, driver: object, *_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        driver.report("features", 0.5)
+
+    monkeypatch.setattr(fallback, "is_better", lambda *_: True)
+    monkeypatch.setattr(PlacedOffline, stage, is_stopped)
+    summary = run(video, tmp_path / "out")
+    assert "keeping what there is" in capfd.readouterr().err
+    assert "offline" not in summary
+    assert summary["interrupted"] is True
+    assert summary["disks"] > 0
+    assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == FRAMES
