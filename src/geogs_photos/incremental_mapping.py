@@ -1,6 +1,6 @@
 """Poses, cameras and points of matched photographs, by pycolmap's incremental mapping."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,11 @@ def put_together(
     models = colmap.incremental_mapping(
         database, work, work, options=options, next_image_callback=after_image
     )
+    return largest_first(models)
+
+
+def largest_first(models: Mapping[int, Any]) -> list[Any]:
+    """Those that have enough pictures to count as a part."""
     parts = [model for model in models.values() if model.num_reg_images() >= LEAST_IMAGES]
     return sorted(parts, key=lambda model: -model.num_reg_images())
 

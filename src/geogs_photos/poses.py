@@ -84,7 +84,8 @@ def find_poses(
     names = [photograph.name for photograph in photographs]
     entries = [Entry(*e) for e in zip(names, camera_of, features, strict=True)]
     with tempfile.TemporaryDirectory(prefix="geogs-photos-") as work:
-        parts, kept = structure_of(Path(work), cameras, entries, pairs, seed, progress)
+        database = Path(work) / "database.db"
+        parts, kept = structure_of(database, cameras, entries, pairs, seed, progress)
     left_out = [LeftOut(name, "cannot be read") for name in folder.damaged]
     left_out += reasons(entries, kept, [_names(part) for part in parts])
     if not parts:
@@ -101,7 +102,7 @@ def find_poses(
 
 
 def structure_of(
-    work: Path,
+    database: Path,
     cameras: Sequence[SharedCamera],
     entries: Sequence[Entry],
     pairs: Pairs,
@@ -110,12 +111,11 @@ def structure_of(
 ) -> tuple[list[Any], np.ndarray]:
     """Parts that hang together, largest first, and the kept matches of any two pictures."""
     threads = worker_count()
-    database = work / "database.db"
     write_database(database, cameras, entries)
     kept = match_pairs(database, entries, pairs, seed, threads, lambda f: progress("matching", f))
     known = [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
     parts = put_together(
-        database, work / "models", len(entries), known, seed, threads,
+        database, database.with_name("models"), len(entries), known, seed, threads,
         lambda f: progress("finding poses", f),
     )  # fmt: skip
     return parts, kept

@@ -17,6 +17,7 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
+from geogs_photos.fragments import rejoined
 from geogs_photos.incremental_mapping import refine
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
@@ -27,6 +28,8 @@ from geogs_photos.upright import upright_rotation
 
 NEXT = 6
 """Chosen frames after each that it is matched with in any case."""
+LEAST_POINTS = 15
+"""Points that have to place a frame."""
 
 
 def place_video(video: Source, seed: int, report: Progress, stopwatch: Stopwatch) -> PlacedVideo:
@@ -72,14 +75,16 @@ def place_frames(
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
     shared = [SharedCamera(begin, is_known)]
     with tempfile.TemporaryDirectory(prefix="geogs-video-") as work:
-        parts, _ = structure_of(Path(work), shared, entries, pairs, seed, progress)
+        database, threads = Path(work) / "database.db", worker_count()
+        parts, _ = structure_of(database, shared, entries, pairs, seed, progress)
+        parts = rejoined(parts, database, count, shared, seed, threads, progress)
     if not parts:
         raise InputError(
             f"Of {count} sharp frames no three tell where they were taken; the camera has to move, "
             "and the scene to show texture."
         )
     best = refine(parts[0], shared, worker_count())
-    images = sorted((i for i in best.images.values() if i.has_pose), key=lambda i: i.name)
+    images = _placed_images(best)
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
@@ -89,7 +94,7 @@ def place_frames(
 def _placed(
     model: Any, chosen: ChosenFrames, entries: Sequence[Entry], is_known: bool
 ) -> PlacedVideo:
-    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
+    images = _placed_images(model)
     T_cw = np.tile(np.eye(4), (len(images), 1, 1))
     positions, descriptors = [], []
     for pose, image in zip(T_cw, images, strict=True):
@@ -109,6 +114,12 @@ def _placed(
         chosen.timestamps, len(chosen.frames), numbers, T_cw, deviation, rotation, depth,
         tuple(positions), tuple(descriptors), calibration, error,
     )  # fmt: skip
+
+
+def _placed_images(model: Any) -> list[Any]:
+    """In order of time; those that few points place have no pose that counts."""
+    placed = (i for i in model.images.values() if i.has_pose and i.num_points3D >= LEAST_POINTS)
+    return sorted(placed, key=lambda image: image.name)
 
 
 def _depth_deviation(model: Any, image: Any, error: float) -> float:

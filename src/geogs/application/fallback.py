@@ -111,6 +111,7 @@ class TrackedOrPlaced(Work):
             f"{_placed_part(tracked):.0%}: "
             + ("that is mapped now." if is_taken else "what was tracked stays.")
         )
+        placed.scene.instead_of = _in_words(tracked)
         return placed if is_taken else None
 
     def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:

@@ -108,6 +108,8 @@ class OfflineScene(Reconstruction):
         self._placed = placed
         self.localised = 0
         """Frames placed against the points of the others."""
+        self.instead_of = ""
+        """What was said of tracking, where the video was tracked before."""
 
     def map(self, progress: StageProgress) -> None:
         """Depths of the sharp frames, and the map from them."""
@@ -127,6 +129,7 @@ class OfflineScene(Reconstruction):
                 "placed_by_structure": len(self._placed.numbers),
                 "placed_against_the_map": self.localised,
                 "reprojection_error": self._placed.error,
+                "instead_of": self.instead_of or None,
                 "calibration": asdict(self._placed.calibration),
             }
         }

@@ -1,0 +1,98 @@
+"""What is tried where incremental mapping of a video falls into parts, or leaves frames out.
+
+Global mapping (rotation averaging, global positioning, adjustment; Pan et al. 2024) takes all pairs
+at once. It comes second, as it takes twice the time of incremental mapping and places neither more
+nor better what that places whole. At last matches are verified once more with the focal length of
+the largest part, which short parts cannot tell, and mapped incrementally.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from geogs_photos.database import SharedCamera
+from geogs_photos.incremental_mapping import largest_first, put_together
+from geogs_photos.pycolmap_library import load_colmap
+
+WHOLE = 0.9
+"""Part of the frames that one reconstruction has to hold for nothing else to be tried."""
+
+
+def rejoined(
+    parts: Sequence[Any],
+    database: Path,
+    count: int,
+    cameras: Sequence[SharedCamera],
+    seed: int,
+    threads: int,
+    progress: Callable[[str, float], None],
+) -> list[Any]:
+    """Reconstructions by the way that puts most frames into one; ``parts`` are by the first.
+
+    Args:
+        parts: by incremental mapping, the largest first.
+        database: with verified matches of ``count`` frames.
+        count: how many frames there are.
+        cameras: of the frames.
+        seed: of the random choices.
+        threads: to compute with.
+        progress: called with a stage and its finished part; what it raises ends the work.
+    """
+    best = list(parts)
+    if _placed(best) < WHOLE * count:
+        progress("finding poses globally", 0.0)
+        best = max(best, _globally(database, seed, threads), key=_placed)
+        progress("finding poses globally", 1.0)
+    if best and _placed(best) < WHOLE * count and not all(c.is_known for c in cameras):
+        again = _with_camera_of(
+            best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
+        )
+        best = max(best, again, key=_placed)
+    return best
+
+
+def _placed(parts: Sequence[Any]) -> int:
+    return int(parts[0].num_reg_images()) if parts else 0
+
+
+def _globally(database: Path, seed: int, threads: int) -> list[Any]:
+    colmap = load_colmap()
+    options = colmap.GlobalPipelineOptions(num_threads=threads, random_seed=seed)
+    mapper = options.mapper
+    mapper.random_seed, mapper.num_threads = seed, threads
+    for stage in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
+        stage.random_seed = seed
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    own, work = database.with_name("global.db"), database.with_name("global")
+    shutil.copy(database, own)
+    work.mkdir()
+    return largest_first(colmap.global_mapping(own, work, work, options))
+
+
+def _with_camera_of(
+    model: Any,
+    database: Path,
+    count: int,
+    seed: int,
+    threads: int,
+    progress: Callable[[float], None],
+) -> list[Any]:
+    colmap = load_colmap()
+    own = database.with_name("again.db")
+    shutil.copy(database, own)
+    opened = colmap.Database.open(own)
+    try:
+        for number in model.cameras:
+            camera = opened.read_camera(number)
+            camera.params = model.cameras[number].params
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)
+        opened.clear_two_view_geometries()
+    finally:
+        opened.close()
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    colmap.geometric_verification(own, two_view_geometry_options=verification)
+    known = list(model.cameras)
+    return put_together(own, own.with_name("again"), count, known, seed, threads, progress)

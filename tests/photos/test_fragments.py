@@ -1,0 +1,98 @@
+"""Ways that are tried where structure from motion of a video falls into parts."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geogs.io.sources.calibration import Calibration
+from geogs.types import Frame
+from geogs_photos import fragments, video
+from geogs_photos.database import SharedCamera
+from geogs_photos.fragments import rejoined
+from geogs_photos.sharp_frames import ChosenFrames
+from posed_layouts import render_room
+
+CAMERA = SharedCamera(Calibration(100.0, 100.0, 50.0, 40.0), is_known=False)
+
+
+@dataclass
+class Part:
+    """A reconstruction of so many frames."""
+
+    frames: int
+    cameras: dict = field(default_factory=dict)
+
+    def num_reg_images(self) -> int:
+        return self.frames
+
+
+@pytest.mark.parametrize(
+    ("first", "globally", "again", "best", "tried"),
+    [
+        ([95], [], [], 95, []),  # whole enough
+        ([60, 35], [98], [], 98, ["globally"]),
+        ([60, 35], [40], [92], 92, ["globally", "again"]),
+        ([60, 35], [65], [30], 65, ["globally", "again"]),  # of three the largest
+        ([], [], [], None, ["globally"]),
+        ([], [70], [80], 80, ["globally", "again"]),
+    ],
+)
+def test_of_three_ways_the_one_that_puts_most_into_one(
+    monkeypatch, first, globally, again, best, tried
+):
+    asked = []
+
+    def by_way(name: str, sizes: list[int]):
+        def way(*_: object) -> list[Part]:
+            asked.append(name)
+            return [Part(n) for n in sizes]
+
+        return way
+
+    monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
+    monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
+    parts = [Part(n) for n in first]
+    found = rejoined(parts, Path("none"), 100, [CAMERA], 0, 1, lambda *_: None)
+    assert asked == tried
+    assert (found[0].frames if found else None) == best
+
+
+@pytest.mark.system
+def test_each_way_places_a_room(monkeypatch):
+    """Incremental mapping is taken to have failed; the two others place all by themselves."""
+    pytest.importorskip("pycolmap")
+    room = render_room(9, 3, 320, 240)
+    frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(room.images))
+    chosen = ChosenFrames(frames, np.arange(9) / 10)
+    truth = room.T_wc[:, :3, 3]
+    extent = np.linalg.norm(truth - truth[0], axis=1)
+
+    def check(parts, *given: object) -> list:
+        found = {"globally": fragments._globally(given[0], 0, 1)}
+        arguments = (parts[0], given[0], 9, 0, 1, lambda _: None)
+        found["again"] = fragments._with_camera_of(*arguments)
+        for way in found.values():
+            assert way[0].num_reg_images() == 9
+            images = sorted(way[0].images.values(), key=lambda image: image.name)
+            centres = np.stack([image.projection_center() for image in images])
+            off = np.linalg.norm(centres - centres[0], axis=1)
+            assert np.abs(off * extent.sum() / off.sum() - extent).max() < 0.03 * extent.max()
+        return parts
+
+    monkeypatch.setattr(video, "rejoined", check)
+    placed = video.place_frames(chosen, room.camera, False, 0, lambda *_: None)
+    assert placed.numbers == tuple(range(9))
+
+
+def test_frames_that_few_points_place_have_no_pose():
+    @dataclass
+    class Image:
+        name: str
+        num_points3D: int
+        has_pose: bool = True
+
+    images = [Image("b", 15), Image("a", 200), Image("c", 14), Image("d", 90, False)]
+    model = type("Model", (), {"images": dict(enumerate(images))})
+    assert [image.name for image in video._placed_images(model)] == ["a", "b"]
