@@ -40,11 +40,12 @@ def rejoined(
         progress: called with a stage and its finished part; what it raises ends the work.
     """
     best = list(parts)
+    is_known = all(camera.is_known for camera in cameras)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
-        best = max(best, _globally(database, seed, threads), key=_placed)
+        best = max(best, _globally(database, is_known, seed, threads), key=_placed)
         progress("finding poses globally", 1.0)
-    if best and _placed(best) < WHOLE * count and not all(c.is_known for c in cameras):
+    if best and _placed(best) < WHOLE * count and not is_known:
         again = _with_camera_of(
             best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
         )
@@ -56,14 +57,16 @@ def _placed(parts: Sequence[Any]) -> int:
     return int(parts[0].num_reg_images()) if parts else 0
 
 
-def _globally(database: Path, seed: int, threads: int) -> list[Any]:
+def _globally(database: Path, is_known: bool, seed: int, threads: int) -> list[Any]:
     colmap = load_colmap()
     options = colmap.GlobalPipelineOptions(num_threads=threads, random_seed=seed)
     mapper = options.mapper
     mapper.random_seed, mapper.num_threads = seed, threads
     for stage in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
         stage.random_seed = seed
-    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    adjustment = mapper.bundle_adjustment
+    mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
+    adjustment.refine_focal_length = adjustment.refine_extra_params = not is_known
     own, work = database.with_name("global.db"), database.with_name("global")
     shutil.copy(database, own)
     work.mkdir()

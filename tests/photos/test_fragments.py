@@ -70,7 +70,7 @@ def test_each_way_places_a_room(monkeypatch):
     extent = np.linalg.norm(truth - truth[0], axis=1)
 
     def check(parts, *given: object) -> list:
-        found = {"globally": fragments._globally(given[0], 0, 1)}
+        found = {"globally": fragments._globally(given[0], False, 0, 1)}
         arguments = (parts[0], given[0], 9, 0, 1, lambda _: None)
         found["again"] = fragments._with_camera_of(*arguments)
         for way in found.values():
