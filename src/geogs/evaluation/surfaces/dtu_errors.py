@@ -6,7 +6,6 @@ Python evaluation that 2DGS and PGSR come with.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,6 +14,7 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 from geogs.evaluation.surfaces.thinning import dense_points, thin
+from geogs.io.mat_reader import read_mat
 from geogs.threads import on_one_torch_thread
 
 SPACING = 0.2
@@ -166,14 +166,9 @@ def _observed(points: Float[np.ndarray, "n 3"], r: DtuReference) -> Bool[np.ndar
 
 
 def _read_mat(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    from scipy.io import loadmat
-
     if not path.is_file():
         raise InputError(f"{path} does not exist; give the folder of the official DTU evaluation.")
-    try:
-        content: dict[str, Any] = loadmat(str(path), variable_names=names)
-    except Exception as error:  # a damaged file raises whatever the reader stumbles over
-        raise InputError(f"{path} is damaged or no MATLAB file; copy it again.") from error
+    content = read_mat(path, names)
     if any(name not in content for name in names):
         raise InputError(f"{path} lacks {', '.join(names)}, which DTU's files hold.")
-    return {name: np.asarray(content[name]) for name in names}
+    return content
