@@ -1,10 +1,19 @@
 """Report pages as a browser would read them."""
 
+import base64
+import hashlib
+import re
 from html.parser import HTMLParser
 
 import pytest
 
-from geogs.evaluation.pages.page import PictureSection, TableSection, TextSection, write_page
+from geogs.evaluation.pages.page import (
+    HtmlSection,
+    PictureSection,
+    TableSection,
+    TextSection,
+    write_page,
+)
 from io_samples import empty_png
 
 
@@ -81,3 +90,22 @@ def test_a_picture_that_promises_more_than_it_holds_is_left_out_in_silence(tmp_p
     assert "bomb" not in text
     assert "here" in text
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_whole_page_allows_its_own_scripts_and_nothing_else(tmp_path):
+    script = "document.title = '<ü>'"
+    sections = [
+        HtmlSection(f"<script>{script}</script>", (script,)),
+        TextSection("said", "<script>alert(1)</script>"),
+    ]
+    write_page(tmp_path / "p.html", "t", sections, is_whole=True)
+    text = (tmp_path / "p.html").read_text(encoding="utf-8")
+    (policy,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
+    assert policy.startswith("default-src 'none';")
+    assert "http" not in policy
+    assert text.index("<meta http-equiv") < text.index("<style")
+    (found,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(found.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}';" in policy
+    write_page(tmp_path / "p.html", "t", sections[1:], is_whole=True)
+    assert "script-src 'none';" in (tmp_path / "p.html").read_text()

@@ -91,7 +91,7 @@ class ViewSettings(Settings):
     """Look at a result in the browser: mesh, disks, path, keyframes with depth and normals.
 
     Needs pip install 'geogs[viewer]'; without it, open report/index.html of the result. Over ssh:
-    ssh -L 8080:localhost:8080 MACHINE, then http://localhost:8080 on your own machine.
+    ssh -L 8080:localhost:8080 MACHINE, then the address it prints on your own machine.
     """
 
     result: Annotated[Path, Positional()]

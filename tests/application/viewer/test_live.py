@@ -45,7 +45,7 @@ class FakeWindow(Window):
         self.calls.append(name)
         return SimpleNamespace(wxyz=None, position=T_wc[:3, 3])
 
-    def say(self, words):
+    def say(self, *words):
         self.gate.wait(5)
         self.calls.append("say")
 

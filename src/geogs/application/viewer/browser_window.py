@@ -1,6 +1,7 @@
 """The page that a viewer serves: the scene on it, and the panel beside that."""
 
 import atexit
+import html
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.errors import InputError
+from geogs.application.viewer.guarded_server import GuardedServer
 from geogs.evaluation.pages.keyframe_layers import LAYERS, Layer
 from geogs.evaluation.pages.shading import level_axes
 from geogs.geometry.camera import Camera
@@ -28,28 +29,24 @@ PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 
 
 class Window:
-    """A page at ``http://host:port`` with a scene and a panel; nobody has to look at it."""
+    """A page at ``address`` with a scene and a panel; nobody has to look at it."""
 
     def __init__(self, title: str, host: str, port: int, with_disks: bool = False) -> None:
         """Begin to serve; ``with_disks`` shows these, too, from the beginning.
 
         Raises:
-            InputError: viser is not installed.
+            InputError: viser is not installed, or is one that cannot be guarded.
         """
-        try:
-            import viser
-        except ImportError:
-            raise InputError("The viewer needs viser: pip install 'geogs[viewer]'.") from None
-        with redirect_stdout(StringIO()):  # it prints a box with the address
-            self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        guarded = GuardedServer(host, port, title)
+        self._server, self.address = guarded.viser, guarded.address
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         # The light is in the colours already.
         self._server.scene.configure_default_lights(False)
         self._server.scene.add_light_ambient("/light", intensity=3.0)
         self._server.scene.set_background_image(np.full((2, 2, 3), (27, 30, 35), np.uint8))
-        self.address = f"http://{host}:{self._server.get_port()}"
         gui = self._server.gui
-        self._words = gui.add_markdown(f"**{title}**")
+        self._words = gui.add_html("")
+        self.say(title)
         self._picture = gui.add_image(np.zeros((9, 16, 3), np.uint8), format="jpeg")
         self._layer = gui.add_dropdown("Layer", LAYERS)
         self._switches = {}
@@ -93,9 +90,10 @@ class Window:
             self._server.stop()
             time.sleep(_FAREWELL)
 
-    def say(self, markdown: str) -> None:
-        """The words at the top of the panel."""
-        self._words.content = markdown
+    def say(self, heading: str, *sentences: str) -> None:
+        """The words at the top of the panel: text, whatever stands in it."""
+        words = [f"<strong>{html.escape(heading)}</strong>", *map(html.escape, sentences)]
+        self._words.content = "".join(f'<p style="margin: 0.4em 1em">{w}</p>' for w in words if w)
 
     def show_picture(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
         """The picture of the panel."""

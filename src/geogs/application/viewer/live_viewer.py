@@ -31,7 +31,7 @@ _PICTURE_EDGE = 320
 class Update:
     """What there is to see at a moment; nothing in it changes any more."""
 
-    words: str
+    words: tuple[str, str]
     picture: UInt8[np.ndarray, "h w 3"] | None
     camera: Camera
     T_wc: Float[np.ndarray, "4 4"] | None
@@ -86,7 +86,7 @@ class LiveViewer(RunObserver):
         if result.mesh is not None:
             self._window.show_mesh(result.mesh)
         sentence = "" if result.verdict is None else result.verdict.sentence
-        self._window.say(f"**{result.source.name}**: done\n\n{sentence}")
+        self._window.say(f"{result.source.name}: done", sentence)
 
     def _look(self, frame: Frame, status: "PoseEstimate", slam: "Slam", now: float) -> Update:
         ids = tuple(slam.segments.keyframe_ids)
@@ -95,8 +95,8 @@ class LiveViewer(RunObserver):
         seen = slam.T_cw if status.state.value == "tracking" else None
         loops = len(slam.world.loops.loops)
         words = (
-            f"frame {status.frames}: {status.state.value}\n\n{status.keyframes} keyframes, "
-            f"{status.disks} disks, {loops} loops"
+            f"frame {status.frames}: {status.state.value}",
+            f"{status.keyframes} keyframes, {status.disks} disks, {loops} loops",
         )
         picture, layer = frame.image, self._window.layer
         if layer != "image" and (searched := slam.depth_maps()):
@@ -129,7 +129,7 @@ class LiveViewer(RunObserver):
 
     def _show(self, update: Update) -> None:
         window = self._window
-        window.say(update.words)
+        window.say(*update.words)
         if len(update.keyframes) > 1:
             extent = np.ptp(update.keyframes[:, :3, 3], axis=0)
             window.stand_upright(update.keyframes, 2.5 * float(np.linalg.norm(extent)) + 1.0)

@@ -43,7 +43,7 @@ def _show_keyframes(result: SavedResult, window: Window) -> None:
     count = len(views.keyframe_id)
     shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
     every = -(-len(shown) // MOST_IMAGES)
-    for place, number in enumerate(shown):
+    for place, number in enumerate(shown.tolist()):
         id = int(views.keyframe_id[number])
         image = result.image(number) if place % every == 0 else None
         if image is not None:
@@ -83,13 +83,13 @@ class _Inspector:
             try:
                 picture = self._picture(number)
             except InputError as error:
-                self._window.say(f"**{result.name}**\n\n{error}")
+                self._window.say(result.name, str(error))
                 return
             self._window.show_picture(picture)
             self._window.show_camera(T_wc, result.camera, picture)
             if self._follow.value:
                 self._window.follow(T_wc)
-            self._window.say(self._words(number))
+            self._window.say(result.name, *self._words(number))
 
     def _picture(self, number: int) -> np.ndarray:
         result, layer = self._result, self._window.layer
@@ -98,14 +98,13 @@ class _Inspector:
             return image
         return layer_picture(result.keyframes[number], layer)
 
-    def _words(self, number: int) -> str:
+    def _words(self, number: int) -> tuple[str, str]:
         result = self._result
         try:
-            verdict = (result.summary.get("verdict") or {}).get("sentence", "")
+            verdict = result.summary.get("verdict")
         except InputError:
-            verdict = ""
+            verdict = None
+        sentence = verdict.get("sentence", "") if isinstance(verdict, dict) else ""
         seconds = result.views.timestamp[number] - result.views.timestamp[0]
         count = len(result.views.keyframe_id)
-        return (
-            f"**{result.name}**\n\n{verdict}\n\nkeyframe {number + 1} of {count}, {seconds:.1f} s"
-        )
+        return str(sentence), f"keyframe {number + 1} of {count}, {seconds:.1f} s"

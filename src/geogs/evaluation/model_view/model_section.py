@@ -19,13 +19,17 @@ SCRIPTS = (
 """Scripts of the page, in the order in which they run; ``three.min.js`` comes before them."""
 
 
+def model_scripts() -> tuple[str, str]:
+    """What runs in the page: the library, and ours."""
+    own = "\n".join(_file(name) for name in SCRIPTS)
+    return _file("three.min.js"), f"(() => {{\n'use strict';\n{own}\n}})();"
+
+
 def model_html(model: ShownModel) -> str:
     """HTML of the model; it needs nothing from elsewhere, and one page holds one of them."""
     scene, arrays, images = pack(model)
     notes = " ".join(model.notes)
     below = f"<p class=note>{html.escape(notes)}</p>" if notes else ""
-    library = f"<script>{_file('three.min.js')}</script>"
-    own = "\n".join(_file(name) for name in SCRIPTS)
     return "\n".join([
         f"<style>{_file('model.css')}</style>",
         _file("model.html"),
@@ -33,8 +37,7 @@ def model_html(model: ShownModel) -> str:
         f'<script type="application/json" id="model-scene">{to_json(scene)}</script>',
         _data("model-arrays", arrays),
         _data("model-images", images),
-        library,
-        f"<script>(() => {{\n'use strict';\n{own}\n}})();</script>",
+        *(f"<script>{script}</script>" for script in model_scripts()),
     ])  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Report pages: one HTML file of figures, tables, pictures and text; no server."""
 
 import base64
+import hashlib
 import html
 import os
 from collections.abc import Sequence
@@ -60,6 +61,8 @@ class HtmlSection:
     """A part that is HTML already, such as a model that turns."""
 
     html: str
+    scripts: Sequence[str] = ()
+    """Those in it that may run, as they stand between their tags."""
 
 
 Section = TableSection | PictureSection | TextSection | FiguresSection | HtmlSection
@@ -94,12 +97,27 @@ def write_page(
     folder = None if is_whole else path.parent
     body += [part for section in sections if (part := _section(section, folder))]
     text = "\n".join(body)
-    write_text(path, f"{_head(title)}<body>\n{text}\n</body></html>\n")
+    scripts = [
+        s for section in sections if isinstance(section, HtmlSection) for s in section.scripts
+    ]
+    policy = _policy(scripts) if is_whole else ""
+    write_text(path, f"{_head(title, policy)}<body>\n{text}\n</body></html>\n")
 
 
-def _head(title: str) -> str:
+def _policy(scripts: Sequence[str]) -> str:
+    """That a page loads nothing from anywhere, and runs these scripts and none that text brings."""
+    digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
+    allowed = [f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests]
+    policy = (
+        "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; "
+        f"script-src {' '.join(allowed) or repr('none')}; base-uri 'none'; form-action 'none'"
+    )
+    return f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+
+
+def _head(title: str, policy: str) -> str:
     return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n{policy}'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head>"

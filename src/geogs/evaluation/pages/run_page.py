@@ -6,7 +6,7 @@ from typing import Any
 
 from geogs.documents import UNUSABLE
 from geogs.evaluation.duration import duration
-from geogs.evaluation.model_view.model_section import model_html
+from geogs.evaluation.model_view.model_section import model_html, model_scripts
 from geogs.evaluation.model_view.shown_model import ShownModel
 from geogs.evaluation.pages.page import (
     FiguresSection,
@@ -46,7 +46,7 @@ def write_run_page(
     """
     name = _shown(str, summary.get("source")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
-    head += [HtmlSection(model_html(model))] if model is not None else []
+    head += [HtmlSection(model_html(model), model_scripts())] if model is not None else []
     place = folder if pictures is None else pictures
     shown = [PictureSection(title, place / file) for file, title in PICTURES.items()]
     sections = [*head, *shown, *run_sections(summary)]
