@@ -1,4 +1,4 @@
-"""Cameras and streams of the network through OpenCV."""
+"""Cameras of this machine through OpenCV, which asks their drivers and not its FFmpeg."""
 
 import time
 from collections.abc import Generator
@@ -14,7 +14,7 @@ MOST_MISSED = 30
 
 
 class Capture:
-    """A camera of this machine, or a stream."""
+    """A camera of this machine."""
 
     def __init__(self, address: LiveAddress) -> None:
         """Raises InputError if it cannot be opened or gives no image."""
@@ -50,11 +50,11 @@ class Capture:
             capture.release()
 
     def _open(self) -> cv2.VideoCapture:
-        target, is_camera = self._address.target, self._address.kind == "camera"
-        capture = cv2.VideoCapture(int(target)) if is_camera else cv2.VideoCapture(target)
+        capture = cv2.VideoCapture(int(self._address.target))
         if not capture.isOpened():
             capture.release()
-            which = "plugged in, and used by nothing else" if is_camera else "reachable"
-            raise InputError(f"{self._address.name} cannot be opened; is it {which}?")
+            raise InputError(
+                f"{self._address.name} cannot be opened; is it plugged in, and used by nothing else?"
+            )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # no queue before ours, where the driver obeys
         return capture

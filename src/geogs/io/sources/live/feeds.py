@@ -11,6 +11,7 @@ from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress
 from geogs.io.sources.live.capture import Capture
 from geogs.io.sources.live.live_reader import LiveReader
+from geogs.io.sources.live.network_stream import NetworkStream
 from geogs.io.sources.live.pipe import Pipe
 from geogs.io.sources.reader import RawFrame, Reader, RecordingInfo
 
@@ -24,7 +25,8 @@ def open_live(address: LiveAddress, pipe: str, played: Reader | None = None) -> 
         assert played is not None, "who plays a file has opened it"
         return LiveReader(Played(played, Path(address.target).name))
     if address.kind != "pipe":
-        return LiveReader(Capture(address))
+        is_camera = address.kind == "camera"
+        return LiveReader(Capture(address) if is_camera else NetworkStream(address))
     if sys.stdin is None or sys.stdin.isatty():
         raise InputError("- reads raw frames from a pipe, and nothing is piped in.")
     return LiveReader(Pipe(cast(BufferedIOBase, sys.stdin.buffer), pipe))

@@ -1,0 +1,71 @@
+"""Streams of the network through FFmpeg (PyAV), which is waited for no longer than said."""
+
+import time
+from collections.abc import Generator
+
+import av
+from av.container import InputContainer
+
+from geogs.errors import InputError
+from geogs.io.sources.address import LiveAddress
+from geogs.io.sources.reader import RawFrame, RecordingInfo
+
+PATIENCE = 10.0
+"""Seconds without an answer after which a stream counts as gone."""
+_OPTIONS = {
+    "rtsp_transport": "tcp",
+    # No stream may lead to a file of this machine.
+    "protocol_whitelist": "rtsp,rtsps,rtp,srtp,rtmp,rtmps,http,https,httpproxy,tls,tcp,udp,crypto",
+}
+
+
+class NetworkStream:
+    """What a camera or a server of the network sends."""
+
+    def __init__(self, address: LiveAddress) -> None:
+        """Raises InputError if it cannot be opened or gives no image."""
+        self._address = address
+        with self._open() as container:
+            stream = container.streams.video[0]
+            first = next(_frames(container), None)
+            if first is None:
+                raise InputError(f"{address.name} is open, but gives no image.")
+            nominal = float(stream.average_rate or stream.guessed_rate or 0)
+            fps = nominal if 1.0 <= nominal <= 1000.0 else 30.0
+            self.info = RecordingInfo(address.kind, address.name, first.width, first.height, fps)
+
+    def frames(self) -> Generator[RawFrame, None, None]:
+        """Images from now on, with the seconds since the first at which they came."""
+        with self._open() as container:
+            began = time.monotonic()
+            for number, frame in enumerate(_frames(container)):
+                image = frame.to_ndarray(format="rgb24")
+                now = time.monotonic() - began
+                yield RawFrame(f"{self.info.name}, frame {number}", now, image)
+
+    def _open(self) -> InputContainer:
+        name = self._address.name
+        try:
+            container = av.open(self._address.target, timeout=PATIENCE, options=_OPTIONS)
+        except (av.error.FFmpegError, OSError, ValueError):
+            raise InputError(f"{name} cannot be opened; is it reachable?") from None
+        if not container.streams.video:
+            container.close()
+            raise InputError(f"{name} is open, but gives no image.")
+        return container
+
+
+def _frames(container: InputContainer) -> Generator[av.VideoFrame, None, None]:
+    """Images until the stream ends or is gone; what is damaged is left out."""
+    packets = container.demux(container.streams.video[0])
+    while True:
+        try:
+            packet = next(packets, None)
+        except (av.error.FFmpegError, OSError):
+            return
+        if packet is None:
+            return
+        try:
+            yield from packet.decode()
+        except av.error.FFmpegError:
+            continue
