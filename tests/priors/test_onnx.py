@@ -44,7 +44,7 @@ def test_shipped_cards_are_complete():
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("name: x\nsource: y\n", "licence"),
+        ("name: x\nheight: 4\n", r"does not say source, licence\.$"),
         (
             "name: x\nsource: y\nlicence: z\nresize: shrink\ndepth_kind: metric",
             "resize must be stretch",

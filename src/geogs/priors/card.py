@@ -1,7 +1,7 @@
 """A card: what a network's file wants and what its numbers mean, as a small YAML file."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -125,10 +125,11 @@ def _from_settings(name: str, content: dict[Any, Any]) -> PriorCard:
         said[key] = _value(known[key], value)
         if not known[key].allows(said[key]):
             raise InputError(f"The card {name} is wrong: {key} must be {known[key]}.")
+    required = (f.name for f in fields(PriorCard) if f.default is MISSING)
+    if missing := [key for key in required if key not in said]:
+        raise InputError(f"The card {name} does not say {', '.join(missing)}.")
     try:
         return PriorCard(**said)
-    except TypeError as error:  # of what is missing
-        raise InputError(f"The card {name} is wrong: {error}.") from None
     except InputError as error:
         raise InputError(f"The card {name} is wrong: {error}") from None
 

@@ -115,8 +115,8 @@ def settings_of(task: Task) -> BaselineSettings:
                 truncation=_number(task.option("mesh.truncation")) or MeshConfig.truncation,
             ),
         )
-    except ValueError as error:
-        raise InputError(f"an option of the baseline is no number ({error}).") from None
+    except ValueError:
+        raise InputError("an option of the baseline that has to be a number is none.") from None
 
 
 def _train(

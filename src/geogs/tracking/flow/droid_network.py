@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.world.grid import OFFSET, STRIDE
 
@@ -271,6 +272,8 @@ def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:
     try:
         network.load_state_dict(plain)
     except RuntimeError as error:
-        reason = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
-        raise InputError(f"These are not the weights of DROID-SLAM: {reason}") from error
+        said = str(error).partition("\n")[2] or str(error)
+        raise InputError(
+            f"These are not the weights of DROID-SLAM: {in_short(RuntimeError(said))}"
+        ) from error
     return network.eval().requires_grad_(False)

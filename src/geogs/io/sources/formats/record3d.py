@@ -153,8 +153,8 @@ class Record3dRecording:
             self._poses = _poses(metadata.get("poses", []))
             self._times = [float(t) for t in metadata.get("frameTimestamps") or []]
             self._size = _whole(metadata, "dh", _LIDAR[0]), _whole(metadata, "dw", _LIDAR[1])
-        except (*UNUSABLE, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: its metadata cannot be understood ({error}).") from None
+        except (*UNUSABLE, UnicodeDecodeError):
+            raise InputError(f"{path}: its metadata cannot be understood; copy it again.") from None
         if not (0 < fps < 1e4):
             raise InputError(f"{path}: its metadata says {fps} frames a second.")
         depths = any(name.endswith(".depth") for name in names)

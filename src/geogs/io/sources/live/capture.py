@@ -53,8 +53,9 @@ class Capture:
         capture = cv2.VideoCapture(int(self._address.target))
         if not capture.isOpened():
             capture.release()
+            name = self._address.name
             raise InputError(
-                f"{self._address.name} cannot be opened; is it plugged in, and used by nothing else?"
+                f"{name} cannot be opened; is it plugged in, and used by nothing else?"
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # no queue before ours, where the driver obeys
         return capture
