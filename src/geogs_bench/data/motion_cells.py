@@ -30,9 +30,13 @@ class Cell:
     """Share of the image that moves."""
 
     @property
-    def on_street(self) -> bool:
-        """Whether it is driven, not walked through a room."""
-        return self.motion == "driving"
+    def place(self) -> MotionKind:
+        """One of the motions through the same place, of which there are three."""
+        return self.motion if self.motion in PLACES else "handheld"
+
+
+PLACES: tuple[MotionKind, ...] = ("handheld", "driving", "corridor")
+"""A motion through each place."""
 
 
 def _cell(
@@ -77,6 +81,7 @@ SMALL: tuple[Cell, ...] = (
     _cell("jerks", "clean", 75, _QVGA),
     _cell("still", "kinect", 30, _QVGA),
     _cell("driving", "clean", 60, _SMALL_STREET),
+    _cell("corridor", "kinect", 60, _QVGA),
 )
 """For two CPU cores."""
 
@@ -91,6 +96,7 @@ FULL: tuple[Cell, ...] = (
     _cell("driving", "clean", 125, _STREET),
     _cell("driving", "action", 125, _STREET),
     _cell("driving", "clean", 125, _STREET, 0.15),
+    *(_cell("corridor", camera, 120, _LARGER) for camera in ("clean", "phone", "kinect")),
 )  # fmt: skip
 """All motions, all flaws."""
 
@@ -110,9 +116,9 @@ def render_cells(
     if strangers := [name for name in names if name not in known]:
         raise InputError(f"there is no cell {strangers[0]}; choose of {', '.join(known)}.")
     missing = [c for c in cells if (not names or c.name in names) and not _is_there(c, folder)]
-    for on_street in (False, True):
-        some = [cell for cell in missing if cell.on_street == on_street]
-        raycaster = _raycaster(on_street) if some else None
+    for place in PLACES:
+        some = [cell for cell in missing if cell.place == place]
+        raycaster = _raycaster(place) if some else None
         for cell in some:
             say(f"rendering {cell.name}")
             _render(cell, folder / cell.name, raycaster)
@@ -136,11 +142,11 @@ def _is_there(cell: Cell, folder: Path) -> bool:
     return any((folder / cell.name).glob("points_seen_*.ply"))
 
 
-def _raycaster(on_street: bool) -> "Raycaster":
+def _raycaster(place: MotionKind) -> "Raycaster":
     from geogs_synth.raycast.raycaster import Raycaster
     from geogs_synth.sequence.location import make_scene
 
-    return Raycaster(make_scene("driving" if on_street else "handheld", 0), _threads())
+    return Raycaster(make_scene(place, 0), _threads())
 
 
 def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:

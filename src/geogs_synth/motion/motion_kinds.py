@@ -8,5 +8,5 @@ RoomMotionKind = Literal[
 ]  # fmt: skip
 """Through a room."""
 ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
-MotionKind = Literal[RoomMotionKind, "driving"]
-"""Through a room, or along a street."""
+MotionKind = Literal[RoomMotionKind, "driving", "corridor"]
+"""Through a room, along a street, or along a corridor almost without texture."""

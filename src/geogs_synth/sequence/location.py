@@ -7,6 +7,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs_synth.motion.motion_kinds import MotionKind
 from geogs_synth.motion.room_motions import Motion, room_motion
+from geogs_synth.places.corridor import make_corridor, walk
 from geogs_synth.places.room import make_room
 from geogs_synth.places.street import drive, make_street
 from geogs_synth.places.traffic import street_traffic
@@ -55,7 +56,7 @@ class Location:
 
 
 def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> Location:
-    """The room or the street of the seed, and the motion through it.
+    """The room, street or corridor of the seed, and the motion through it.
 
     ``scene``, if it is there already, is not made again.
     """
@@ -65,6 +66,11 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
             kind, f"procedural street, seed {seed}", seed, scene, drive(seed),
             width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
         )  # fmt: skip
+    if kind == "corridor":
+        return Location(
+            kind, f"procedural corridor, seed {seed}", seed, scene, walk(scene, seed),
+            width=320, height=240, focal=ROOM_FOCAL, depth_scale=2000.0, voxel_cm=2, reach=15.0,
+        )  # fmt: skip
     return Location(
         kind, f"procedural room, seed {seed}", seed, scene, room_motion(kind, scene, seed),
         width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
@@ -72,8 +78,10 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
 
 
 def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
-    """The room or the street of the seed that a motion goes through."""
-    return make_street(seed) if kind == "driving" else make_room(seed)
+    """The room, street or corridor of the seed that a motion goes through."""
+    if kind == "driving":
+        return make_street(seed)
+    return make_corridor(seed) if kind == "corridor" else make_room(seed)
 
 
 def centred_camera(width: int, height: int, focal: float = ROOM_FOCAL) -> Camera:

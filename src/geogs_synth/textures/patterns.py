@@ -208,6 +208,26 @@ def tiles(
     return _finish(image * (1 - joint) + joint * np.array([168, 162, 150], np.float32))
 
 
+def panels(
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    cell: tuple[float, float],
+    colour: Colour,
+    contrast: float,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Smooth painted panels of ``cell`` texels down and across.
+
+    The narrow joints between them are darker by ``contrast``, a part of the colour.
+    """
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    row, column = (y / cell[0]).astype(int), (x / cell[1]).astype(int)
+    tone = rng.normal(1.0, 0.008, (row.max() + 1, column.max() + 1)).astype(np.float32)
+    fx, fy = x - column * cell[1], y - row * cell[0]
+    edge = np.minimum(np.minimum(fx, cell[1] - fx), np.minimum(fy, cell[0] - fy))
+    joint = 1 - contrast * np.clip(2 - edge, 0, 1)
+    return _finish(np.asarray(colour, np.float32) * (tone[row, column] * joint)[..., None])
+
+
 def fabric(
     rng: np.random.Generator, shape: tuple[int, int], colour: Colour, stripe: Colour
 ) -> UInt8[np.ndarray, "h w 3"]:
