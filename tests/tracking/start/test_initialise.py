@@ -1,15 +1,17 @@
-"""Placing the keyframes of a start."""
+"""The pair of views that a start begins with, and placing its keyframes."""
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph.frame_graph import FrameGraph
-from geogs.tracking.matching.two_view import _pose_of
+from geogs.tracking.matching.two_view import _pose_of, agreement, best_two_view, two_view
 from geogs.tracking.start.initialise import placed_after
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from tracking_scenes import CAMERA, pose, render
@@ -53,3 +55,40 @@ def test_of_four_poses_of_an_essential_matrix_the_right_one_is_taken(t) -> None:
         assert seen.sum() == count == 400
         np.testing.assert_allclose(theirs, found, atol=1e-9)
         np.testing.assert_allclose(direction[:, 0], along, atol=1e-9)
+
+
+def _flow(depth: torch.Tensor, to: np.ndarray, of: torch.Tensor | None = None) -> FlowMatch:
+    """Where a camera sees the cells of the first view, known to a tenth of a pixel."""
+    grid = SampleGrid(CAMERA)
+    T = torch.from_numpy(np.linalg.inv(to)).float()[None]
+    at = project(CAMERA, grid.rays, T, 1 / depth[None])
+    noise = 0.1 * torch.randn(at.pixels.shape, generator=torch.Generator().manual_seed(0))
+    used = at.valid if of is None else at.valid & of
+    weight = used[..., None].float().expand_as(at.pixels)
+    return FlowMatch(at.pixels + noise, weight)
+
+
+def test_a_pair_that_other_views_contradict_is_not_started_from() -> None:
+    """The first two suit a scene and a motion that are not there, over more cells than others."""
+    grid = SampleGrid(CAMERA)
+    first = pose(0.0)
+    depth = torch.from_numpy(render(first)[1][4:-3:8, 4:-3:8].reshape(-1).copy()).float()
+    other = torch.from_numpy(np.random.default_rng(1).uniform(1.0, 4.0, grid.size)).float()
+    right = torch.from_numpy(np.random.default_rng(2).random(grid.size) < 0.7)
+    wrong = _flow(other, pose(0.0, 0.3, 0.1))
+    flows = [wrong, *(_flow(depth, pose(0.06 * k, 0.0, 0.02 * k), right) for k in range(3, 9))]
+    views = [two_view(CAMERA, match) for match in flows]
+    assert views[0].good.sum() > max(int(v.good.sum()) for v in views[1:])
+    assert min(v.parallax for v in views) > 3 * 2.0  # more of it makes none better
+    n, view = best_two_view(CAMERA, flows, 2.0)
+    assert n > 0
+    ratio = view.inverse_depth[view.good] * depth[view.good]
+    assert (ratio / ratio.median() - 1).abs().median() < 0.02
+    of_all = [sum(agreement(grid, v, match) for match in flows) for v in (views[0], view)]
+    assert of_all[1] > 3 * of_all[0]
+
+
+def test_without_parallax_there_is_no_pair_to_start_from() -> None:
+    depth = torch.full((SampleGrid(CAMERA).size,), 3.0)
+    turned = [_flow(depth, pose(0.0, yaw=0.05 * k)) for k in range(1, 5)]
+    assert best_two_view(CAMERA, turned, 2.0) is None

@@ -16,7 +16,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
 from geogs.tracking.matching.pnp import pnp
-from geogs.tracking.matching.two_view import best_two_view, two_view
+from geogs.tracking.matching.two_view import best_two_view
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -46,7 +46,7 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
     """Place and adjust the keyframes from one focal length; None where it shows no parallax."""
     flows = [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
-    found = best_two_view((two_view(camera, match) for match in flows[1::2]), min_parallax)
+    found = best_two_view(camera, flows[1::2], min_parallax)
     if found is None:
         return None
     best, view = 1 + 2 * found[0], found[1]

@@ -1,6 +1,6 @@
 """Relative pose of two views from their flow alone, and the depth that it gives."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,12 +9,19 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
+from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
+from geogs.threads import thread_map
+from geogs.tracking.matching.pnp import pnp
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 FARTHEST = 50.0
 """Baselines beyond which a point says nothing on which of four poses is the right one."""
+COMPARED = 5
+"""Pairs of views that are compared by what other views say of their depths."""
+AGREEING = 0.004
+"""A cell agrees that lies no farther from where it was matched, of the long edge."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +37,48 @@ class TwoView:
 
 
 def best_two_view(
-    views: Iterable[TwoView | None], min_parallax: float
+    camera: Camera, flows: Sequence[FlowMatch], min_parallax: float
 ) -> tuple[int, TwoView] | None:
-    """The pair to start from, with its index; None where none has the parallax (pixels)."""
-    best, best_score = None, 0.0
-    for n, view in enumerate(views):
-        if view is None or view.parallax < min_parallax:
-            continue
-        # Parallax helps until the views no longer overlap.
-        score = min(view.parallax, 3 * min_parallax) * int(view.good.sum())
-        if score > best_score:
-            best, best_score = (n, view), score
-    return best
+    """The pair to start from, of the flows from one view to others; None without parallax.
+
+    An essential matrix of a short baseline may be wrong and yet suit its pair well, so a few of
+    the pairs that have parallax over most good cells are compared: the depth that most cells of
+    all the flows agree with is right.
+
+    Args:
+        camera: of all views.
+        flows: from the first view to each other, on the CPU.
+        min_parallax: motion that rotation does not explain, at least, pixels.
+
+    Returns:
+        The index of the pair among the flows, and what it gives.
+    """
+    found = thread_map(lambda match: two_view(camera, match), flows)
+    able = [(n, v) for n, v in enumerate(found) if v is not None and v.parallax >= min_parallax]
+    # Parallax helps until the views no longer overlap.
+    able.sort(key=lambda c: -min(c[1].parallax, 3 * min_parallax) * int(c[1].good.sum()))
+    able = able[:COMPARED]
+    if len(able) < 2:
+        return able[0] if able else None
+    grid = SampleGrid(camera)
+    pairs = [(view, match) for _, view in able for match in flows]
+    agreeing = thread_map(lambda pair: agreement(grid, *pair), pairs)
+    support = torch.tensor(agreeing).reshape(len(able), -1).sum(1)
+    return able[int(support.argmax())]
+
+
+def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> int:
+    """How many cells of a flow agree with the depth of a pair of views, wherever it leads to.
+
+    The pose there is found from them (PnP). All on the CPU.
+    """
+    good = view.good & match.sure()[0]
+    T = pnp(grid, view.inverse_depth, match.pixels[0], good)
+    if T is None:
+        return 0
+    at = project(grid.camera, grid.rays, T[None].float(), view.inverse_depth[None])
+    near = (at.pixels[0] - match.pixels[0]).norm(dim=-1) < AGREEING * grid.camera.long_edge
+    return int((good & near & at.valid[0]).sum())
 
 
 def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:

@@ -18,13 +18,13 @@ from geogs.bundle.marginals import marginals
 from geogs.bundle.protocols import BundleOptions
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.threads import thread_map
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
 from geogs.tracking.graph.proximity import RADIUS
+from geogs.tracking.locate.frame_locator import MIN_KNOWN
 from geogs.tracking.matching.photometric_check import MIN_NCC, PhotometricCheck, correlation_at
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.sparse_features import guided_flows
-from geogs.tracking.matching.two_view import TwoView, best_two_view, two_view
+from geogs.tracking.matching.two_view import TwoView, best_two_view
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
@@ -32,8 +32,11 @@ from geogs.world.keyframes import Keyframe, KeyframeSet
 MIN_PARALLAX = 0.005
 """Motion that rotation does not explain, needed to try to start, of the long edge."""
 MAX_DEVIATION = 0.2
-"""The map is started when the depths of its first keyframes are known to this, in the median:
-relative standard deviation by what matches and poses leave open."""
+"""The map is started when the depths of its first keyframes are known to this, in ``LEAST_KNOWN``
+of their cells: relative standard deviation by what matches and poses leave open."""
+LEAST_KNOWN = 1.5 * MIN_KNOWN
+"""Fraction of a keyframe's cells, half again as many as frames are followed by. Of plain walls
+nothing is known however far the camera has moved; they do not keep the rest from being used."""
 LEAST_SEEN = 0.4
 """Fraction of the first keyframe's depths that a keyframe must see to be placed on them."""
 ROUNDS, FORGIVING = 6, 2
@@ -65,8 +68,7 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     camera = segment.grid.camera
     # Poses are guessed on the CPU.
     flows = [f.on_cpu() for f in flows]
-    found = thread_map(lambda match: two_view(camera, match), flows)
-    best = best_two_view(found, MIN_PARALLAX * camera.long_edge)
+    best = best_two_view(camera, flows, MIN_PARALLAX * camera.long_edge)
     if best is None:
         return Attempt.FAILED
     _place_all(graph, flows, best)
@@ -133,11 +135,14 @@ def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
 
 
 def _depth_deviation(graph: FrameGraph) -> float:
-    """Relative deviation of the depths, the poses being as open as they are: the median of all."""
+    """Relative deviation of the best known depths, the poses being as open as they are.
+
+    That of the ``LEAST_KNOWN`` of a keyframe's cells which are known best: the median of all.
+    """
     ids = graph.keyframes.ids
     problem, _ = graph.problem(list(graph.edges), ids[1:], ids)
     found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=HUBER))
-    return float(found.depth_deviation.median())
+    return float(found.relative_depth.quantile(LEAST_KNOWN, -1, interpolation="higher").median())
 
 
 def _passes_photometric_check(graph: FrameGraph) -> bool:
