@@ -22,8 +22,8 @@ from geogs.world.frames import RelativeRotation
 from geogs.world.keyframes import Keyframe
 
 CULL_DISTANCE = 0.012
-"""A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
-makes one."""
+"""A keyframe nearer than this to the one before it is removed again, of the long edge: somewhat
+less than what makes one."""
 DEEPER = 3
 """Keyframes before the window whose poses are adjusted whose inverse depth is adjusted, too."""
 PROXIMITY_WINDOW = 25

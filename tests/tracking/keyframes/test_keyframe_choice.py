@@ -19,12 +19,18 @@ def texture(seed: int = 0) -> np.ndarray:
 
 
 def is_chosen(flow: float, overlap: float) -> bool:
-    return KeyframeChoice(CONFIG, 512).calls_for(flow, overlap)
+    return KeyframeChoice(CONFIG, 512).calls_for(flow, overlap, flow)
 
 
 def test_motion_makes_a_keyframe_whatever_overlaps() -> None:
     assert is_chosen(12.9, 1.0)
     assert not is_chosen(12.7, 1.0)
+
+
+def test_before_depths_are_known_the_rotation_counts_and_more_is_asked_for() -> None:
+    choice = KeyframeChoice(CONFIG, 512)
+    assert not choice.calls_for(23.0, 1.0)
+    assert choice.calls_for(23.1, 1.0)
 
 
 def test_lost_overlap_makes_a_keyframe_before_the_median_motion_does() -> None:
@@ -48,19 +54,19 @@ def test_a_blurred_frame_waits_for_a_sharper_one_but_not_for_long() -> None:
     choice = KeyframeChoice(CONFIG, 512)
     for seed in range(5):
         choice.see(texture(seed))
-    assert choice.calls_for(12.9, 1.0)
+    assert choice.calls_for(12.9, 1.0, 12.9)
     choice.see(cv2.blur(texture(5), (9, 1)))
-    assert not choice.calls_for(17.8, 1.0)
-    assert choice.calls_for(18.0, 1.0)
-    assert not choice.calls_for(9.0, 0.6)
-    assert choice.calls_for(9.0, 0.45)
+    assert not choice.calls_for(17.8, 1.0, 17.8)
+    assert choice.calls_for(18.0, 1.0, 18.0)
+    assert not choice.calls_for(9.0, 0.6, 9.0)
+    assert choice.calls_for(9.0, 0.45, 9.0)
 
 
 def test_where_all_are_blurred_none_waits() -> None:
     choice = KeyframeChoice(CONFIG, 512)
     for seed in range(12):
         choice.see(cv2.blur(texture(seed), (9, 1)))
-    assert choice.calls_for(12.9, 1.0)
+    assert choice.calls_for(12.9, 1.0, 12.9)
 
 
 def test_a_choice_goes_on_where_another_was() -> None:
@@ -71,7 +77,7 @@ def test_a_choice_goes_on_where_another_was() -> None:
     choice.settle()
     other = KeyframeChoice(CONFIG, 512, recent)
     other.see(cv2.blur(texture(5), (9, 1)))
-    assert not other.calls_for(13.0, 1.0)
+    assert not other.calls_for(13.0, 1.0, 13.0)
 
 
 def test_a_camera_that_turns_makes_keyframes_by_what_goes_out_of_sight() -> None:

@@ -12,6 +12,9 @@ from geogs.config import TrackingConfig
 LEAST_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
 hardly moved, so it is the image that is poor."""
+WITH_ROTATION = 1.8
+"""Times the parallax that makes a keyframe is the motion that does before depths are known, since
+part of it is the rotation's."""
 FARTHEST = 0.15
 """Motion that makes a keyframe without any parallax, of the long edge: over larger ones flow finds
 fewer matches, and worse ones."""
@@ -54,7 +57,7 @@ def calls_for_keyframe(
     if overlap < config.keyframe_overlap / more and flow >= LEAST_FLOW * enough:
         return True
     if parallax is None:
-        return flow >= enough
+        return flow >= WITH_ROTATION * enough
     return parallax >= enough or flow >= FARTHEST * more * long_edge
 
 
