@@ -32,7 +32,8 @@ class TrackingConfig(Settings, group="tracking"):
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
     keyframe_parallax: Fraction = 0.014
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge,
-    without what the camera's rotation alone does; before depths are known, 1.8 times that in all."""
+    without what the camera's rotation alone does; before depths are known, 1.8 times that in
+    all."""
     keyframe_overlap: Fraction = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""
