@@ -66,9 +66,10 @@ class FlowMatch:
         return FlowMatch(self.pixels.cpu(), self.weight.cpu())
 
     def sure(self) -> Bool[Tensor, "e p"]:
-        """Cells that a geometry may be guessed from: matched with no less than a hundredth of the
-        weight of the edge's best, where a mere guess would count like a good match."""
-        weight = self.weight[..., 0]
+        """Cells that a geometry may be guessed from: matched, along both axes, with no less than a
+        hundredth of the weight of the edge's best, where a mere guess would count like a good
+        match."""
+        weight = self.weight.amin(-1)
         best = torch.quantile(weight.float(), 0.98, dim=-1, keepdim=True)
         return (weight > 0) & (weight > 0.01 * best)
 

@@ -198,16 +198,17 @@ def test_matches_are_those_of_the_cpu(device: torch.device, level: int) -> None:
     operator._kernels["flow_match"](
         (-(-grid.size // 8), 2), (32, 8), table, dense, begin[0], begin[1], pixels, weight, 1,
         camera.width, camera.height, grid.width, grid.height, level,
-        operator._layout.structure, 1.0, *((1.7 if level else 1.0) * d for d in DEVIATION),
+        operator._layout.certainty, 1.0, *((1.7 if level else 1.0) * d for d in DEVIATION),
     )  # fmt: skip
     for k in (0, 1):
         expected, expected_weight = reference._match(reference.encode(rgb), flows[k], flows[1 - k])
         # OpenCV interpolates at steps of 1/32 pixel.
         np.testing.assert_allclose(pixels[k].cpu().numpy(), expected, atol=0.03)
-        a, b = weight[k, :, 0].cpu().numpy(), expected_weight[:, 0]
-        assert ((a > 0) == (b > 0)).mean() > 0.97
-        both = (a > 0) & (b > 0)
-        assert both.mean() > 0.3
-        ratio = np.sqrt(a[both] / b[both])
-        assert np.abs(np.median(ratio) - 1) < 0.01
-        assert np.quantile(np.abs(ratio - 1), 0.9) < (0.15 if level else 0.05)
+        for axis in (0, 1):
+            a, b = weight[k, :, axis].cpu().numpy(), expected_weight[:, axis]
+            assert ((a > 0) == (b > 0)).mean() > 0.97
+            both = (a > 0) & (b > 0)
+            assert both.mean() > 0.3
+            ratio = np.sqrt(a[both] / b[both])
+            assert np.abs(np.median(ratio) - 1) < 0.01
+            assert np.quantile(np.abs(ratio - 1), 0.9) < (0.15 if level else 0.05)

@@ -68,9 +68,11 @@ __device__ float local_mean(const float* pyramid, int width, int height, int x, 
   return warp_sum(sum) / warp_sum(total);
 }
 
-// Smaller eigenvalue of the structure tensor over 9 x 9 pixels around each cell of the grid
-// (grey levels^2 / pixel^2), the number of cells above `least`, and the local means. A warp each.
-extern "C" __global__ void flow_structure(float* image, int* textured, int width, int height, int grid_width, int grid_height, int mean_offset, int structure_offset, float least) {
+// What a match of each cell of the grid says along x and along y, by the structure tensor over 9 x 9
+// pixels around it: each eigenvalue l becomes min(1, l / sharp + uninformed), and of either axis
+// counts what is known while the other is open. The number of cells whose smaller eigenvalue (grey
+// levels^2 / pixel^2) is above `least`, and the local means. A warp each.
+extern "C" __global__ void flow_structure(float* image, int* textured, int width, int height, int grid_width, int grid_height, int mean_offset, int certainty_offset, float least, float sharp, float uninformed) {
   int index = blockIdx.x * blockDim.y + threadIdx.y, lane = threadIdx.x;
   int cells = grid_width * grid_height;
   Level coarse = pyramid_level(width, height, MEAN_LEVEL);
@@ -98,9 +100,13 @@ extern "C" __global__ void flow_structure(float* image, int* textured, int width
   yy = warp_sum(yy) / 81.f;
   xy = warp_sum(xy) / 81.f;
   if (lane) return;
-  float half = 0.5f * (xx - yy), smaller = 0.5f * (xx + yy) - sqrtf(half * half + xy * xy);
-  image[structure_offset + index] = smaller;
-  if (smaller > least) atomicAdd(textured, 1);
+  float half = 0.5f * (xx - yy), mean = 0.5f * (xx + yy), radius = sqrtf(half * half + xy * xy);
+  float across = fminf(1.f, (mean + radius) / sharp + uninformed);
+  float along = fminf(1.f, (mean - radius) / sharp + uninformed);
+  float in_x = 0.5f + 0.5f * half / fmaxf(radius, 1e-6f);  // squared cosine of the direction across
+  image[certainty_offset + 2 * index] = across * along / (across + (along - across) * in_x);
+  image[certainty_offset + 2 * index + 1] = across * along / (along + (across - along) * in_x);
+  if (mean - radius > least) atomicAdd(textured, 1);
 }
 
 // Pyramid of the second image warped to the first by the start flow.

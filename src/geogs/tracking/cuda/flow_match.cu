@@ -39,7 +39,7 @@ __device__ float roughness_at(const Composed& c, float x, float y) {
 
 // Positions and weights (inverse variances) of all cells; a warp each. The deviation of a match is
 // base + by_disagreement |forward + backward| + by_roughness (mean gradient of the rest).
-extern "C" __global__ void flow_match(const long long* images, const float2* flow, const float2* forward, const float2* backward, float2* pixels, float2* weight, int pairs, int width, int height, int grid_width, int grid_height, int level, int structure_offset, float most, float base, float by_disagreement, float by_roughness) {
+extern "C" __global__ void flow_match(const long long* images, const float2* flow, const float2* forward, const float2* backward, float2* pixels, float2* weight, int pairs, int width, int height, int grid_width, int grid_height, int level, int certainty_offset, float most, float base, float by_disagreement, float by_roughness) {
   int cells = grid_width * grid_height, d = blockIdx.y, reverse = d < pairs ? d + pairs : d - pairs;
   int index = blockIdx.x * blockDim.y + threadIdx.y;
   if (index >= cells) return;
@@ -60,12 +60,12 @@ extern "C" __global__ void flow_match(const long long* images, const float2* flo
     float disagreement = sqrtf((f.x + b.x) * (f.x + b.x) + (f.y + b.y) * (f.y + b.y));
     if (disagreement < most) {
       float deviation = base + by_disagreement * disagreement + by_roughness * roughness;
-      // Without texture the flow stays where it started, smooth and consistent but uninformed.
-      float structure = source_image(images, d)[structure_offset + index];
-      variance_inverse = fminf(1.f, 0.5f * structure + 0.01f) / (deviation * deviation);
+      variance_inverse = 1.f / (deviation * deviation);
     }
   }
   if (!isfinite(q.x) || !isfinite(q.y)) q = make_float2(FAR, FAR);
   pixels[d * cells + index] = q;
-  weight[d * cells + index] = make_float2(variance_inverse, variance_inverse);
+  // Without texture the flow stays where it started, smooth and consistent but uninformed.
+  const float* certainty = source_image(images, d) + certainty_offset + 2 * index;
+  weight[d * cells + index] = make_float2(certainty[0] * variance_inverse, certainty[1] * variance_inverse);
 }

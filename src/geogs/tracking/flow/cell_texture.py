@@ -1,4 +1,4 @@
-"""Where an image has enough structure to be matched, whatever matches it."""
+"""Where an image has enough structure to be matched, and along which axis, whatever matches it."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,11 @@ from jaxtyping import Float, UInt8
 
 from geogs.world.grid import OFFSET, STRIDE
 
+UNINFORMED = 0.01
+"""Weight, of the full one, of a match along a direction in which the image does not change: a flow
+that is smoothed goes on there as it does around."""
+SHARP = 2.0
+"""Structure along a direction from which on more of it does not help, grey levels^2 / pixel^2."""
 MIN_STRUCTURE = 0.5
 """Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
 
@@ -25,9 +30,34 @@ def textured_fraction(grey: UInt8[np.ndarray, "h w"]) -> float:
     return float((cell_structure(grey) > MIN_STRUCTURE).mean())
 
 
+def cell_certainty(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "p 2"]:
+    """What a match of each cell says along x and along y, as a part of the full weight.
+
+    A point on an edge is known across the edge, hardly along it. The information of a match is that
+    of the structure tensor with each eigenvalue l replaced by min(1, l / SHARP + UNINFORMED); what
+    it says of one coordinate while the other is open is the inverse of its inverse's diagonal. So
+    an upright edge counts in x, a level one in y, a slanted one little in either.
+    """
+    xx, yy, xy = (p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(grey))
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
+    radius = np.sqrt(half * half + xy * xy)
+    across, along = (np.minimum(1, (mean + sign * radius) / SHARP + UNINFORMED) for sign in (1, -1))
+    in_x = 0.5 + 0.5 * half / np.maximum(radius, 1e-6)  # squared cosine of the direction across
+    x, y = along + (across - along) * in_x, across + (along - across) * in_x
+    return np.stack([across * along / y, across * along / x], -1)
+
+
 def smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Smaller eigenvalue of the structure tensor averaged over 9 x 9 pixels, levels^2 / pixel^2."""
+    """Smaller eigenvalue of the structure tensor, grey levels^2 / pixel^2."""
+    xx, yy, xy = structure_tensor(grey)
+    return (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+
+
+def structure_tensor(
+    grey: UInt8[np.ndarray, "h w"],
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Squares and product of the gradient's parts, xx, yy and xy, averaged over 9 x 9 pixels."""
     gx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
     gy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)
     xx, yy, xy = (cv2.boxFilter(p, -1, (9, 9)) for p in (gx * gx, gy * gy, gx * gy))
-    return (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    return xx, yy, xy

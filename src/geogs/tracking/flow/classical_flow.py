@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.threads import opencv_on_one_thread, worker_count
-from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
+from geogs.tracking.flow.cell_texture import cell_certainty, textured_fraction
 from geogs.tracking.flow.flow_operator import Memories
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
@@ -40,8 +40,10 @@ class ClassicalImage:
     grey: UInt8[np.ndarray, "h w"]
     half: UInt8[np.ndarray, "h2 w2"]
     """The same at half resolution; its pixel x is 2 x + 1/2 of the image."""
-    structure: Float[np.ndarray, "p"]
-    """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
+    textured: float
+    """Fraction of the grid that has texture."""
+    certainty: Float[np.ndarray, "p 2"]
+    """What matches of the cells say along x and y, see :func:`cell_certainty`."""
 
 
 class _Level:
@@ -103,13 +105,12 @@ class ClassicalFlow:
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> ClassicalImage:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        structure = cell_structure(grey)
         even = np.pad(grey, [(0, n % 2) for n in grey.shape], mode="edge")
         half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        return ClassicalImage(grey, half, structure)
+        return ClassicalImage(grey, half, textured_fraction(grey), cell_certainty(grey))
 
     def texture(self, encoded: ClassicalImage) -> float:
-        return float((encoded.structure > MIN_STRUCTURE).mean())
+        return encoded.textured
 
     def grey(self, encoded: ClassicalImage) -> Float[Tensor, "h w"]:
         return torch.from_numpy(encoded.grey).to(self.grid.device).float()
@@ -206,9 +207,9 @@ class ClassicalFlow:
         if there.level.step > 1:
             deviation = deviation * COARSE_DEVIATION
         # Without texture the flow stays where it started, smooth and consistent but uninformed.
-        weight = ok / deviation**2 * np.minimum(1.0, image.structure / 2 + 0.01)
+        weight = (ok / deviation**2)[:, None] * image.certainty
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
-        return q, np.repeat(weight[:, None], 2, 1).astype(np.float32)
+        return q, weight.astype(np.float32)
 
 
 def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

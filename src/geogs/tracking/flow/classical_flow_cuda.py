@@ -18,7 +18,7 @@ from torch import Tensor
 
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.tracking.flow.cell_texture import MIN_STRUCTURE
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, SHARP, UNINFORMED
 from geogs.tracking.flow.classical_flow import COARSE_DEVIATION, MAX_DISAGREEMENT, SMALL_IMAGE
 from geogs.tracking.flow.flow_operator import Memories, check_image_size
 from geogs.types import FlowMatch
@@ -77,7 +77,8 @@ class CudaImage:
     """An image as the operator keeps it, on the device."""
 
     data: Float[Tensor, "n"]
-    """Grey pyramid, local means of the brightness, structure of the cells, one after the other."""
+    """Grey pyramid, local means of the brightness, what matches of the cells say along x and y (see
+    :func:`~geogs.tracking.flow.cell_texture.cell_certainty`), one after the other."""
     textured: Int[Tensor, "1"]
     """Number of cells with structure, int32."""
 
@@ -94,8 +95,8 @@ class _Layout:
         self.pyramid = sum(w * h for w, h in self.sizes)
         w, h = self.sizes[MEAN_LEVEL]
         self.means = w * h
-        self.structure = self.pyramid + self.means
-        self.total = self.structure + grid.size
+        self.certainty = self.pyramid + self.means
+        self.total = self.certainty + 2 * grid.size
         self.coarsest = max(k for k, size in enumerate(self.sizes) if min(size) >= PATCH or k == 0)
 
     def patches(self, level: int) -> int:
@@ -128,7 +129,8 @@ class CudaClassicalFlow:
         self._kernels["flow_grey"](_tiles(w, h), (TILE, 8), rgb, data, textured, w, h, LEVELS)
         self._kernels["flow_structure"](
             -(-(grid.size + layout.means) // 8), (32, 8), data, textured, w, h,
-            grid.width, grid.height, layout.pyramid, layout.structure, MIN_STRUCTURE,
+            grid.width, grid.height, layout.pyramid, layout.certainty, MIN_STRUCTURE, SHARP,
+            UNINFORMED,
         )  # fmt: skip
         return CudaImage(data, textured)
 
@@ -178,7 +180,7 @@ class CudaClassicalFlow:
         scale = COARSE_DEVIATION if finest else 1.0
         self._kernels["flow_match"](
             (-(-grid.size // 8), 2 * pairs), (32, 8), table, flow, forward, backward, pixels,
-            weight, pairs, w, h, grid.width, grid.height, finest, layout.structure,
+            weight, pairs, w, h, grid.width, grid.height, finest, layout.certainty,
             MAX_DISAGREEMENT, *(scale * d for d in DEVIATION),
         )  # fmt: skip
         return pixels, weight
