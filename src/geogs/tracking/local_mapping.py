@@ -21,9 +21,9 @@ from geogs.world.edges import edge_matches
 from geogs.world.frames import RelativeRotation
 from geogs.world.keyframes import Keyframe
 
-CULL_DISTANCE = 0.012
-"""A keyframe nearer than this to the one before it is removed again, of the long edge: somewhat
-less than what makes one."""
+CULL_DISTANCE = 0.007
+"""A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
+makes one."""
 DEEPER = 3
 """Keyframes before the window whose poses are adjusted whose inverse depth is adjusted, too."""
 PROXIMITY_WINDOW = 25
