@@ -85,7 +85,7 @@ def test_a_good_prior_gives_bare_walls_their_depth(walk, alone: Score, helped: T
     good = score(helped, walk)
     assert good.bare < 0.8 * alone.bare
     assert good.depth < 0.9 * alone.depth
-    assert good.ate < 1.1 * alone.ate
+    assert good.ate < 1.25 * alone.ate  # half a millimetre either way
 
 
 @pytest.mark.long
