@@ -94,7 +94,7 @@ def resealed(output: Path) -> None:
     """Give changed files of a state their right sizes and checksums, as a stranger would."""
     folder = output / "checkpoint"
     manifest = json.loads((folder / "manifest.json").read_text())
-    manifest.pop("checksum")
+    manifest.pop("checksum", None)
     for entry in manifest["state"]:
         data = (folder / entry[0]).read_bytes()
         entry[1] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
@@ -336,6 +336,41 @@ def test_a_pickle_is_not_executed(output, tmp_path):
     assert not (tmp_path / "harm").exists()
 
 
+@pytest.mark.parametrize("kind", ["archive", "state", "deleted"])
+@pytest.mark.parametrize(
+    "name", ["precious.txt", "archive-of-mine", "state-1.txt", "notes", ".manifest.json.part.txt"]
+)
+def test_names_that_geogs_does_not_give_are_refused(output, kind, name):
+    """Files of others in the folder itself are neither cut off, nor read, nor deleted."""
+    precious, paths = output / "checkpoint" / name, files(output)
+    precious.write_text("precious " * 1000)
+    if kind == "archive":
+        text = paths["json"].read_text().replace(paths["archive"].name, name)
+        paths["json"].write_text(text)
+    manifest = json.loads(paths["manifest"].read_text())
+    manifest["files"].append(name)
+    if kind == "state":
+        manifest["state"][0][0] = name
+    paths["manifest"].write_text(json.dumps(manifest))
+    resealed(output)
+    refused(output, "is no name of a file of a checkpoint")
+    with pytest.raises(OutputError, match="is left alone"):
+        write_checkpoint(checkpoint_folder(output), state(6))
+    checkpoint_folder(output).remove()
+    assert precious.read_text() == "precious " * 1000
+
+
+def test_an_archive_that_the_manifest_does_not_name_is_refused(output):
+    """What looks like one of ours, but is not said to be, is not cut off either."""
+    own, other = files(output)["archive"], output / "checkpoint" / f"archive-{'0' * 16}"
+    other.write_text("precious " * 1000)
+    text = files(output)["json"].read_text().replace(own.name, other.name)
+    files(output)["json"].write_text(text)
+    resealed(output)
+    refused(output, "is none of its files")
+    assert other.read_text() == "precious " * 1000
+
+
 @pytest.mark.parametrize("where", ["up", "absolute", "folder", "manifest", "deleted"])
 def test_names_of_other_places_are_refused(output, tmp_path, where):
     """An archive is cut to its length, a state's old files are deleted: of no other folder."""
@@ -363,7 +398,7 @@ def test_names_of_other_places_are_refused(output, tmp_path, where):
         with pytest.raises(OutputError, match="is left alone"):
             write_checkpoint(checkpoint_folder(output), state(6))
         checkpoint_folder(output).remove()
-    refused(output, "is no name of a file of a checkpoint")
+    refused(output, "is no name of a file of a checkpoint|is none of its files")
     assert victim.read_text() == "precious " * 1000
 
 

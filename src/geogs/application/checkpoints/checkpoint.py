@@ -111,7 +111,7 @@ class SavedState(Generic[S]):
                 raise InputError(f"geogs {manifest.geogs} wrote it, another version than this")
             if manifest.schema != schema(kind):
                 raise InputError("it is of another command, or another version wrote it")
-            self._files = manifest.state
+            self._manifest = manifest
             self._values = json.loads(self._read("json"))
 
     def plain(self, name: str) -> Any:
@@ -128,6 +128,8 @@ class SavedState(Generic[S]):
         with self.in_a_sentence():
             arrays, folder = load(self._read("safetensors")), self._folder
             settled = unpack(dict[str, SettledArchive], self._values["archives"], {}, {})
+            for foreign in sorted(settled.keys() - self._manifest.files):
+                raise InputError(f"{foreign[:40]!r} is none of its files")
             archives = {n: Archive.reopened(folder, n, s) for n, s in settled.items()}
             values = self._values["state"].pop(name)
             return unpack(self._kinds[name], values, arrays, archives, device, name)
@@ -147,8 +149,9 @@ class SavedState(Generic[S]):
 
     def _read(self, ending: str) -> bytes:
         """What the file of the state with this ending holds."""
-        (name,) = (name for name in self._files if name.endswith(f".{ending}"))
-        return self._folder.read(name, self._files[name])
+        files = self._manifest.state
+        (name,) = (name for name in files if name.endswith(f".{ending}"))
+        return self._folder.read(name, files[name])
 
 
 def write_checkpoint(folder: CheckpointFolder, state: object) -> None:

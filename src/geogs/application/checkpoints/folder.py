@@ -25,7 +25,7 @@ from geogs.world.pack import pack, unpack
 FORMAT = "geogs checkpoint 2"
 MANIFEST = "manifest.json"
 _UNFINISHED = ".manifest.json.part"
-_PLAIN_NAME = re.compile(r"[a-z0-9.][a-z0-9.-]*[a-z0-9]")
+_OUR_NAME = re.compile(r"state-\d{1,18}\.(json|safetensors)|archive-[0-9a-f]{16}")
 _LARGEST_MANIFEST = 1 << 24
 """Bytes; it has about a hundred for every file."""
 _MODES = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}
@@ -253,8 +253,8 @@ class CheckpointFolder:
 
 
 def _check_name(name: str) -> None:
-    """Raises InputError if a name is not one that geogs gives, such as one of another folder."""
-    if not _PLAIN_NAME.fullmatch(name):
+    """Raises InputError if a name is not one that geogs gives: no other file is ever touched."""
+    if name not in (MANIFEST, _UNFINISHED) and not _OUR_NAME.fullmatch(name):
         raise InputError(f"{name!r} is no name of a file of a checkpoint")
 
 
