@@ -1,15 +1,17 @@
 """What flows between the parts: frozen records, no behaviour."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from torch import Tensor
 
+from geogs.config.setting import Range
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
+from geogs.limits import UNBOUNDED, AtLeast0, Pose, Positive
 
 
 @runtime_checkable
@@ -25,7 +27,7 @@ class MeasuredDepth(Protocol):
 class MeasuredPose:
     """Where something else than the images says that the camera was."""
 
-    T_cw: Float64[Tensor, "4 4"]
+    T_cw: Pose
     """World to camera, metres, in a world of its own."""
     world: int = 0
     """Poses of different worlds say nothing of each other."""
@@ -39,9 +41,9 @@ class SeenRows:
     made with what lies between them bilinearly.
     """
 
-    offset: Float16[Tensor, "h w 2"]
+    offset: Float16[Tensor, "r c 2"]
     """Pixels from a node to where a pinhole at the camera's place of that time saw the same."""
-    seconds: Float16[Tensor, "h w"]
+    seconds: Float16[Tensor, "r c"]
     """That time, from the middle row's."""
     doubt: float = 0.0
     """Standard error of the readout, as a part of it; 0 where it was told."""
@@ -51,11 +53,11 @@ class SeenRows:
 class FlowMatch:
     """Where the cells of one image lie in another."""
 
-    pixels: Float[Tensor, "e p 2"]
+    pixels: Float32[Tensor, "e p 2"]
     """Position in the second image of each grid cell of the first."""
-    weight: Float[Tensor, "e p 2"]
+    weight: Annotated[Float32[Tensor, "e p 2"], Range(0)]
     """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
-    damping: Float[Tensor, "e p"] | None = None
+    damping: Annotated[Float32[Tensor, "e p"], Range(0)] | None = None
     """What resists a change of the first image's inverse depth, in the units of its inverse
     variance; equal for all edges of a call that share the first image. None for nothing."""
     memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
@@ -113,9 +115,9 @@ class MetricScale:
 
     origin: str
     """What told them."""
-    factor: float
+    factor: Positive
     """By which all lengths were multiplied."""
-    deviation: float
+    deviation: AtLeast0
     """Standard deviation of the factor, as a part of it."""
 
 
@@ -157,12 +159,12 @@ class Uncertainty:
 
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
-    position: Float[np.ndarray, "n"]
+    position: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """That of the camera's centre, map units, all axes together: of what is left when the
     trajectory is laid over the truth by a similarity."""
-    rotation: Float[np.ndarray, "n"]
+    rotation: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """That of its orientation, radians."""
-    depth: Float[np.ndarray, "n"]
+    depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """That of its depths, as a part of them: the median."""
 
 

@@ -18,7 +18,7 @@ from geogs.tracking.start.initialise import FORGIVING, Attempt, initialise
 from geogs.types import Frame, Trajectory
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
-from geogs.world.segments import SegmentTable, TrackState, check_segment
+from geogs.world.segments import SegmentTable, TrackState, check_segments
 from records import copied
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, sideways
@@ -33,7 +33,7 @@ def resumed(keyframes: KeyframeTable, table: SegmentTable) -> Segments:
     keyframes.attached(grid, operator.encode)
     for segment in table.segments:
         segment.keyframes.attached(keyframes)
-        check_segment(segment, grid)
+    check_segments(table, keyframes, 1000)
     return Segments(table, keyframes, operator, Config(tracking=CONFIG))
 
 

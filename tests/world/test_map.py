@@ -60,9 +60,9 @@ def test_it_comes_back_with_its_random_numbers():
 def test_what_does_not_fit_is_said():
     known = keyframes(2)
     for change, sentence in (
-        ({"mapped": [7]}, "a view of the map is missing"),
+        ({"mapped": [7]}, "mapped.0 names what is missing in the keyframes"),
         ({"order": [1]}, "the place in the training is none"),
-        ({"views": {**filled().views, 5: ViewRow()}}, "a keyframe of the map is missing"),
+        ({"views": {**filled().views, 5: ViewRow()}}, "views names what is missing in the keyframes"),
         (
             {"views": {**filled().views, 0: ViewRow(depth=SearchedDepth(1.0, 1.0))}},
             "the depth of keyframe 0 is missing",
@@ -70,7 +70,7 @@ def test_what_does_not_fit_is_said():
     ):
         with pytest.raises(InputError, match=sentence):
             check_map(replace(filled(), **change), known, SIZE)
-    with pytest.raises(InputError, match="the depth of keyframe 1 has another size"):
+    with pytest.raises(InputError, match="the 'depth' of keyframe 1 cannot be"):
         check_map(filled(), known, (8, 6))
     state = filled().random
     with pytest.raises(InputError, match="in no state that there is"):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,10 +16,12 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.limits import UNBOUNDED
 from geogs.world.cell_depths import MeasuredCells
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable, check_keyframes
-from geogs.world.pack import pack, schema, unpack
+from geogs.world.kinds import schema
+from geogs.world.pack import pack, unpack
 
 
 class Mood(Enum):
@@ -40,7 +42,7 @@ class Pair(NamedTuple):
 class Leaf:
     """Arrays that share a length."""
 
-    a: Float64[np.ndarray, "n"]
+    a: Annotated[Float64[np.ndarray, "n"], UNBOUNDED]
     b: Int16[Tensor, "n 3"]
 
 
@@ -67,7 +69,7 @@ class Tree:
     several: list[Leaf | Twig]
     by_pair: dict[tuple[int, int], Twig]
     span: tuple[int, str]
-    ages: tuple[float, ...]
+    ages: tuple[Annotated[float, UNBOUNDED], ...]
     pair: Pair
     small: BFloat16[Tensor, ""]
     shared: UInt8[np.ndarray, "k"] | None = None
@@ -76,7 +78,7 @@ class Tree:
 
 def tree() -> Tree:
     base = torch.arange(24).reshape(8, 3).short()
-    leaf = Leaf(np.array([1.0, math.nan]), base[2:4])  # a part of a larger tensor
+    leaf = Leaf(np.array([1.0, math.inf]), base[2:4])  # a part of a larger tensor
     pair = Pair(torch.zeros(0, 2), torch.zeros(0, dtype=torch.bool))
     return Tree(
         "beech", 0.1 + 0.2, 2**127, True, Mood.WILD, "elm", "unknown", Path("a/b"), leaf,

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from geogs.limits import Positive
 from geogs.types import MapSnapshot, RenderedKeyframe
 
 # Cameras whose distances make the unit, at most.
@@ -24,7 +25,7 @@ class MapFrame:
 
     origin: Float64[np.ndarray, "3"]
     """World coordinates of the map's origin."""
-    unit: float
+    unit: Positive
     """Length of a map unit in the world."""
 
     @staticmethod

@@ -17,6 +17,11 @@ ROUNDS = 3
 """The row decides the time, the time decides the row: an error shrinks some 50 times a round."""
 
 
+def node_count(pixels: int) -> int:
+    """Nodes along so many pixels."""
+    return -(-pixels // CELL) + 2
+
+
 class RowOffsets:
     """By how much each pixel of a rectified image is seen elsewhere because the camera turns.
 
@@ -28,8 +33,8 @@ class RowOffsets:
     def __init__(self, rolling: RollingCamera, rectified: Camera) -> None:
         self._rolling, self._rectified = rolling, rectified
         # A cell more on every side, so that all pixels lie between nodes.
-        columns = np.arange(-1, -(-rectified.width // CELL) + 1) * CELL + (CELL - 1) / 2
-        lines = np.arange(-1, -(-rectified.height // CELL) + 1) * CELL + (CELL - 1) / 2
+        columns = (np.arange(node_count(rectified.width)) - 1) * CELL + (CELL - 1) / 2
+        lines = (np.arange(node_count(rectified.height)) - 1) * CELL + (CELL - 1) / 2
         self._shape = (len(lines), len(columns))
         u, v = (x.ravel() for x in np.meshgrid(columns, lines))
         plane = [(u - rectified.cx) / rectified.fx, (v - rectified.cy) / rectified.fy]

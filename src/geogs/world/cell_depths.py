@@ -1,10 +1,13 @@
 """What monocular priors and depth sensors say of the depth of a keyframe's cells."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from jaxtyping import Float
+from jaxtyping import Float32
 from torch import Tensor
 
+from geogs.config.setting import Range
+from geogs.limits import AT_LEAST_0
 from geogs.priors.monocular_prior import DepthKind
 
 
@@ -13,13 +16,13 @@ class KeyframePrior:
     """What a monocular prior said of a keyframe's depth, and how it is scaled; mutable."""
 
     kind: DepthKind
-    values: Float[Tensor, "p"]
+    values: Float32[Tensor, "p"]
     """As the prior gave them, on the grid."""
-    inverse_depth: Float[Tensor, "p"]
+    inverse_depth: Annotated[Float32[Tensor, "p"], AT_LEAST_0]
     """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
-    scale: Float[Tensor, "k"]
+    scale: Float32[Tensor, "k"]
     """Factors of the aligned inverse depth at the nodes of a coarse grid, row by row."""
-    information: Float[Tensor, "p"]
+    information: Annotated[Float32[Tensor, "p"], Range(0)]
     """What it adds to the inverse variance of the keyframe's inverse depth."""
     is_aligned: bool = False
 
@@ -33,8 +36,8 @@ class KeyframePrior:
 class MeasuredCells:
     """What a depth sensor says of a keyframe's cells, in the lengths of the map; mutable."""
 
-    inverse_depth: Float[Tensor, "p"]
-    information: Float[Tensor, "p"]
+    inverse_depth: Annotated[Float32[Tensor, "p"], AT_LEAST_0]
+    information: Annotated[Float32[Tensor, "p"], Range(0)]
     """Inverse variance of inverse depth; 0 where it says nothing."""
 
     def rescale(self, factor: float) -> None:

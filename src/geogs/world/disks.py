@@ -1,13 +1,15 @@
 """The map: geometry-only Gaussian disks and what is remembered about each of them."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Float32, Int, Int64
 from torch import Tensor
 
+from geogs.config.setting import Range
 from geogs.geometry.lie import matrix_to_quaternion, quaternion_multiply, sim3_scale
+from geogs.limits import FARTHEST, Reference
 from geogs.types import MapSnapshot
 from geogs.world.growing_rows import GrowingRows
 
@@ -15,14 +17,14 @@ from geogs.world.growing_rows import GrowingRows
 class DiskParameters(NamedTuple):
     """The ten trained numbers of every disk, before activation."""
 
-    position: Float[Tensor, "n 3"]
+    position: Annotated[Float32[Tensor, "n 3"], Range(-FARTHEST, FARTHEST)]
     """Centre, world frame, map units."""
-    quaternion: Float[Tensor, "n 4"]
+    quaternion: Float32[Tensor, "n 4"]
     """w, x, y, z of any non-zero norm; its rotation maps the disk's axes (tangent, tangent,
     normal) into the world."""
-    log_scale: Float[Tensor, "n 2"]
+    log_scale: Float32[Tensor, "n 2"]
     """Logarithm of the standard deviation along each tangent, map units."""
-    opacity_logit: Float[Tensor, "n"]
+    opacity_logit: Float32[Tensor, "n"]
     """The opacity is its sigmoid."""
 
     @staticmethod
@@ -47,11 +49,11 @@ class GaussianMap:
     """Running means of the gradients."""
     second: DiskParameters
     """Running means of their squares."""
-    keyframe_id: Int64[Tensor, "n"]
+    keyframe_id: Annotated[Int64[Tensor, "n"], Reference("keyframes")]
     """Keyframe that created a disk."""
-    steps: Int64[Tensor, "n"]
+    steps: Annotated[Int64[Tensor, "n"], Range(0)]
     """Steps of the optimiser so far."""
-    seen: Int64[Tensor, "n"]
+    seen: Annotated[Int64[Tensor, "n"], Range(0)]
     """Renderings in training that showed a disk."""
 
     def __post_init__(self) -> None:

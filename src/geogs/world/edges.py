@@ -3,22 +3,23 @@
 A packed edge takes a third of the memory, for graphs over thousands of keyframes.
 """
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float, Float16, Int16
+from jaxtyping import Float, Float16, Float32, Int16
 from torch import Tensor
 
-from geogs.errors import InputError
+from geogs.config.setting import Range
 from geogs.geometry.camera import Camera
+from geogs.limits import POSITIVE, KeyframeId, Pose
 from geogs.world.grid import SampleGrid
 
 MAX_WEIGHT = 6e4
 """Largest weight that half precision holds, 1 / pixel^2."""
 
-Pair = tuple[int, int]
+Pair = tuple[KeyframeId, KeyframeId]
 """Two keyframe ids: source and target of a directed edge, or the earlier first for both."""
 
 
@@ -26,13 +27,13 @@ Pair = tuple[int, int]
 class MeasuredEdge:
     """One direction of a measured pair."""
 
-    pixels: Float[Tensor, "p 2"]
+    pixels: Float32[Tensor, "p 2"]
     """Position in the target of each cell of the source."""
-    weight: Float[Tensor, "p 2"]
+    weight: Annotated[Float32[Tensor, "p 2"], Range(0)]
     """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
-    reprojection: Float[Tensor, "p 2"]
+    reprojection: Float32[Tensor, "p 2"]
     """Where the cells fell when the flow was measured."""
-    damping: Float[Tensor, "p"] | None = None
+    damping: Annotated[Float32[Tensor, "p"], Range(0)] | None = None
     """Damping of the source's inverse depth, if the operator gives one."""
     memory: Any = field(default=None, metadata={"stored": False})
     """What the operator keeps of this edge, and can do without."""
@@ -49,13 +50,13 @@ class PackedEdge:
     """
 
     position: Int16[Tensor, "p 2"]
-    half_weight: Float16[Tensor, "p 2"]
-    T_source: Float[Tensor, "4 4"]
+    half_weight: Annotated[Float16[Tensor, "p 2"], Range(0)]
+    T_source: Pose
     """World to camera of the source when the flow was measured."""
-    T_target: Float[Tensor, "4 4"]
-    inverse_depth: Float[Tensor, "p"]
+    T_target: Pose
+    inverse_depth: Annotated[Float32[Tensor, "p"], POSITIVE]
     """The source's when the flow was measured."""
-    damping: Float[Tensor, "p"] | None = None
+    damping: Annotated[Float32[Tensor, "p"], Range(0)] | None = None
     """Damping of the source's inverse depth, if the operator gives one."""
     memory: Any = field(default=None, metadata={"stored": False})
     """What the operator keeps of this edge, and can do without."""
@@ -104,11 +105,3 @@ def position_step(camera: Camera) -> float:
 def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 2"]:
     """Pixels by which positions are moved, in whole steps."""
     return (shift / position_step(camera)).round().short()
-
-
-def check_edges(edges: Mapping[Pair, Edge], grid: SampleGrid, keyframes: Container[object]) -> None:
-    """Raise InputError where an edge is of another camera, or joins a keyframe that is missing."""
-    for (i, j), edge in edges.items():
-        cells = edge.position if isinstance(edge, PackedEdge) else edge.pixels
-        if len(cells) != grid.size or i not in keyframes or j not in keyframes:
-            raise InputError(f"the edge from {i} to {j} has no place")

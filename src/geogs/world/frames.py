@@ -1,16 +1,15 @@
 """Frames of a video: what is kept of each to place it once the keyframes around it are final."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Float16, Float64, Int16, UInt8
 from torch import Tensor
 
-from geogs.errors import InputError
+from geogs.config.setting import Range
+from geogs.limits import RIGID, AtLeast0, KeyframeId, Number, Pose, Positive
 from geogs.types import SeenRows
-from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 
@@ -18,11 +17,11 @@ from geogs.world.keyframes import Keyframe
 class RelativeRotation:
     """Rotation of a frame's camera relative to that of an earlier frame."""
 
-    frame: int
+    frame: Number
     """Index of the earlier."""
-    R: Float64[Tensor, "3 3"]
+    R: Annotated[Float64[Tensor, "3 3"], RIGID]
     """The earlier camera to this one."""
-    deviation: float
+    deviation: AtLeast0
     """Standard deviation of the angle, radians."""
 
 
@@ -30,9 +29,9 @@ class RelativeRotation:
 class Observation:
     """Flow from a keyframe to a frame on every second cell, packed as in ``edges.py``."""
 
-    keyframe: int
+    keyframe: KeyframeId
     position: Int16[Tensor, "s 2"]
-    half_weight: Float16[Tensor, "s 2"]
+    half_weight: Annotated[Float16[Tensor, "s 2"], Range(0)]
     shift: Int16[Tensor, "s 2"] | None = None
     """Steps to be added to the position, for the rows of a rolling shutter."""
 
@@ -46,13 +45,13 @@ class Observation:
 class FrameRecord:
     """One frame of the stream."""
 
-    index: int
+    index: Number
     timestamp: float
-    anchor: int | None
+    anchor: KeyframeId | None
     """Keyframe that the pose is relative to; None where the frame was not tracked."""
-    T_rel: Float[Tensor, "4 4"]
+    T_rel: Pose
     """Anchor keyframe to this frame."""
-    scale: float = 1.0
+    scale: Positive = 1.0
     """Scale of the anchor when that was measured."""
     observations: list[Observation] = field(default_factory=list)
     rotations: list[RelativeRotation] = field(default_factory=list)
@@ -80,15 +79,5 @@ class FrameLog:
     """All frames of a segment of video."""
 
     records: list[FrameRecord] = field(default_factory=list)
-    rows: dict[int, SeenRows] = field(default_factory=dict)
+    rows: dict[Number, SeenRows] = field(default_factory=dict)
     """Rectified rows of a rolling shutter, by the indices of the frames."""
-
-
-def check_frames(records: Sequence[FrameRecord], grid: SampleGrid) -> None:
-    """Raise InputError where frames are of another camera than the grid's."""
-    camera = grid.camera
-    cells = -(-grid.height // 2) * -(-grid.width // 2)
-    seen = {len(o.position) for record in records for o in record.observations}
-    images = {record.image.shape[:2] for record in records if record.image is not None}
-    if seen - {cells} or images - {(camera.height, camera.width)}:
-        raise InputError("the frames are of another camera")

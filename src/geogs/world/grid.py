@@ -9,6 +9,7 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import to_device
+from geogs.shutter.rows import node_count
 
 STRIDE = 8
 """Pixels of the working image between two cells of the grid."""
@@ -51,6 +52,15 @@ class SampleGrid:
         object.__setattr__(self, "rays", rays.reshape(-1, 3).float().to(self.device))
         centre = torch.tensor([cam.width / 2, cam.height / 2])
         object.__setattr__(self, "centre", centre.to(self.device))
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """What letters in the shapes of stored arrays stand for: ``p`` cells, ``s`` of them in
+        every second row and column, images of ``h w`` pixels, rectified by ``r c`` nodes."""
+        camera = self.camera
+        size = {"p": self.size, "h": camera.height, "w": camera.width}
+        some = -(-self.height // 2) * -(-self.width // 2)
+        return size | {"s": some, "r": node_count(camera.height), "c": node_count(camera.width)}
 
     @property
     def on_gpu(self) -> bool:

@@ -3,23 +3,33 @@
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from torch import Tensor
 
+from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.lie import scaled, sim3_scale
+from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
 from geogs.types import MeasuredPose, PoseCorrection
 from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
 from geogs.world.cell_depths import KeyframePrior, MeasuredCells
 from geogs.world.grid import SampleGrid
 from geogs.world.pose_table import PoseTable
+from geogs.world.tables import check_arrays, check_tables
 
 Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
 """A flow operator's form of an image."""
+
+KEYFRAME_ARRAYS = {
+    "image": UInt8[np.ndarray, "h w 3"],
+    "prior normal": Float32[np.ndarray, "h w 3"],
+    "sensor depth": Annotated[Float16[np.ndarray, "h w"], UNBOUNDED, Range(0)],
+}
+"""The large arrays that a keyframe may have."""
 
 KNOWN = 0.3
 """Relative deviation up to which a depth helps to tell where a camera is."""
@@ -34,17 +44,17 @@ class Keyframe:
     A pose or a field is replaced, never changed in place: who keeps a reference sees what it was.
     """
 
-    id: int
+    id: Id
     """Stable: never reused, increasing in time."""
-    frame_index: int
+    frame_index: Number
     timestamp: float
     """Seconds."""
-    inverse_depth: Float32[Tensor, "p"]
+    inverse_depth: Annotated[Float32[Tensor, "p"], POSITIVE]
     """On the grid of its table."""
-    information: Float32[Tensor, "p"]
+    information: Annotated[Float32[Tensor, "p"], Range(0)]
     """Sum over matches of w |dp/dd|^2, and what a depth sensor adds; not a prior."""
     prior: KeyframePrior | None = None
-    scale: float = 1.0
+    scale: Positive = 1.0
     """Factor by which corrections have multiplied the lengths around it; what was measured from it
     at another scale is to be multiplied by the ratio of the two."""
     moving: Bool[Tensor, "p"] | None = None
@@ -176,9 +186,9 @@ class KeyframeTable:
     Who works with keyframes holds ids, or a :class:`KeyframeSet`, and asks here.
     """
 
-    next_id: int = 0
+    next_id: Id = 0
     """The id that the next keyframe gets; ids grow and are never used twice."""
-    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    keyframes: dict[Id, Keyframe] = field(default_factory=dict)
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
@@ -235,7 +245,7 @@ class KeyframeTable:
 class KeyframeSet:
     """Keyframes of a table that share a gauge, world and unit of their poses; in order of time."""
 
-    members: list[int] = field(default_factory=list)
+    members: list[KeyframeId] = field(default_factory=list)
     """Their ids, earliest first."""
     table: KeyframeTable = field(init=False, repr=False, metadata=NOT_STORED)
     _corrections: list[PoseCorrection] = field(
@@ -368,21 +378,16 @@ def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:
     Raises:
         InputError: a keyframe is missing, of another camera, or not in its place.
     """
-    grid = table.grid
-    size = grid.camera.height, grid.camera.width, 3
-    images, seen = table.arrays.pieces.get("image", {}), set[int]()
+    sizes, seen = table.grid.sizes, set[int]()
+    check_tables(KeyframeTable, table, sizes, {})
+    check_arrays(table.arrays, KEYFRAME_ARRAYS, sizes, range(table.next_id))
     for members in (keyframes.members for keyframes in sets):
         last = -1
         for id in members:
-            if id not in table.keyframes or id not in images or id not in table.poses.T_cw:
+            is_whole = table.arrays.has("image", id) and id in table.poses.T_cw
+            if id not in table.keyframes or not is_whole:
                 raise InputError(f"keyframe {id} is missing")
-            k = table.keyframes[id]
-            cells = k.inverse_depth if k.moving is None else k.moving
-            measured = cells if k.measured is None else k.measured.inverse_depth
-            shapes = {k.inverse_depth.shape, cells.shape, measured.shape}
-            if images[id].shape != size or shapes != {(grid.size,)}:
-                raise InputError(f"keyframe {id} is of another camera")
-            if k.id != id or id in seen or id <= last:
+            if table.keyframes[id].id != id or id in seen or not last < id < table.next_id:
                 raise InputError(f"keyframe {id} is not in its place")
             seen.add(id)
             last = id

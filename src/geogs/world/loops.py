@@ -1,15 +1,20 @@
 """Loops: what keyframes are recognised by, candidates, verified loops, and relative poses kept."""
 
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
+from geogs.config.setting import Range
 from geogs.errors import InputError
+from geogs.limits import SIMILARITY, KeyframeId, Number, Pose, Positive, Reference
 from geogs.types import FlowMatch
+from geogs.world.keyframes import KeyframeTable
+from geogs.world.tables import check_tables
 
 Cause = Literal["geometry", "appearance"]
 """What proposed a pair: the present poses, or appearance alone."""
@@ -32,8 +37,8 @@ class ImageFeatures:
 class Vocabulary:
     """Binary words and which keyframes contain them; mutable."""
 
-    words: UInt8[np.ndarray, "w 32"] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
-    keyframes: list[int] = field(default_factory=list)
+    words: UInt8[np.ndarray, "v 32"] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
+    keyframes: list[KeyframeId] = field(default_factory=list)
     """Indexed so far, earliest first."""
     counts: list[Int64[np.ndarray, "_ 2"]] = field(default_factory=list)
     """For each of them its words, ascending, and how often it contains them."""
@@ -46,14 +51,14 @@ class TwoViewMatch:
     accepted: bool
     reason: str
     """Why not; empty if accepted."""
-    T_ji: Float[Tensor, "4 4"] | None = None
+    T_ji: Pose | None = None
     """First camera to second, float64. In the first's lengths if metric, else with a translation
     of length one, which means nothing where the views have no parallax. None without a pose."""
     is_metric: bool = False
-    scale: float | None = None
+    scale: Positive | None = None
     """Lengths of the second's depth per length of the first's; None unless both have depth."""
-    matches: int = 0
-    inliers: int = 0
+    matches: Number = 0
+    inliers: Number = 0
     spread: float = 0.0
     """Fraction of the raster's cells that hold inliers, in the poorer image."""
 
@@ -67,8 +72,8 @@ class TwoViewMatch:
 class LoopCandidate:
     """A pair of keyframes that may show one place."""
 
-    first: int
-    second: int
+    first: KeyframeId
+    second: KeyframeId
     """The later."""
     cause: Cause
 
@@ -85,13 +90,13 @@ class VerifiedCandidate:
 class Loop:
     """A pair of keyframes that show one place, confirmed by dense flow."""
 
-    first: int
-    second: int
+    first: KeyframeId
+    second: KeyframeId
     """The later keyframe."""
     cause: Cause
-    T_ji: Float[Tensor, "4 4"]
+    T_ji: Pose
     """First camera to second in the lengths of the first keyframe's depth, float64."""
-    scale: float
+    scale: Positive
     """Lengths of the second's depth per length of the first's: what drifted in between."""
     inliers: int
     """Features that agree with the pose; 0 where the flow alone found it."""
@@ -124,13 +129,13 @@ class Loop:
 class RelativePoses:
     """Measured similarities between pairs of keyframes."""
 
-    source: Int[Tensor, "e"]
+    source: Annotated[Int64[Tensor, "e"], Reference("keyframes")]
     """Index of keyframe i."""
-    target: Int[Tensor, "e"]
+    target: Annotated[Int64[Tensor, "e"], Reference("keyframes")]
     """Index of keyframe j."""
-    G: Float[Tensor, "e 4 4"]
+    G: Annotated[Float64[Tensor, "e 4 4"], SIMILARITY]
     """Camera i, in the unit of keyframe i, to camera j in the unit of keyframe j; float64."""
-    information: Float[Tensor, "e 7"]
+    information: Annotated[Float64[Tensor, "e 7"], Range(0)]
     """Inverse variances of the error [tau, phi, sigma] in the frame of j: 1 / unit^2, 1 / rad^2
     and of the logarithm of scale; float64. Zero where nothing is known."""
     is_loop: Bool[Tensor, "e"]
@@ -182,9 +187,9 @@ class SegmentConstraints:
 class LoopTable:
     """All that is known of loops; mutable."""
 
-    keyframes: list[int] = field(default_factory=list)
+    keyframes: list[KeyframeId] = field(default_factory=list)
     """Searched for loops so far, earliest first."""
-    features: dict[int, ImageFeatures] = field(default_factory=dict)
+    features: dict[KeyframeId, ImageFeatures] = field(default_factory=dict)
     """By keyframe."""
     vocabulary: Vocabulary = field(default_factory=Vocabulary)
     found: list[list[VerifiedCandidate]] = field(default_factory=list)
@@ -199,11 +204,17 @@ class LoopTable:
     """Corrections by loops so far."""
 
 
-def check_loops(table: LoopTable) -> None:
-    """Raises InputError if the vocabulary of a table that was read is incomplete."""
+def check_loops(table: LoopTable, keyframes: KeyframeTable, segments: Container[int]) -> None:
+    """Check a table that was read; ``segments`` are the numbers of those that there are.
+
+    Raises InputError if it is incomplete, or names keyframes or segments that are missing.
+    """
+    check_tables(LoopTable, table, keyframes.grid.sizes, {"keyframes": keyframes})
     vocabulary, words = table.vocabulary, len(table.vocabulary.words)
     counts = vocabulary.counts
     if len(counts) != len(vocabulary.keyframes) or any(
-        ((c[:, 0] < 0) | (c[:, 0] >= words)).any() for c in counts
+        ((c[:, 0] < 0) | (c[:, 0] >= words) | (c[:, 1] < 1)).any() for c in counts
     ):
         raise InputError("the index of appearance is incomplete")
+    if not all(number in segments for number in table.constraints):
+        raise InputError("the segment of a relative pose is missing")

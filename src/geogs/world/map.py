@@ -1,35 +1,49 @@
 """The map: disks, what mapping knows of each keyframe, and how far the training is."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float16, Float32, UInt8
 from torch import Tensor
 
+from geogs.config.setting import Range
 from geogs.errors import InputError
+from geogs.limits import AT_LEAST_0, POSITIVE, AtLeast0, KeyframeId, Number, Positive
 from geogs.world.arrays import NOT_STORED, ArrayTable
 from geogs.world.disks import GaussianMap
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.tables import check_arrays, check_tables
+
+DEPTH = ("depth", "confidence")
+MAP_ARRAYS = {
+    "mask": Bool[np.ndarray, "h w"],
+    "depth": Annotated[Float32[np.ndarray, "h w"], POSITIVE],
+    "confidence": Annotated[Float32[np.ndarray, "h w"], Range(0, 1)],
+    "depth normal": Float16[np.ndarray, "h w 3"],
+    "rendered depth": Annotated[Float32[np.ndarray, "h w"], AT_LEAST_0],
+}
+"""The large arrays that a view may have."""
 
 
 @dataclass(frozen=True, slots=True)
 class DepthSearch:
     """Where to look for a keyframe's depth, where no tracker says. Map units."""
 
-    near: float
-    typical: float
+    near: Positive
+    typical: Positive
     """Median: neighbours are chosen for their parallax there."""
-    far: float
+    far: Positive
 
 
 @dataclass(frozen=True, slots=True)
 class SearchedDepth:
     """What there is to say of a dense depth whose arrays are in the table."""
 
-    typical: float
+    typical: Positive
     """Median depth, map units."""
-    scale: float
+    scale: Positive
     """Scale of the keyframe when the depth was as it is there."""
 
     def typical_at(self, scale: float) -> float:
@@ -41,7 +55,7 @@ class SearchedDepth:
 class ViewRow:
     """What mapping knows of a keyframe."""
 
-    partners: list[int] = field(default_factory=list)
+    partners: list[KeyframeId] = field(default_factory=list)
     """Ids of the keyframes whose images check this one's depth, best first."""
     search: DepthSearch | None = None
     """Where its depth is searched; none leaves that to the tracker's depth."""
@@ -55,11 +69,11 @@ class ViewRow:
 class TrainingPlace:
     """How far a long training is."""
 
-    steps: int = 0
+    steps: Number = 0
     """Done."""
-    total: int = 0
+    total: Number = 0
     """To be done in all."""
-    seconds: float = 0.0
+    seconds: AtLeast0 = 0.0
     """Spent."""
 
 
@@ -114,18 +128,18 @@ class MapTable:
 
     disks: GaussianMap
     random: RandomState
-    views: dict[int, ViewRow] = field(default_factory=dict)
+    views: dict[KeyframeId, ViewRow] = field(default_factory=dict)
     """By keyframe, in the order in which mapping came to know them."""
     arrays: ArrayTable = field(default_factory=ArrayTable)
     """Masks, dense depths with confidences and normals, and depths rendered from the disks."""
-    resident: list[int] = field(default_factory=list)
+    resident: list[KeyframeId] = field(default_factory=list)
     """Keyframes whose arrays were in memory when the table was settled, those used last at the end:
     of these depths have been rounded at each change of scale."""
-    mapped: list[int] = field(default_factory=list)
+    mapped: list[KeyframeId] = field(default_factory=list)
     """Keyframes whose depth is part of the map."""
-    given: list[int] = field(default_factory=list)
+    given: list[KeyframeId] = field(default_factory=list)
     """Those of a saved map, which stay as they are."""
-    unit: float | None = None
+    unit: Positive | None = None
     """Median depth of the first keyframe, map units; none until it is mapped."""
     place: TrainingPlace = TrainingPlace()
     """How far the training over all keyframes is, at each report of its progress."""
@@ -144,17 +158,19 @@ def check_map(table: MapTable, keyframes: KeyframeTable, size: tuple[int, int]) 
     Raises:
         InputError: it is incomplete, or of other keyframes.
     """
-    if not {*table.mapped, *table.given, *table.resident} <= table.views.keys():
+    height, width = size
+    check_tables(MapTable, table, {}, {"keyframes": keyframes})
+    check_arrays(table.arrays, MAP_ARRAYS, {"h": height, "w": width}, table.views)
+    disks = table.disks
+    is_turned = disks.parameters.quaternion.detach().any(dim=1)
+    if not is_turned.all() or any((part < 0).any() for part in disks.second):
+        raise InputError("a disk has no orientation, or has been trained as none can be")
+    partners = {i for row in table.views.values() for i in row.partners}
+    if not {*table.mapped, *table.given, *table.resident, *partners} <= table.views.keys():
         raise InputError("a view of the map is missing")
-    if not all(i in keyframes for i in table.views):
-        raise InputError("a keyframe of the map is missing")
     if not all(0 <= n < len(table.mapped) for n in table.order):
         raise InputError("the place in the training is none")
     for id, row in table.views.items():
-        wanted = () if row.depth is None else ("depth", "confidence")
-        if not all(table.arrays.has(name, id) for name in wanted):
+        is_searched = id in {*table.mapped} or row.depth is not None
+        if is_searched and not (row.depth and all(table.arrays.has(n, id) for n in DEPTH)):
             raise InputError(f"the depth of keyframe {id} is missing")
-        for name in (*wanted, "rendered depth", "mask"):
-            piece = table.arrays.pieces.get(name, {}).get(id)
-            if piece is not None and piece.shape != size:
-                raise InputError(f"the depth of keyframe {id} has another size")

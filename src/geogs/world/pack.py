@@ -4,25 +4,38 @@ A state is a record: a dataclass or named tuple of plain values, arrays, arrays 
 lists, tuples, dictionaries, unions and records of such. How one is read follows from the types that
 its class declares, never from the file: every value is checked against its field, every array
 against the type and the shape that jaxtyping's annotation names, where a letter stands for the
-same length throughout a record. Fields marked ``NOT_STORED`` belong to the process and are left at
-their default.
+same length throughout a record, and every number against what the field says of it
+(:mod:`geogs.limits`). Fields marked ``NOT_STORED`` belong to the process and are left at their
+default.
 """
 
-import hashlib
-import types
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 import torch
-from jaxtyping import AbstractArray
 from torch import Tensor
 
 from geogs.errors import InputError
+from geogs.limits import holds
 from geogs.world.archive import Archive, Archived
+from geogs.world.kinds import (
+    alternatives,
+    described,
+    fits,
+    is_array,
+    is_record,
+    is_union,
+    item_kinds,
+    joined,
+    lengths,
+    marks_of,
+    plain,
+    stored,
+)
 
 Values = Any
 """What JSON holds: None, booleans, numbers, strings, lists and dictionaries of such."""
@@ -77,62 +90,6 @@ def unpack(
     return _Unpacker(arrays, archives, torch.device(device)).value(kind, values, name)
 
 
-def schema(kind: Any) -> str:
-    """64 digits that change with any name, type or shape that a record of the kind declares."""
-    return hashlib.sha256(_described(kind).encode()).hexdigest()
-
-
-def _described(kind: Any) -> str:
-    if _is_record(kind):
-        named = (f"{n}:{_described(k)}" for n, k in _stored(kind).items())
-        return f"{kind.__name__}({','.join(named)})"
-    if _is_array(kind):
-        return f"{kind.array_type.__name__}[{'|'.join(kind.dtypes)};{kind.dim_str}]"
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        return f"{kind.__name__}({','.join(kind.__members__)})"
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return f"Literal{list(parts)}"
-    if origin is not None:
-        label = "union" if origin in (Union, types.UnionType) else origin.__name__
-        return f"{label}[{','.join('...' if p is ... else _described(p) for p in parts)}]"
-    return kind.__name__
-
-
-# --- kinds ---------------------------------------------------------------------------------------
-
-
-def _is_record(kind: Any) -> bool:
-    is_named_tuple = isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields")
-    return is_named_tuple or (isinstance(kind, type) and is_dataclass(kind))
-
-
-def _is_array(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, AbstractArray)
-
-
-def _stored(kind: Any) -> dict[str, Any]:
-    """Names and kinds of the fields of a record that are stored."""
-    hints = get_type_hints(kind)
-    if not is_dataclass(kind):
-        return hints
-    return {f.name: hints[f.name] for f in fields(kind) if f.metadata.get("stored", True)}
-
-
-def _alternatives(kind: Any) -> tuple[Any, ...]:
-    """Kinds in a union, but for None."""
-    return tuple(k for k in get_args(kind) if k is not type(None))
-
-
-def _fits(kind: Any, value: object) -> bool:
-    """Whether a value is of a kind, as far as one sees from outside."""
-    if kind in (bool, int):
-        return type(value) is kind
-    if get_origin(kind) is Literal:
-        return value in get_args(kind)
-    return isinstance(value, get_origin(kind) or kind) or (kind is float and type(value) is int)
-
-
 # --- to plain values and arrays ------------------------------------------------------------------
 
 
@@ -142,28 +99,29 @@ class _Packer:
 
     def value(self, kind: Any, value: Any, name: str) -> Values:
         """JSON's form of a value; its arrays are noted by name."""
+        kind = plain(kind)
         origin = get_origin(kind)
-        if origin in (Union, types.UnionType):
+        if is_union(kind):
             return self._one_of(kind, value, name)
         if origin is Literal:
             return value if value in get_args(kind) else self._wrong(kind, value, name)
-        if not _fits(kind, value):
+        if not fits(kind, value):
             return self._wrong(kind, value, name)
-        if _is_record(kind):
-            stored = _stored(kind).items()
-            return {n: self.value(k, getattr(value, n), _joined(name, n)) for n, k in stored}
-        if _is_array(kind):
+        if is_record(kind):
+            own = stored(kind).items()
+            return {n: self.value(k, getattr(value, n), joined(name, n)) for n, k in own}
+        if is_array(kind):
             return self._array(value, name)
         if origin in (list, tuple):
-            kinds = _item_kinds(kind, len(value))
+            kinds = item_kinds(kind, len(value))
             return [
-                self.value(k, v, _joined(name, n))
+                self.value(k, v, joined(name, n))
                 for n, (k, v) in enumerate(zip(kinds, value, strict=True))
             ]
         if origin is dict:
             key, item = get_args(kind)
             return [
-                [self.value(key, k, name), self.value(item, v, _joined(name, n))]
+                [self.value(key, k, name), self.value(item, v, joined(name, n))]
                 for n, (k, v) in enumerate(value.items())
             ]
         if kind is Archive:
@@ -179,13 +137,13 @@ class _Packer:
 
     def _one_of(self, kind: Any, value: Any, name: str) -> Values:
         """None, the form of the only alternative, or the number of the alternative and its form."""
-        kinds = _alternatives(kind)
+        kinds = alternatives(kind)
         if value is None and type(None) in get_args(kind):
             return None
         if len(kinds) == 1:
             return self.value(kinds[0], value, name)
         for n, k in enumerate(kinds):
-            if _fits(k, value):
+            if fits(k, value):
                 return [n, self.value(k, value, name)]
         return self._wrong(kind, value, name)
 
@@ -202,7 +160,7 @@ class _Packer:
 
     @staticmethod
     def _wrong(kind: Any, value: object, name: str) -> Values:
-        raise TypeError(f"{name} is a {type(value).__name__}, not {_described(kind)}")
+        raise TypeError(f"{name} is a {type(value).__name__}, not {described(kind)}")
 
 
 # --- and back ------------------------------------------------------------------------------------
@@ -218,22 +176,28 @@ class _Unpacker:
 
     def value(self, kind: Any, value: Values, name: str) -> Any:
         """What a form stands for, given its kind."""
+        made = self._made(plain(kind), value, name)
+        if not holds(marks_of(kind), made):
+            raise InputError(f"{name} has a value that cannot be")
+        return made
+
+    def _made(self, kind: Any, value: Values, name: str) -> Any:
         origin = get_origin(kind)
-        if origin in (Union, types.UnionType):
+        if is_union(kind):
             return self._one_of(kind, value, name)
         if origin is Literal:
             return value if _is_in(value, get_args(kind)) else self._wrong(name)
-        if _is_record(kind):
+        if is_record(kind):
             return self._record(kind, value, name)
-        if _is_array(kind):
+        if is_array(kind):
             return self._array(kind, value, name)
         if origin in (list, tuple):
             items = self._of(list, value, name)
-            kinds = _item_kinds(kind, len(items))
+            kinds = item_kinds(kind, len(items))
             if len(kinds) != len(items):
                 self._wrong(name)
             return origin(
-                self.value(k, v, _joined(name, n))
+                self.value(k, v, joined(name, n))
                 for n, (k, v) in enumerate(zip(kinds, items, strict=True))
             )
         if origin is dict:
@@ -251,7 +215,7 @@ class _Unpacker:
         return self._of(kind, value, name)
 
     def _one_of(self, kind: Any, value: Values, name: str) -> Any:
-        kinds = _alternatives(kind)
+        kinds = alternatives(kind)
         if value is None and type(None) in get_args(kind):
             return None
         if len(kinds) == 1:
@@ -262,14 +226,14 @@ class _Unpacker:
         return self.value(kinds[number], form, name)
 
     def _record(self, kind: Any, value: Values, name: str) -> Any:
-        stored, given = _stored(kind), self._of(dict, value, name)
-        if given.keys() != stored.keys():
+        own, given = stored(kind), self._of(dict, value, name)
+        if given.keys() != own.keys():
             self._wrong(name)
-        parts = {n: self.value(k, given[n], _joined(name, n)) for n, k in stored.items()}
-        lengths: dict[str, int] = {}
-        for n, k in stored.items():
-            if any(lengths.setdefault(x, m) != m for x, m in _lengths(k, parts[n])):
-                self._wrong(_joined(name, n))
+        parts = {n: self.value(k, given[n], joined(name, n)) for n, k in own.items()}
+        known: dict[str, int] = {}
+        for n, k in own.items():
+            if any(known.setdefault(x, m) != m for x, m in lengths(k, parts[n])):
+                self._wrong(joined(name, n))
         try:
             return kind(**parts)
         except (TypeError, ValueError, ArithmeticError) as error:
@@ -279,7 +243,7 @@ class _Unpacker:
         key, item = get_args(kind)
         pairs = [self._pair(p, name) for p in self._of(list, value, name)]
         made = {
-            self.value(key, k, name): self.value(item, v, _joined(name, n))
+            self.value(key, k, name): self.value(item, v, joined(name, n))
             for n, (k, v) in enumerate(pairs)
         }
         return made if len(made) == len(pairs) else self._wrong(name)
@@ -327,27 +291,6 @@ class _Unpacker:
         raise InputError(f"{name or 'it'} is missing, or not what it should be")
 
 
-def _item_kinds(kind: Any, count: int) -> list[Any]:
-    """Kinds of the items of a list or tuple of so many."""
-    kinds = list(get_args(kind))
-    if get_origin(kind) is list:
-        return kinds * count
-    return kinds[:1] * count if kinds[1:] == [...] else kinds
-
-
-def _lengths(kind: Any, value: Any) -> list[tuple[str, int]]:
-    """The letters in the annotated shape of an array, or of one that there may be, and lengths."""
-    array = next((k for k in (kind, *get_args(kind)) if _is_array(k)), None)
-    if array is None or not isinstance(value, array.array_type):
-        return []
-    shape = zip(array.dim_str.split(), value.shape, strict=False)
-    return [(x, m) for x, m in shape if x.isidentifier()]
-
-
 def _is_in(value: Values, several: Any) -> bool:
     """Whether a form, which may be unhashable, is one of several plain values."""
     return isinstance(value, _PLAIN) and value in several
-
-
-def _joined(name: str, part: object) -> str:
-    return f"{name}.{part}" if name else str(part)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
+from geogs.limits import Id, Pose
 from geogs.world.arrays import NOT_STORED
 
 
@@ -21,7 +22,7 @@ class PoseTable:
     A pose is replaced, never changed in place: who keeps a reference sees what it was.
     """
 
-    T_cw: dict[int, Float64[Tensor, "4 4"]] = field(default_factory=dict)
+    T_cw: dict[Id, Pose] = field(default_factory=dict)
     _rows: Float64[np.ndarray, "c 4 4"] = field(init=False, repr=False, metadata=NOT_STORED)
     """The same by id, with room for more."""
     _centres: Float64[np.ndarray, "c 3"] = field(init=False, repr=False, metadata=NOT_STORED)

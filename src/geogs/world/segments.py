@@ -7,19 +7,30 @@ segments is the main map, which is shown and written. Source: the atlas of ORB-S
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor
 
+from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp, se3_log
-from geogs.world.edges import Edge, Pair, check_edges
-from geogs.world.frames import FrameLog, check_frames
-from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import Keyframe, KeyframeSet
+from geogs.limits import (
+    RIGID,
+    UNBOUNDED,
+    AtLeast0,
+    Id,
+    KeyframeId,
+    Number,
+    Pose,
+    Positive,
+)
+from geogs.world.edges import Edge, Pair
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
+from geogs.world.tables import check_tables
 
 CONSTANT_RATE = 0.2
 """Fraction by which a frame may come sooner or later than the one before and still count as one
@@ -42,16 +53,16 @@ class TrackState(Enum):
 class LastFrame:
     """Pose of the last located frame relative to a keyframe, so that corrections apply to it."""
 
-    keyframe: int
-    T_rel: Float[Tensor, "4 4"]
+    keyframe: KeyframeId
+    T_rel: Pose
     """Keyframe to this frame."""
-    velocity: Float[Tensor, "4 4"] | None
+    velocity: Pose | None
     """Motion from the frame before; None where the camera had been lost."""
-    scale: float
+    scale: Positive
     """Scale of the keyframe when the two were measured."""
     timestamp: float
     """Seconds."""
-    interval: float
+    interval: AtLeast0
     """Seconds that the motion took."""
 
     @staticmethod
@@ -94,9 +105,9 @@ class ChainedPositions:
 class ReferenceView:
     """A frame that later ones are matched with to follow the camera's orientation."""
 
-    index: int
+    index: Number
     image: UInt8[np.ndarray, "h w 3"]
-    R: Float64[Tensor, "3 3"] | None
+    R: Annotated[Float64[Tensor, "3 3"], RIGID] | None
     """The camera that was located last to this one; none where nothing links them."""
     encoded: Any = field(default=None, metadata={"stored": False})
     """The flow operator's form of the image, or None where it has to be computed again."""
@@ -109,7 +120,7 @@ class OrientationTrack:
     view: ReferenceView | None = None
     flow: ChainedPositions = field(default_factory=ChainedPositions)
     """From the view to the latest frame."""
-    misses: int = 0
+    misses: Number = 0
     """Frames in a row that did not match the view."""
 
     def reset(self, view: ReferenceView | None = None) -> None:
@@ -125,9 +136,9 @@ class TrackStatus:
     state: TrackState = TrackState.INITIALIZING
     last: LastFrame | None = None
     orientation: OrientationTrack = field(default_factory=OrientationTrack)
-    misses: int = 0
+    misses: Number = 0
     """Frames since the camera was last located."""
-    frames_lost: int = 0
+    frames_lost: Number = 0
     """Those of them with texture that show more than a rotation."""
 
     @property
@@ -148,9 +159,9 @@ class StartUpProgress:
 
     flow: ChainedPositions = field(default_factory=ChainedPositions)
     """From the last keyframe to the latest frame."""
-    misses: int = 0
+    misses: Number = 0
     """Frames in a row that did not match the last keyframe."""
-    min_keyframes: int = 0
+    min_keyframes: Number = 0
     """Keyframes with which it is tried again, where an earlier attempt was far off."""
 
 
@@ -158,9 +169,9 @@ class StartUpProgress:
 class OdometryScale:
     """Scale of poses that another tracker gives beside the images."""
 
-    scale: float | None = None
+    scale: Positive | None = None
     """Metres to the unit of the map; none as long as the measured motions do not fit."""
-    deviation: float = float("inf")
+    deviation: Annotated[float, UNBOUNDED, Range(0)] = float("inf")
     """Relative deviation of the scale."""
 
 
@@ -168,18 +179,18 @@ class OdometryScale:
 class VideoSegment:
     """All that tracking knows of one segment of video; mutable."""
 
-    number: int = 0
+    number: Id = 0
     """Stable, never used again."""
     keyframes: KeyframeSet = field(default_factory=KeyframeSet)
     edges: dict[Pair, Edge] = field(default_factory=dict)
     """Measured flow between keyframes, in both directions of each pair."""
     frames: FrameLog = field(default_factory=FrameLog)
     status: TrackStatus = field(default_factory=TrackStatus)
-    final: list[int] = field(default_factory=list)
+    final: list[KeyframeId] = field(default_factory=list)
     """Keyframes that are never removed any more, earliest first."""
-    fixed: list[int] = field(default_factory=list)
+    fixed: list[KeyframeId] = field(default_factory=list)
     """Keyframes of a saved map, in whose gauge this segment is: they never change."""
-    breaks: list[int] = field(default_factory=list)
+    breaks: list[Id] = field(default_factory=list)
     """Keyframes that no motion links to the one before them."""
     sharpness: list[float] = field(default_factory=list)
     """Sharpness of the latest frames."""
@@ -219,25 +230,37 @@ class SegmentTable:
 
     segments: list[VideoSegment] = field(default_factory=list)
     """Earliest first."""
-    main: int = 0
+    main: Id = 0
     """Number of the one that is the main map."""
-    current: int = 0
+    current: Id = 0
     """Number of the one in which the camera is."""
-    count: int = 0
+    count: Id = 0
     """Segments so far: the number that the next one gets."""
     joined: list[SegmentFate] = field(default_factory=list)
     why_not: str = ""
     """Why no segment could be started, once the stream has ended; empty if one could."""
 
 
-def check_segment(segment: VideoSegment, grid: SampleGrid) -> None:
-    """Raise InputError where what is kept of a segment is of another camera, or has no place."""
-    check_edges(segment.edges, grid, segment.keyframes)
-    check_frames(segment.frames.records, grid)
-    view = segment.status.orientation.view
-    if view is not None and view.image.shape != (grid.camera.height, grid.camera.width, 3):
-        raise InputError("the view that orientations are relative to is of another camera")
-    for flow in (segment.start.flow, segment.status.orientation.flow):
-        for positions in (flow.there, flow.back):
-            if positions is not None and positions.shape[1] != grid.size:
-                raise InputError("the flow of the start is of another camera")
+def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -> None:
+    """Check segments that were read; their keyframes are attached to the table.
+
+    Raises:
+        InputError: one is of other keyframes or another camera, or the table is incomplete; there
+            cannot be more than so many ``frames``.
+    """
+    numbers = [segment.number for segment in table.segments]
+    here = {table.main, table.current} if numbers else set[int]()
+    if not here <= {*numbers} or any(n >= table.count for n in numbers) or _repeats(numbers):
+        raise InputError("a segment is missing, or has the number of another")
+    sizes = keyframes.grid.sizes
+    for segment in table.segments:
+        check_tables(VideoSegment, segment, sizes, {"keyframes": segment.keyframes})
+        edges, indices = segment.edges, [record.index for record in segment.frames.records]
+        if not all(i != j and (j, i) in edges for i, j in edges):
+            raise InputError(f"an edge of segment {segment.number} has no way back")
+        if indices != sorted(indices) or _repeats(indices) or indices[-1:] >= [frames]:
+            raise InputError(f"the frames of segment {segment.number} are not in their order")
+
+
+def _repeats(numbers: list[int]) -> bool:
+    return len(set(numbers)) < len(numbers)

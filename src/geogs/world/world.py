@@ -3,12 +3,13 @@
 from dataclasses import dataclass, field
 
 from geogs.errors import InputError
+from geogs.limits import KeyframeId, Number
 from geogs.stopwatch import StageSeconds
 from geogs.types import MetricScale, Uncertainty
 from geogs.world.keyframes import KeyframeTable, check_keyframes
 from geogs.world.loops import LoopTable, check_loops
 from geogs.world.map import MapTable
-from geogs.world.segments import SegmentTable, check_segment
+from geogs.world.segments import SegmentTable, check_segments
 
 
 @dataclass(eq=False)
@@ -23,13 +24,13 @@ class World:
     map: MapTable | None = None
     """Disks and dense depths."""
     times: StageSeconds = field(default_factory=StageSeconds)
-    frames: int = 0
+    frames: Number = 0
     """Images so far."""
     timestamp: float | None = None
     """Seconds of the last frame; none before the first."""
-    unmapped: list[int] = field(default_factory=list)
+    unmapped: list[KeyframeId] = field(default_factory=list)
     """Final keyframes that the map does not show yet, earliest first."""
-    adjusted: int = 0
+    adjusted: Number = 0
     """Keyframes at the last bundle adjustment of all."""
     is_ended: bool = False
     """Whether the stream has ended."""
@@ -52,8 +53,7 @@ def check_world(world: World) -> None:
     for segment in segments:
         segment.keyframes.attached(keyframes)
     check_keyframes(keyframes, [segment.keyframes for segment in segments])
-    for segment in segments:
-        check_segment(segment, keyframes.grid)
-    if not all(i in keyframes for i in (*world.unmapped, *world.loops.keyframes)):
+    check_segments(world.segments, keyframes, world.frames)
+    check_loops(world.loops, keyframes, {segment.number for segment in segments})
+    if not all(i in keyframes for i in world.unmapped):
         raise InputError("a keyframe is missing")
-    check_loops(world.loops)

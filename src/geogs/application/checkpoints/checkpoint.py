@@ -25,7 +25,8 @@ from geogs.errors import InputError, OutputError
 from geogs.stopwatch import Stopwatch
 from geogs.version import __version__
 from geogs.world.archive import Archive, SettledArchive
-from geogs.world.pack import pack, schema, unpack
+from geogs.world.kinds import schema
+from geogs.world.pack import pack, unpack
 
 S = TypeVar("S")
 

@@ -53,7 +53,7 @@ class Manifest:
     geogs: str
     """The version that wrote it."""
     schema: str
-    """Hash of the state's types, see :func:`geogs.world.pack.schema`."""
+    """Hash of the state's types, see :func:`geogs.world.kinds.schema`."""
     is_our_folder: bool
     """Whether geogs made it."""
     number: int

@@ -1,0 +1,104 @@
+"""What the numbers of a stored record may be, as the types of its fields say it.
+
+``Annotated`` gives a number or an array a :class:`~geogs.config.setting.Range`, or says that it is
+:data:`UNBOUNDED`, a pose (:data:`RIGID`), or a :class:`Reference` to a row of a table. Floats of
+which nothing is said are finite.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from geogs.config.setting import Range
+
+FARTHEST = 1e12
+"""Beyond it, and below its inverse, are no lengths of a map, in its unit, nor scales."""
+MOST_IDS = 1 << 22
+"""Tables have room for every number up to the largest: at two keyframes a second, 24 days."""
+MOST_COUNTED = 1 << 53
+"""Whole numbers beyond it are none of a float."""
+_SQUARENESS = 1e-4
+"""Largest error of an element of R R^T."""
+
+
+class _Unbounded:
+    """Infinite numbers are allowed, too; those that are none are not."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Matrices of rotation, with translation if 4 x 4, and of one scale if ``is_scaled``."""
+
+    is_scaled: bool = False
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A number, or an array of such, that names a row of a table."""
+
+    table: str
+
+
+UNBOUNDED = _Unbounded()
+RIGID, SIMILARITY = Transform(), Transform(is_scaled=True)
+AT_LEAST_0 = Range(0, FARTHEST)
+POSITIVE = Range(1 / FARTHEST, FARTHEST)
+
+Id = Annotated[int, Range(0, MOST_IDS)]
+"""Number that nothing else of its kind has, such as that of a frame."""
+KeyframeId = Annotated[int, Range(0, MOST_IDS), Reference("keyframes")]
+"""That of a keyframe that there is."""
+Number = Annotated[int, Range(0, MOST_COUNTED)]
+"""How many there are."""
+Positive = Annotated[float, POSITIVE]
+AtLeast0 = Annotated[float, AT_LEAST_0]
+Pose = Annotated[Float64[Tensor, "4 4"], RIGID]
+
+
+def holds(marks: tuple[object, ...], value: Any) -> bool:
+    """Whether a number or an array is as it should be; other values always are."""
+    if isinstance(value, np.ndarray):
+        value = torch.from_numpy(value)
+    if isinstance(value, Tensor):
+        return _array_holds(marks, value.detach())
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return True
+    return _is_allowed(marks, value, value)
+
+
+def _array_holds(marks: tuple[object, ...], array: Tensor) -> bool:
+    if not array.numel():
+        return True
+    least, most = (float(x) for x in array.aminmax())
+    return _is_allowed(marks, least, most) and all(
+        _is_transform(array, mark.is_scaled) for mark in marks if isinstance(mark, Transform)
+    )
+
+
+def _is_allowed(marks: tuple[object, ...], least: float | int, most: float | int) -> bool:
+    """Whether all from the least to the most may be, neither of which is NaN if none is."""
+    if math.isnan(least) or math.isnan(most):
+        return False
+    ends = (least, most)
+    is_finite = UNBOUNDED in marks or all(map(math.isfinite, ends))
+    ranges = (mark for mark in marks if isinstance(mark, Range))
+    return is_finite and all(r.holds(x) for r in ranges for x in ends)
+
+
+def _is_transform(T: Tensor, is_scaled: bool) -> bool:
+    T = T.double()
+    R = T[..., :3, :3]
+    square = R @ R.mT
+    scale = square[..., :1, :1] if is_scaled else square.new_ones(())
+    error = (square / scale - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max()
+    is_rotation = bool(error < _SQUARENESS) and bool((torch.linalg.det(R) > 0).all())
+    if T.shape[-1] == 3:
+        return is_rotation
+    last = T.new_tensor([0.0, 0.0, 0.0, 1.0])
+    is_near = bool(T[..., :3, 3].abs().max() < FARTHEST)
+    return is_rotation and is_near and bool((T[..., 3, :] == last).all())
