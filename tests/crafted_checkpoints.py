@@ -50,7 +50,7 @@ def reseal(output: Path) -> None:
 
 
 def crafted(begun: Path, seed: int, count: int) -> list[Crafted]:
-    """So many changes of a checkpoint: of numbers, lists, and types, shapes and values of arrays."""
+    """So many changes of numbers, of lists, and of types, shapes and values of arrays."""
     (values,) = (begun / "checkpoint").glob("state-*.json")
     (arrays,) = (begun / "checkpoint").glob("state-*.safetensors")
     leaves = list(_leaves(json.loads(values.read_text())["state"]["world"], ("world",)))

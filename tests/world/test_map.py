@@ -33,8 +33,8 @@ def filled() -> MapTable:
     table.disks.second.position.fill_(0.5)
     search = DepthSearch(1.0, 2.0, 3.0)
     table.views = {0: ViewRow(), 1: ViewRow([0], search, torch.ones(2), SearchedDepth(2.0, 1.0))}
-    for name in ("depth", "confidence"):
-        table.arrays.put(name, 1, np.full(SIZE, 2.0, np.float32))
+    for name, value in (("depth", 2.0), ("confidence", 0.5)):
+        table.arrays.put(name, 1, np.full(SIZE, value, np.float32))
     table.mapped, table.resident, table.unit, table.order = [1], [1], 2.0, [0]
     return table
 
@@ -62,7 +62,10 @@ def test_what_does_not_fit_is_said():
     for change, sentence in (
         ({"mapped": [7]}, "mapped.0 names what is missing in the keyframes"),
         ({"order": [1]}, "the place in the training is none"),
-        ({"views": {**filled().views, 5: ViewRow()}}, "views names what is missing in the keyframes"),
+        (
+            {"views": {**filled().views, 5: ViewRow()}},
+            "views names what is missing in the keyframes",
+        ),
         (
             {"views": {**filled().views, 0: ViewRow(depth=SearchedDepth(1.0, 1.0))}},
             "the depth of keyframe 0 is missing",

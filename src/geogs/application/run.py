@@ -14,6 +14,7 @@ from geogs.application.driver import Driver
 from geogs.application.fallback import TrackedOrPlaced
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Written
@@ -28,6 +29,7 @@ from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
+from geogs.io.sources.address import live_address
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
@@ -134,7 +136,8 @@ def resume(
 
     ``settings`` are those it was begun with if none are given. Given ones may differ in what does
     not decide about poses and map: the mesh, the number of the device, checkpoints, and what is
-    written besides.
+    written besides; and in where files lie. What a checkpoint names is opened only if it is in the
+    folder, or the user made the checkpoint; else it has to be given.
 
     Raises:
         InputError: there is nothing to resume, or it cannot be used, or with other settings.
@@ -142,7 +145,7 @@ def resume(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     saved = SavedRun(output)
-    settings = continued(saved.metadata, settings or saved.metadata.settings, output)
+    settings = continued(saved.metadata, settings or saved.settings, output)
     config, device = settings.config, require_device(settings.device)
     opened = open_source(settings.source, config.input)
     source = saved.calibrated(opened)
@@ -166,10 +169,22 @@ def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSet
     """Settings to go on with in a folder, on the kind of device that the run began on or the CPU.
 
     Raises:
-        InputError: they would compute something else, or elsewhere.
+        InputError: they would compute something else, or elsewhere; files of the run are not named.
     """
+    missing = options_missing(settings, begun.settings)
+    if missing:
+        raise InputError(
+            f"The checkpoint in {output} was not made by you on this machine, and what it names "
+            f"outside of that folder is opened only where you name it: give {', '.join(missing)} "
+            f"beside --resume {output}."
+        )
+    if any(map(live_address, settings.source)):
+        raise InputError(
+            "A live source comes but once; give the video that the run was begun with."
+        )
+    same_place = with_files_of(begun.settings, settings).deciding()
     elsewhere = settings.output is not None and settings.output.resolve() != output.resolve()
-    if elsewhere or settings.deciding() != begun.settings.deciding():
+    if elsewhere or settings.deciding() != same_place:
         raise InputError(
             "--resume goes on with the source and the settings of the run; leave out everything "
             "else but --device, --mesh, --checkpoint-every, --fallback, --online-results, "

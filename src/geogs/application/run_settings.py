@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+from geogs.application.named_files import with_absolute_paths
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import (
     Basic,
@@ -19,8 +20,6 @@ from geogs.config.setting import (
     Unnamed,
     Weight,
 )
-from geogs.documents import expanded
-from geogs.io.sources.address import live_address
 
 
 @dataclass(frozen=True)
@@ -61,29 +60,7 @@ class RunSettings(Settings):
 
     def absolute(self) -> "RunSettings":
         """The same with paths that hold wherever the run is resumed from, and without a folder."""
-        config = self.config
-        prior, tracking = config.prior, config.tracking
-        return replace(
-            self,
-            source=tuple(
-                path if live_address(path) else expanded(path).absolute() for path in self.source
-            ),
-            output=None,
-            map=_absolute(self.map),
-            config=replace(
-                config,
-                input=replace(
-                    config.input,
-                    intrinsics=_file(config.input.intrinsics),
-                    mask=_absolute(config.input.mask),
-                ),
-                tracking=replace(tracking, weights=_file(tracking.weights)),
-                prior=replace(
-                    prior, model=_file(prior.model), card=_file(prior.card),
-                    normal_model=_file(prior.normal_model), normal_card=_file(prior.normal_card),
-                ),
-            ),
-        )  # fmt: skip
+        return with_absolute_paths(replace(self, output=None))
 
     def deciding(self) -> "RunSettings":
         """Only what decides about poses and map; all else has its default.
@@ -152,12 +129,3 @@ class Verbosity(Settings):
     """Say nothing but warnings and errors."""
     log: Annotated[Path | None, Basic()] = None
     """File to which everything is also written, with the time of day; added to if it exists."""
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else expanded(path).absolute()
-
-
-def _file(name: str) -> str:
-    """The absolute path where that names a file; other words, such as auto, as they are."""
-    return str(Path(name).absolute()) if name and Path(name).is_file() else name

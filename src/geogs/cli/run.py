@@ -113,4 +113,4 @@ def _defaults(given: Given) -> RunOptions:
     folder = Path(given["resume"])
     if "preset" in given:
         raise InputError("--resume goes on with the run's settings; leave out --preset.")
-    return RunOptions(**vars(SavedRun(folder).metadata.settings), resume=folder)
+    return RunOptions(**vars(SavedRun(folder).settings), resume=folder)

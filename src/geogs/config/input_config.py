@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from geogs.config.setting import Basic, Only, Range, Settings
+from geogs.config.setting import Basic, NamesFile, Only, Range, Settings
 
 
 @dataclass(frozen=True)
 class InputConfig(Settings, group="input"):
     """How the source is read."""
 
-    intrinsics: Annotated[str, Basic("--intrinsics")] = "auto"
+    intrinsics: Annotated[str, NamesFile(("auto",)), Basic("--intrinsics")] = "auto"
     """auto, a file, fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image, or
     fisheye,fx,fy,cx,cy[,k1,k2,k3,k4] (OpenCV's, Kannala and Brandt's)."""
     long_edge: Annotated[int, Range(32, 16384, or_zero=True), Basic("--long-edge")] = 512
@@ -27,7 +27,9 @@ class InputConfig(Settings, group="input"):
     depth: Annotated[Literal["none", "auto", "sensor"], Only("run"), Basic("--depth")] = "none"
     """Depth that a sensor measured, beside the images: none leaves it, auto takes it where there
     is any, sensor must have it. With it the result is in metres."""
-    poses: Annotated[str, Only("run"), Basic("--poses")] = "auto"
+    poses: Annotated[str, NamesFile(("none", "auto", "prior")), Only("run"), Basic("--poses")] = (
+        "auto"
+    )
     """Poses beside the images as priors on the motion and the scale: none leaves them, auto takes
     those of an app that tracks its camera (Stray Scanner, Record3D, Polycam), prior must have some,
     and a file (TUM's rows) is taken as given. With them the result is in metres."""

@@ -5,9 +5,9 @@ import functools
 import inspect
 import itertools
 import sys
-from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, fields
-from typing import Any, get_args
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields, replace
+from typing import Any, TypeVar, get_args
 
 from geogs.config.setting import (
     Basic,
@@ -19,6 +19,8 @@ from geogs.config.setting import (
     group_of,
     kinds,
 )
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,15 @@ def leaves(tree: object, command: str = "") -> tuple[Leaf, ...]:
     """
     found = _of_class(tree) if isinstance(tree, type) else tuple(_leaves(tree, (), ""))
     return tuple(leaf for leaf in found if not command or leaf.is_offered_by(command))
+
+
+def with_values(tree: T, values: Mapping[tuple[str, ...], object]) -> T:
+    """The same settings but for some, which are named by the fields that lead to them."""
+    own: dict[str, Any] = {}
+    for name in {path[0] for path in values}:
+        inner = {path[1:]: value for path, value in values.items() if path[0] == name}
+        own[name] = inner[()] if () in inner else with_values(getattr(tree, name), inner)
+    return replace(tree, **own)  # type: ignore[type-var]
 
 
 def default_text(leaf: Leaf) -> str:

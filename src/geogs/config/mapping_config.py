@@ -10,6 +10,7 @@ from geogs.config.setting import (
     Count,
     CountOrZero,
     Fraction,
+    NamesFile,
     Only,
     Positive,
     Range,
@@ -81,7 +82,7 @@ class DepthConfig(Settings, group="mapping.depth"):
     """Who finds depth: matching without a network, the network of geogs train depth, both, each
     where it is more confident (auto on a GPU; on a CPU that is classical), or nobody: the tracker's
     own depth, enlarged, as the paper has it."""
-    weights: str = ""
+    weights: Annotated[str, NamesFile()] = ""
     """Weights file of the network; "" takes the one that is found."""
     planes: Annotated[int, Range(2, 256)] = 144
     """Most planes of inverse depth that are searched, and half of them at least."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from geogs.config.setting import Basic, Fraction, Positive, Range, Settings
+from geogs.config.setting import Basic, Fraction, NamesFile, Positive, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class OdometryConfig(Settings, group="odometry"):
 class PriorConfig(Settings, group="prior"):
     """Depth and normals that a network guesses from single keyframes; without a model, none."""
 
-    model: Annotated[str, Basic()] = ""
+    model: Annotated[str, NamesFile(), Basic()] = ""
     """Network for depth (or depth and normals): a file; none does without."""
-    card: Annotated[str, Basic()] = ""
+    card: Annotated[str, NamesFile(), Basic()] = ""
     """What it wants and gives: the name of a card that comes with geogs, or a YAML file."""
-    normal_model: str = ""
+    normal_model: Annotated[str, NamesFile()] = ""
     """Another network for normals, where the first has none: a file."""
-    normal_card: str = ""
+    normal_card: Annotated[str, NamesFile()] = ""
     """What that one wants and gives."""
     scale_rows: Annotated[int, Range(2, 64)] = 8
     """Nodes of the scale field from top to bottom."""

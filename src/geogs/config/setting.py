@@ -104,6 +104,13 @@ class Positional:
     """Option with which it may be left out all the same."""
 
 
+@dataclass(frozen=True)
+class NamesFile:
+    """A text that may be the name of a file, where it is none of these words."""
+
+    words: tuple[str, ...] = ()
+
+
 class Time:
     """Seconds that an option may give as ``90s``, ``10m`` or ``1.5h``, too."""
 

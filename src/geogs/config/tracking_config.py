@@ -3,7 +3,16 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from geogs.config.setting import Basic, Count, CountOrZero, Fraction, Range, Settings, Weight
+from geogs.config.setting import (
+    Basic,
+    Count,
+    CountOrZero,
+    Fraction,
+    NamesFile,
+    Range,
+    Settings,
+    Weight,
+)
 
 
 @dataclass(frozen=True)
@@ -28,7 +37,7 @@ class TrackingConfig(Settings, group="tracking"):
 
     operator: Annotated[Literal["auto", "classical", "own", "droid"], Basic()] = "auto"
     """What measures image motion; auto takes classical, which needs no weights."""
-    weights: Annotated[str, Basic()] = ""
+    weights: Annotated[str, NamesFile(), Basic()] = ""
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
     keyframe_parallax: Fraction = 0.014
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge,

@@ -23,6 +23,7 @@ class Saved:
     def __init__(self, output: Path) -> None:
         assert output == OUT
         self.metadata = RunMetadata(BEGUN, "cpu", "", None)
+        self.settings = BEGUN
 
 
 @pytest.fixture(autouse=True)
@@ -57,12 +58,23 @@ def test_what_changes_neither_poses_nor_map_may_be_given():
 
 @pytest.mark.parametrize(
     "argv",
-    ["--seed 8", "--stride 1", "--mapping.iterations 3", "other.mp4", "-o /elsewhere",
-     "--preset fast", "--preset default"],
+    ["--seed 8", "--stride 1", "--mapping.iterations 3", "-o /elsewhere", "--preset fast",
+     "--mask other.png", "--tracking.weights /a/flow.safetensors", "--preset default"],
 )  # fmt: skip
 def test_what_would_compute_something_else_is_refused(argv):
     with pytest.raises(InputError, match=r"--resume goes on with .*; leave out"):
         settings(*argv.split())
+
+
+def test_the_video_may_lie_elsewhere_by_now():
+    """Whether it is the same is told by its fingerprint, when it is open."""
+    assert settings("/moved/a.mp4").source == (Path("/moved/a.mp4"),)
+
+
+@pytest.mark.parametrize("address", ["camera:0", "-", "rtsp://host/path", "play:/data/a.mp4"])
+def test_what_does_not_wait_is_not_gone_on_with(address):
+    with pytest.raises(InputError, match="A live source comes but once"):
+        settings("--", address)
 
 
 def test_the_kind_of_device_stays():

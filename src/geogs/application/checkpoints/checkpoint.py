@@ -113,6 +113,8 @@ class SavedState(Generic[S]):
             if manifest.schema != schema(kind):
                 raise InputError("it is of another command, or another version wrote it")
             self._manifest = manifest
+            self.is_own = manifest.is_own
+            """Whether this user made it, as far as can be told."""
             self._values = json.loads(self._read("json"))
 
     def plain(self, name: str) -> Any:

@@ -13,13 +13,15 @@ import re
 import stat
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
+from geogs.application.checkpoints.seal import is_sealed, seal
 from geogs.documents import UNUSABLE
 from geogs.errors import InputError, OutputError
 from geogs.version import __version__
+from geogs.world.arrays import NOT_STORED
 from geogs.world.pack import pack, unpack
 
 FORMAT = "geogs checkpoint 2"
@@ -63,6 +65,8 @@ class Manifest:
     none if it was never completed."""
     files: list[str]
     """All of ours that may be there, but for the manifest."""
+    is_own: bool = field(default=False, metadata=NOT_STORED)
+    """Whether this user wrote it, see :mod:`geogs.application.checkpoints.seal`."""
 
 
 class CheckpointFolder:
@@ -86,15 +90,16 @@ class CheckpointFolder:
             data = file.read(_LARGEST_MANIFEST)
         try:
             given = json.loads(data)
-            checksum = given.pop("checksum")
+            checksum, sealed = given.pop("checksum"), str(given.pop("seal", ""))
             manifest: Manifest = unpack(Manifest, given, {}, {})
         except (InputError, *UNUSABLE) as error:
             raise InputError(f"{MANIFEST} is damaged, or none of geogs") from error
-        if checksum != Sum.of(_json(pack(Manifest, manifest).values)).sha256:
+        said = _json(pack(Manifest, manifest).values)
+        if checksum != Sum.of(said).sha256:
             raise InputError(f"{MANIFEST} has changed")
         for name in (*manifest.state, *manifest.files):
             _check_name(name)
-        return manifest
+        return replace(manifest, is_own=is_sealed(said, sealed))
 
     def read(self, name: str, wanted: Sum) -> bytes:
         """What a file holds. Raises InputError if it is not what it should be."""
@@ -201,8 +206,10 @@ class CheckpointFolder:
 
     def _write_manifest(self, manifest: Manifest) -> None:
         values = pack(Manifest, manifest).values
+        said = _json(values)
+        signed = {"checksum": Sum.of(said).sha256, "seal": seal(said)}
         with self._open(_UNFINISHED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as file:
-            file.write(_json(values | {"checksum": Sum.of(_json(values)).sha256}))
+            file.write(_json(values | signed))
             file.flush()
             os.fsync(file.fileno())
         with self._opened() as folder:

@@ -8,8 +8,10 @@ from pathlib import Path
 import torch
 
 from geogs.application.checkpoints.checkpoint import SavedState
+from geogs.application.named_files import without_files_outside
 from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
+from geogs.io.sources.address import live_address
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import ReadingPlace, Source
 from geogs.shutter.shutter import Shutter
@@ -57,6 +59,15 @@ class SavedRun:
         """Raises InputError if there is none, it is damaged, or another version wrote it."""
         self._saved = SavedState(output, RunState)
         self.metadata: RunMetadata = self._saved.plain("metadata")
+        with self._saved.in_a_sentence():
+            self.settings = self._trusted(output)
+            """Those that the run was begun with, without the files that only a stranger names."""
+
+    def _trusted(self, output: Path) -> RunSettings:
+        begun = self.metadata.settings
+        if any(map(live_address, begun.source)):  # of which there is no checkpoint
+            raise InputError("it names a live source, which cannot be gone on with")
+        return begun if self._saved.is_own else without_files_outside(begun, output)
 
     @contextmanager
     def world(self, device: torch.device) -> Iterator[World]:
