@@ -7,8 +7,10 @@ somebody else's list is shown to anybody.
 import json
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from geogs.errors import InputError
 
@@ -39,26 +41,45 @@ def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
     Raises:
         InputError: it is missing, no plain file, too large, or cannot be read.
     """
+    with open_file(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > largest:
+            raise InputError(
+                f"{path} has {size / 2**20:.0f} MiB, more than any such file; is it another one?"
+            )
+        return stream.read(size)
+
+
+@contextmanager
+def open_file(path: str | Path) -> Iterator[BinaryIO]:
+    """A plain file to be read; a pipe or a device is not waited for.
+
+    Raises:
+        InputError: it is missing, no plain file, or cannot be read.
+    """
     name = str(path)
     if "\0" in name:
         raise InputError("A file name with a zero byte in it cannot be that of a file.")
     try:
         with open(path, "rb", opener=_without_waiting) as stream:
-            status = os.fstat(stream.fileno())
-            if not stat.S_ISREG(status.st_mode):
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
                 raise InputError(f"{name} is no plain file; give one.")
-            if status.st_size > largest:
-                raise InputError(
-                    f"{name} has {status.st_size / 2**20:.0f} MiB, more than any such file; is it "
-                    "another one?"
-                )
-            return stream.read(status.st_size)
+            yield stream
     except FileNotFoundError:
         raise InputError(f"{name} does not exist; give a file that does.") from None
     except IsADirectoryError:
         raise InputError(f"{name} is a folder; give a file.") from None
     except OSError as error:
         raise InputError(f"{name} cannot be read ({error.strerror or error}).") from error
+
+
+def require_file(path: str | Path) -> Path:
+    """The path of a plain file, for a library that opens files by their names.
+
+    Raises InputError as of ``open_file``.
+    """
+    with open_file(path):
+        return Path(path)
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:

@@ -9,6 +9,9 @@ from geogs.documents import expanded, read_text
 from geogs.errors import GeogsError, InputError, OutputError
 from geogs.io.writers.atomic import write_text
 
+PATIENCE = 60.0
+"""Seconds that a server may be silent, however long a file takes."""
+
 
 class StoragePath:
     """A file or a folder, here or elsewhere."""
@@ -120,7 +123,10 @@ class StoragePath:
                 if not files:
                     raise InputError(f"{self.address} does not exist; give a source that does.")
                 for file in files:
-                    inner = target / PurePosixPath(file).relative_to(path.rstrip("/"))
+                    relative = PurePosixPath(file).relative_to(path.rstrip("/"))
+                    if ".." in relative.parts:
+                        raise InputError(f"{self.address} names files outside of itself.")
+                    inner = target / relative
                     inner.parent.mkdir(parents=True, exist_ok=True)
                     system.get_file(file, str(inner))
         except OSError as error:
@@ -146,7 +152,7 @@ class StoragePath:
         except ImportError:
             raise InputError(f"{self.address} needs fsspec: pip install 'geogs[fleet]'.") from None
         try:
-            reached = url_to_fs(self.address)
+            reached = url_to_fs(self.address, **_limits(self.address))
         except (ImportError, ValueError) as error:
             raise InputError(f"{self.address} cannot be reached ({_reason(error)}).") from error
         try:
@@ -155,6 +161,19 @@ class StoragePath:
             raise
         except Exception as error:
             raise OSError(_reason(error)) from error
+
+
+def _limits(address: str) -> dict[str, Any]:
+    """By which a file system waits no longer than ``PATIENCE`` for a server that is silent."""
+    protocol = address.partition("://")[0]
+    if protocol in ("http", "https"):
+        from aiohttp import ClientTimeout
+
+        timeout = ClientTimeout(total=None, sock_connect=PATIENCE, sock_read=PATIENCE)
+        return {"client_kwargs": {"timeout": timeout}}
+    if protocol in ("s3", "s3a"):
+        return {"config_kwargs": {"connect_timeout": PATIENCE, "read_timeout": PATIENCE}}
+    return {"requests_timeout": PATIENCE} if protocol in ("gs", "gcs") else {}
 
 
 def _reason(error: Exception) -> str:

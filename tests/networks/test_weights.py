@@ -220,7 +220,7 @@ def test_verify_ends_with_2_where_a_file_cannot_be_used(places, tmp_path, capsys
     broken = tmp_path / "droid.pth"
     broken.write_bytes(b"no weights")
     for path, sentence in (
-        (tmp_path / "none.pth", "cannot be read (No such file or directory)."),
+        (tmp_path / "none.pth", "does not exist; give a file that does."),
         (wrong, "is not the published file of that name"),
         (broken, "is damaged, or no PyTorch checkpoint."),
     ):

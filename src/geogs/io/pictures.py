@@ -7,7 +7,7 @@ gives half a picture and such a line, and no error.
 import io
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from geogs.documents import read_bytes
+from geogs.documents import open_file, read_bytes
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
 
@@ -119,8 +119,10 @@ def header_read(file: Path | IO[bytes]) -> Iterator["Image"]:
     """
     from PIL import Image
 
-    with warnings.catch_warnings(action="ignore"), Image.open(file) as picture:
-        yield picture
+    with ExitStack() as stack:
+        stream = stack.enter_context(open_file(file)) if isinstance(file, Path) else file
+        stack.enter_context(warnings.catch_warnings(action="ignore"))
+        yield stack.enter_context(Image.open(stream))
 
 
 def _promises_too_much(data: np.ndarray) -> bool:

@@ -11,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from geogs.documents import in_short
+from geogs.documents import in_short, open_file, require_file
 from geogs.errors import InputError
 from geogs.networks.weights_files import require_intact
 
@@ -53,7 +53,7 @@ def load_trained(
             f"{kind}, or take {option} classical."
         )
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(require_file(path), "pt") as file:
             about = {name: json.loads(text) for name, text in (file.metadata() or {}).items()}
             tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
         options = about["options"].items()
@@ -70,14 +70,15 @@ def load_trained(
 
 def _safetensors(path: Path) -> object:
     try:
-        return load_file(path)
+        return load_file(require_file(path))
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is damaged, or no safetensors file.") from error
 
 
 def _checkpoint(path: Path) -> object:
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        with open_file(path) as file:
+            return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         # Also raised for what is no pickle at all.
         if "Unsupported global" in str(error):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from geogs.documents import open_file
 from geogs.errors import InputError
 from geogs.gpu.cache import cache_folder
 
@@ -170,13 +171,8 @@ def checksum(path: Path) -> Checksum:
 
     Raises InputError if the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            actual = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"The weights file {path} cannot be read ({error.strerror or error})."
-        ) from error
+    with open_file(path) as file:
+        actual = hashlib.file_digest(file, "sha256").hexdigest()
     return Checksum(actual, _published(path))
 
 

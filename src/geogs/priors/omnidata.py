@@ -8,6 +8,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from geogs.documents import open_file
 from geogs.errors import InputError
 from geogs.priors.card import PriorCard
 from geogs.priors.dpt import MULTIPLE, DptHybrid
@@ -69,7 +70,8 @@ def _weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise InputError(f"There is no file {path} with a monocular network.")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with open_file(path) as file:
+            content = torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path} holds more than numbers, which is not read for safety; keep the field "

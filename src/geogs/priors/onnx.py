@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from geogs.documents import require_file
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.priors.card import PriorCard
@@ -75,7 +76,9 @@ def _open(model: Path, device: torch.device) -> Any:
     wanted = ["CUDAExecutionProvider"] * (device.type == "cuda") + ["CPUExecutionProvider"]
     providers = [p for p in wanted if p in onnxruntime.get_available_providers()]
     try:
-        return onnxruntime.InferenceSession(str(model), options, providers, enable_fallback=0)
+        return onnxruntime.InferenceSession(
+            str(require_file(model)), options, providers, enable_fallback=0
+        )
     except Exception as error:  # onnxruntime raises classes of its own
         raise InputError(f"{model} is no ONNX network that can be used{_said(error)}.") from error
 

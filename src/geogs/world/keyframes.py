@@ -226,7 +226,7 @@ class KeyframeTable:
     def __getitem__(self, id: int) -> Keyframe:
         return self.keyframes[id]
 
-    def __contains__(self, id: int) -> bool:
+    def __contains__(self, id: object) -> bool:
         return id in self.set_of
 
     def forget_removed(self) -> None:

@@ -7,6 +7,7 @@ from typing import TypeVar
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from geogs.documents import require_file
 from geogs.world.pack import pack, unpack
 
 R = TypeVar("R")
@@ -20,7 +21,7 @@ def write_record(path: Path, record: object) -> None:
 
 def read_record(kind: type[R], path: Path) -> R:
     """The record of this kind that ``write_record`` wrote."""
-    with safe_open(path, "pt") as file:
+    with safe_open(require_file(path), "pt") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         record: R = unpack(kind, json.loads(file.metadata()["values"]), arrays, {})
     return record

@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.application.results.saved_result import load_result
+from geogs.documents import open_file
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_folder import image_path, read_image
 from geogs.mesh.triangle_mesh import DepthMapView
@@ -28,7 +29,7 @@ class StoredView:
 
     def load(self, with_image: bool = False) -> DepthMapView:
         """What is in the file; with the image only where it is wanted."""
-        with np.load(self.file, allow_pickle=False) as file:
+        with open_file(self.file) as stored, np.load(stored, allow_pickle=False) as file:
             depth, weight = torch.from_numpy(file["depth"]), torch.from_numpy(file["weight"])
         image = read_image(self.image) if with_image else None
         return DepthMapView(depth, weight.float(), self.camera, self.pose, image)

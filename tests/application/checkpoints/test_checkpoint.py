@@ -1,7 +1,6 @@
 """Checkpoints of a small state: complete or not there, checked, and nothing foreign is touched."""
 
 import errno
-import hashlib
 import json
 import os
 import pickle
@@ -18,6 +17,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
+from crafted_checkpoints import reseal
 from geogs.application.checkpoints.checkpoint import (
     Checkpoint,
     SavedState,
@@ -90,25 +90,13 @@ def files(output: Path) -> dict[str, Path]:
     return {"manifest": folder / "manifest.json", **found}
 
 
-def resealed(output: Path) -> None:
-    """Give changed files of a state their right sizes and checksums, as a stranger would."""
-    folder = output / "checkpoint"
-    manifest = json.loads((folder / "manifest.json").read_text())
-    manifest.pop("checksum", None)
-    for entry in manifest["state"]:
-        data = (folder / entry[0]).read_bytes()
-        entry[1] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    checksum = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
-    (folder / "manifest.json").write_text(json.dumps(manifest | {"checksum": checksum}))
-
-
 def changed_values(output: Path, change: Callable[[dict], object]) -> None:
     """A checkpoint whose JSON a stranger has made up, all checksums right."""
     path = files(output)["json"]
     values = json.loads(path.read_text())
     change(values)
     path.write_text(json.dumps(values))
-    resealed(output)
+    reseal(output)
 
 
 def refused(output: Path, wanted: str) -> None:
@@ -325,7 +313,7 @@ def test_a_pickle_is_not_executed(output, tmp_path):
         shutil.copytree(output, copy)
         files(copy)[kind].write_bytes(harm)
         if kind != "manifest":
-            resealed(copy)
+            reseal(copy)
         refused(copy, "cannot be used")
     old = tmp_path / "old" / "checkpoint"
     old.mkdir(parents=True)
@@ -352,7 +340,7 @@ def test_names_that_geogs_does_not_give_are_refused(output, kind, name):
     if kind == "state":
         manifest["state"][0][0] = name
     paths["manifest"].write_text(json.dumps(manifest))
-    resealed(output)
+    reseal(output)
     refused(output, "is no name of a file of a checkpoint")
     with pytest.raises(OutputError, match="is left alone"):
         write_checkpoint(checkpoint_folder(output), state(6))
@@ -366,7 +354,7 @@ def test_an_archive_that_the_manifest_does_not_name_is_refused(output):
     other.write_text("precious " * 1000)
     text = files(output)["json"].read_text().replace(own.name, other.name)
     files(output)["json"].write_text(text)
-    resealed(output)
+    reseal(output)
     refused(output, "is none of its files")
     assert other.read_text() == "precious " * 1000
 
@@ -387,13 +375,12 @@ def test_names_of_other_places_are_refused(output, tmp_path, where):
             manifest["files"].append(name)
         else:
             manifest["state"][0][0] = name
-        manifest.pop("checksum")
-        checksum = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
-        path.write_text(json.dumps(manifest | {"checksum": checksum}))
+        path.write_text(json.dumps(manifest))
+        reseal(output)
     else:
         text = files(output)["json"].read_text().replace(archive, name)
         files(output)["json"].write_text(text)
-        resealed(output)
+        reseal(output)
     if where == "deleted":
         with pytest.raises(OutputError, match="is left alone"):
             write_checkpoint(checkpoint_folder(output), state(6))
@@ -459,7 +446,7 @@ def test_mutated_bytes_with_right_checksums_never_crash(output):
             for _ in range(rng.integers(1, 4)):
                 data[rng.integers(len(data))] = rng.integers(256)
             path.write_bytes(data)
-            resealed(output)
+            reseal(output)
             try:
                 made = read(output)
             except InputError:

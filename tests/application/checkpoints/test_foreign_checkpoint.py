@@ -142,11 +142,11 @@ def test_a_changed_checkpoint_is_no_longer_ones_own(tmp_path):
     begun(out, RunSettings((tmp_path / "v.mp4",)))
     path = out / "checkpoint" / "state-1.json"
     assert SavedRun(out).settings.source
+    manifest = json.loads((out / "checkpoint" / "manifest.json").read_text())
+    assert len(manifest["seal"]) == 64
     path.write_text(path.read_text().replace("/v.mp4", "/w.mp4"))
     reseal(out)
     assert SavedRun(out).settings.source == ()
-    manifest = json.loads((out / "checkpoint" / "manifest.json").read_text())
-    assert len(manifest["seal"]) == 64
 
 
 def test_the_key_is_for_its_user_alone(cache):

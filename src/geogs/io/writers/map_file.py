@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from geogs.documents import UNUSABLE
+from geogs.documents import UNUSABLE, require_file
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file
@@ -110,7 +110,7 @@ def _open(path: str | Path) -> "safe_open":
     if not Path(path).is_file():
         raise InputError(f"The map {path} does not exist.")
     try:
-        file = safe_open(str(path), framework="pt")
+        file = safe_open(str(require_file(path)), framework="pt")
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is no map of geogs, or is damaged.") from error
     header = file.metadata() or {}

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.documents import open_file
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
@@ -87,7 +88,7 @@ def _read_matrices(
 ) -> tuple[dict[int, Float64[np.ndarray, "4 4"]], Float64[np.ndarray, "4 4"] | None]:
     """``world_mat_i`` by i, in order, and the first ``scale_mat_i`` if there is one."""
     try:
-        with path.open("rb") as stream, np.load(stream) as archive:
+        with open_file(path) as stream, np.load(stream) as archive:
             matrices = {name: archive[name].astype(np.float64) for name in archive.files}
     except Exception as error:  # a damaged archive raises whatever zipfile, zlib or numpy find
         raise InputError(f"{path} is damaged or no NumPy archive; copy it again.") from error

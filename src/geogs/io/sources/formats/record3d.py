@@ -41,7 +41,7 @@ def is_record3d(path: Path) -> bool:
     """Whether ``path`` is an archive of Record3D or what was unpacked from one."""
     if path.is_dir():
         return (path / "metadata").is_file() and (path / "rgbd").is_dir()
-    return path.suffix.lower() == ".r3d" and zipfile.is_zipfile(path)
+    return path.suffix.lower() == ".r3d" and path.is_file() and zipfile.is_zipfile(path)
 
 
 @runtime_checkable

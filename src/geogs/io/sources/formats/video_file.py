@@ -9,14 +9,22 @@ import numpy as np
 from av.container import InputContainer
 from jaxtyping import UInt8
 
+from geogs.documents import require_file
 from geogs.errors import InputError
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 
-# FFmpeg also "plays" text, single pictures and play lists; none of them is a video file.
-_NOT_VIDEO = frozenset({"tty", "image2", "hls", "concat", "concatf", "dash", "sdp", "lrc", "srt"})
+# FFmpeg also "plays" text, pictures, devices, and play lists, which open what they name before
+# anybody sees what they are; none of them is a video file.
+_NOT_VIDEO = frozenset({
+    "tty", "image2", "image2pipe", "hls", "concat", "concatf", "dash", "webm_dash_manifest", "sdp",
+    "rtp", "rtsp", "sap", "imf", "vobsub", "lrc", "srt", "lavfi", "avisynth", "vapoursynth", "alsa",
+    "oss", "fbdev", "kmsgrab", "x11grab", "xcbgrab", "video4linux2,v4l2",
+})  # fmt: skip
 
-_LOCAL = {"protocol_whitelist": "file"}
-"""No container may lead to the network."""
+_OPTIONS = {
+    "protocol_whitelist": "file",  # no container may lead to the network
+    "format_whitelist": ",".join(sorted(av.formats_available - _NOT_VIDEO)),
+}
 
 _log = logging.getLogger(__name__)
 
@@ -97,24 +105,25 @@ def _seconds(container: InputContainer) -> float | None:
 
 def _container(path: Path) -> InputContainer:
     try:
-        return av.open(str(path), metadata_errors="replace", options=_LOCAL)
+        return av.open(str(path), metadata_errors="replace", options=_OPTIONS)
     except TypeError:  # PyAV 19 no longer has it
-        return av.open(str(path), options=_LOCAL)
+        return av.open(str(path), options=_OPTIONS)
 
 
 def _open(path: Path) -> InputContainer:
     try:
-        container = _container(path)
+        container = _container(require_file(path))
+    except av.error.ArgumentError as error:  # a format that is not on the list
+        raise InputError(f"{path} is no video; give a video file or a folder of images.") from error
     except (av.error.FFmpegError, OSError) as error:
         raise InputError(
             f"{path} cannot be opened as a video ({error.strerror}); "
             f"is it complete and a video file?"
         ) from error
-    formats = set(container.format.name.split(","))
-    is_picture = any(name.endswith("_pipe") for name in formats)
-    if formats & _NOT_VIDEO or is_picture or not container.streams.video:
+    is_picture = container.format.name.endswith("_pipe")
+    if is_picture or not container.streams.video:
         container.close()
-        what = "a single picture" if is_picture or "image2" in formats else "no video"
+        what = "a single picture" if is_picture else "no video"
         raise InputError(f"{path} is {what}; give a video file or a folder of images.")
     return container
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from geogs.documents import open_file
 from geogs.errors import InputError
 from geogs.io.pictures import decoded, header_of
 
@@ -66,9 +67,9 @@ def _size(picture: UInt8[np.ndarray, "h w 3"], parts: int) -> tuple[int, int]:
 
 def _is_jpeg(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return file.read(3) == b"\xff\xd8\xff"
-    except OSError:
+    except InputError:
         return False
 
 

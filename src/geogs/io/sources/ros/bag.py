@@ -9,6 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from geogs.documents import (
+    LARGEST_DOCUMENT,
+    UNUSABLE,
+    open_file,
+    read_text,
+    require_file,
+    yaml_value,
+)
 from geogs.errors import GeogsError, InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
@@ -113,6 +121,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(
             f"{path} is a recording of ROS; pip install 'geogs[ros]' brings what reads it."
         ) from error
+    _require_files(path)
     try:
         # The images' types are alike in all of ROS 2, whose older bags do not describe them.
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
@@ -130,6 +139,23 @@ def _opened(path: Path) -> Iterator[Any]:
     finally:
         with suppress(Exception):  # a damaged index may lead it astray here, too
             bag.close()
+
+
+def _require_files(path: Path) -> None:
+    """Raise InputError where what the reader will open is no plain file of the recording."""
+    if not path.is_dir():
+        require_file(path)
+        return
+    metadata = path / _METADATA
+    try:
+        said = yaml_value(read_text(metadata, LARGEST_DOCUMENT), str(metadata))
+        names = [str(name) for name in said["rosbag2_bagfile_information"]["relative_file_paths"]]
+    except UNUSABLE:
+        raise InputError(f"{metadata} is damaged as that of a recording of ROS.") from None
+    for name in names:
+        if Path(name).name != name:
+            raise InputError(f"{metadata} names files of other folders; copy them beside it.")
+        require_file(path / name)
 
 
 def _chosen(bag: Any, path: Path, asked: str) -> str:
@@ -229,5 +255,8 @@ def _rate(nanoseconds: Sequence[int]) -> float:
 
 
 def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(4096)
+    try:
+        with open_file(path) as stream:
+            return stream.read(4096)
+    except InputError:
+        return b""
