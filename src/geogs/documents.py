@@ -9,8 +9,9 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from geogs.errors import InputError
 
@@ -51,7 +52,7 @@ def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
 
 
 @contextmanager
-def open_file(path: str | Path) -> Iterator[BinaryIO]:
+def open_file(path: str | Path) -> Iterator[BufferedReader]:
     """A plain file to be read; a pipe or a device is not waited for.
 
     Raises:
