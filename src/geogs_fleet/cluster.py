@@ -1,16 +1,20 @@
 """Ray: found or started, and what one source gets of it."""
 
 import os
+import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from geogs.errors import InputError
+from geogs.version import __version__
 from geogs_fleet.fleet_options import FleetOptions
 
 _OBJECTS = 80 << 20
 """Bytes of the object store of a local cluster; rows are small."""
+HERE = "127.0.0.1"
+"""Address that only this machine sees: a cluster started here listens nowhere else."""
 _PASSING = "geogs: ends with its command"
 """What a cluster has that another command must not rely on, where it finds it on this machine."""
 
@@ -86,15 +90,35 @@ def as_task(
 ) -> Any:
     """A function as a task of Ray that gets so much of a node.
 
-    Ray calls it again, up to so many times, where its node or its process is lost.
+    Ray calls it again, up to so many times, where its node or its process is lost. A node with
+    another version of geogs refuses: the task raises InputError.
     """
-    return ray.remote(function).options(
+    return ray.remote(for_this_version(function)).options(
         num_cpus=allocation.cpus,
         num_gpus=allocation.gpus or None,
         memory=allocation.memory,
         max_retries=retries,
         scheduling_strategy="SPREAD",
     )
+
+
+def for_this_version(
+    function: Callable[..., Any], version: str = __version__
+) -> Callable[..., Any]:
+    """A function that refuses where it is called in another version of geogs, by InputError."""
+
+    def checked(*arguments: Any) -> Any:  # taken there by value, whatever version is there
+        from geogs.version import __version__ as here
+
+        if here != version:
+            raise InputError(
+                f"The machine {platform.node()} has geogs {here}, and the fleet is of {version}; "
+                "install the same everywhere."
+            )
+        return function(*arguments)
+
+    checked.__name__ = function.__name__
+    return checked
 
 
 def _times(node: dict[str, float], wanted: dict[str, float]) -> int:
@@ -124,6 +148,7 @@ def _connect(ray: Any, address: str) -> None:
             raise InputError(f"Ray cannot be reached at {address} ({said}).") from error
     ray.init(
         address="local",
+        _node_ip_address=HERE,
         num_cpus=available_cores(),  # Ray would count those that others have, too
         include_dashboard=False,
         object_store_memory=_OBJECTS,

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
+from geogs.errors import GeogsError
 from geogs_fleet.attempt import FleetJob, attempt
 from geogs_fleet.cluster import Allocation, as_task
 from geogs_fleet.row import Row
@@ -56,6 +57,9 @@ def _row(ray: Any, reference: Any, job: FleetJob) -> Row:
 
 
 def _sentence(ray: Any, error: Exception) -> str:
+    cause = getattr(error, "cause", None)
+    if isinstance(cause, GeogsError):
+        return str(cause)
     if isinstance(error, ray.exceptions.OutOfMemoryError):
         return "The memory of the machine was full; give fewer sources at once (--cpus, --gpus)."
     if isinstance(error, ray.exceptions.NodeDiedError | ray.exceptions.WorkerCrashedError):

@@ -58,7 +58,8 @@ def placed(tmp_path, monkeypatch):
         T[:, :3, 3] += torch.from_numpy(rng.normal(0, 0.003, 3)) * (n > 0)
         placements[n] = Placement(T, torch.ones(len(T)))
     none = torch.zeros(0, dtype=torch.long)
-    relative = RelativePoses(none, none, torch.zeros(0, 4, 4), torch.zeros(0, 7), none.bool())
+    numbers = torch.zeros(0, 7, dtype=torch.float64)
+    relative = RelativePoses(none, none, numbers.new_zeros(0, 4, 4), numbers, none.bool())
     links = tuple(Link((n, 3), (n + 1, 0), torch.eye(4), 1.0, relative) for n in range(2))
     gauge = Gauge({n: torch.eye(4) for n in range(3)}, links)
     return parts, files, placements, gauge, config
