@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes
+from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes, require_file
 from geogs.errors import InputError
 from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
 from geogs.io.pose_files import OPENCV_FROM_OPENGL, poses_from
@@ -87,7 +87,7 @@ class _Archive:
 
     def _opened(self) -> zipfile.ZipFile:
         try:
-            return zipfile.ZipFile(self.path)
+            return zipfile.ZipFile(require_file(self.path))
         except (OSError, *_DAMAGED):
             raise InputError(f"{self.path} is damaged; export it again.") from None
 
