@@ -13,8 +13,9 @@ from geogs_fleet.fleet_options import FleetOptions
 
 _OBJECTS = 80 << 20
 """Bytes of the object store of a local cluster; rows are small."""
-HERE = "127.0.0.1"
-"""Address that only this machine sees: a cluster started here listens nowhere else."""
+ASKS_FOR_TOKEN = 2, 59
+"""Ray from which on a cluster that is started here asks for a token; its ports are open to the
+network, whatever address it is given."""
 _PASSING = "geogs: ends with its command"
 """What a cluster has that another command must not rely on, where it finds it on this machine."""
 
@@ -85,40 +86,45 @@ def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
     return Allocation(cpus, gpus, memory_bytes, at_once)
 
 
+@dataclass(frozen=True)
+class Task:
+    """A function that nodes of the same version call."""
+
+    checked: Any
+    """``in_version`` as Ray has it."""
+    function: Callable[..., Any]
+
+    def remote(self, *arguments: Any) -> Any:
+        """Ray's reference to what it will return."""
+        return self.checked.remote(__version__, self.function, *arguments)
+
+
 def as_task(
     ray: Any, function: Callable[..., Any], allocation: Allocation, retries: int = 0
-) -> Any:
+) -> Task:
     """A function as a task of Ray that gets so much of a node.
 
     Ray calls it again, up to so many times, where its node or its process is lost. A node with
     another version of geogs refuses: the task raises InputError.
     """
-    return ray.remote(for_this_version(function)).options(
+    task = ray.remote(in_version).options(
         num_cpus=allocation.cpus,
         num_gpus=allocation.gpus or None,
         memory=allocation.memory,
         max_retries=retries,
         scheduling_strategy="SPREAD",
     )
+    return Task(task, function)
 
 
-def for_this_version(
-    function: Callable[..., Any], version: str = __version__
-) -> Callable[..., Any]:
-    """A function that refuses where it is called in another version of geogs, by InputError."""
-
-    def checked(*arguments: Any) -> Any:  # taken there by value, whatever version is there
-        from geogs.version import __version__ as here
-
-        if here != version:
-            raise InputError(
-                f"The machine {platform.node()} has geogs {here}, and the fleet is of {version}; "
-                "install the same everywhere."
-            )
-        return function(*arguments)
-
-    checked.__name__ = function.__name__
-    return checked
+def in_version(version: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function returns; raises InputError where another version of geogs is installed."""
+    if __version__ != version:
+        raise InputError(
+            f"The machine {platform.node()} has geogs {__version__}, and the fleet is of "
+            f"{version}; install the same everywhere."
+        )
+    return function(*arguments)
 
 
 def _times(node: dict[str, float], wanted: dict[str, float]) -> int:
@@ -146,9 +152,13 @@ def _connect(ray: Any, address: str) -> None:
         except (ValueError, RuntimeError, OSError) as error:
             said = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"Ray cannot be reached at {address} ({said}).") from error
+    if tuple(int(part) for part in ray.__version__.split(".")[:2]) < ASKS_FOR_TOKEN:
+        raise InputError(
+            f"Ray {ray.__version__} would start a cluster that anybody on the network can use; "
+            "pip install -U 'geogs[fleet]'."
+        )
     ray.init(
         address="local",
-        _node_ip_address=HERE,
         num_cpus=available_cores(),  # Ray would count those that others have, too
         include_dashboard=False,
         object_store_memory=_OBJECTS,
