@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from geogs_photos.database import SharedCamera
-from geogs_photos.incremental_mapping import largest_first, put_together
+from geogs_photos.incremental_mapping import largest_first, placed_images, put_together
 from geogs_photos.pycolmap_library import load_colmap
 
 WHOLE = 0.9
@@ -54,7 +54,7 @@ def rejoined(
 
 
 def _placed(parts: Sequence[Any]) -> int:
-    return int(parts[0].num_reg_images()) if parts else 0
+    return len(placed_images(parts[0])) if parts else 0
 
 
 def _globally(database: Path, is_known: bool, seed: int, threads: int) -> list[Any]:

@@ -9,6 +9,8 @@ from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_IMAGES = 3
 """Fewest pictures of a part that counts as one."""
+LEAST_POINTS = 15
+"""Points that have to place a frame of a video."""
 FREE_IMAGES = 8
 """Pictures of a camera from which on its principal point and a second radial term are found."""
 FREE_POINTS = 300
@@ -62,6 +64,12 @@ def largest_first(models: Mapping[int, Any]) -> list[Any]:
     """Those that have enough pictures to count as a part."""
     parts = [model for model in models.values() if model.num_reg_images() >= LEAST_IMAGES]
     return sorted(parts, key=lambda model: -model.num_reg_images())
+
+
+def placed_images(model: Any) -> list[Any]:
+    """Frames of a video by name; those that few points place have no pose that counts."""
+    placed = (i for i in model.images.values() if i.has_pose and i.num_points3D >= LEAST_POINTS)
+    return sorted(placed, key=lambda image: image.name)
 
 
 def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:

@@ -18,7 +18,7 @@ from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import rejoined
-from geogs_photos.incremental_mapping import refine
+from geogs_photos.incremental_mapping import LEAST_IMAGES, placed_images, refine
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.poses import Progress, structure_of
@@ -28,8 +28,6 @@ from geogs_photos.upright import upright_rotation
 
 NEXT = 6
 """Chosen frames after each that it is matched with in any case."""
-LEAST_POINTS = 15
-"""Points that have to place a frame."""
 
 
 def place_video(video: Source, seed: int, report: Progress, stopwatch: Stopwatch) -> PlacedVideo:
@@ -78,13 +76,13 @@ def place_frames(
         database, threads = Path(work) / "database.db", worker_count()
         parts, _ = structure_of(database, shared, entries, pairs, seed, progress)
         parts = rejoined(parts, database, count, shared, seed, threads, progress)
-    if not parts:
+    best = refine(parts[0], shared, worker_count()) if parts else None
+    images = [] if best is None else placed_images(best)
+    if best is None or len(images) < LEAST_IMAGES:
         raise InputError(
             f"Of {count} sharp frames no three tell where they were taken; the camera has to move, "
             "and the scene to show texture."
         )
-    best = refine(parts[0], shared, worker_count())
-    images = _placed_images(best)
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
@@ -94,7 +92,7 @@ def place_frames(
 def _placed(
     model: Any, chosen: ChosenFrames, entries: Sequence[Entry], is_known: bool
 ) -> PlacedVideo:
-    images = _placed_images(model)
+    images = placed_images(model)
     T_cw = np.tile(np.eye(4), (len(images), 1, 1))
     positions, descriptors = [], []
     for pose, image in zip(T_cw, images, strict=True):
@@ -114,12 +112,6 @@ def _placed(
         chosen.timestamps, len(chosen.frames), numbers, T_cw, deviation, rotation, depth,
         tuple(positions), tuple(descriptors), calibration, error,
     )  # fmt: skip
-
-
-def _placed_images(model: Any) -> list[Any]:
-    """In order of time; those that few points place have no pose that counts."""
-    placed = (i for i in model.images.values() if i.has_pose and i.num_points3D >= LEAST_POINTS)
-    return sorted(placed, key=lambda image: image.name)
 
 
 def _depth_deviation(model: Any, image: Any, error: float) -> float:

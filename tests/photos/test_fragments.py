@@ -1,16 +1,18 @@
 """Ways that are tried where structure from motion of a video falls into parts."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
-from geogs_photos import fragments, video
+from geogs_photos import fragments, incremental_mapping, video
 from geogs_photos.database import SharedCamera
 from geogs_photos.fragments import rejoined
+from geogs_photos.incremental_mapping import placed_images
 from geogs_photos.sharp_frames import ChosenFrames
 from posed_layouts import render_room
 
@@ -18,14 +20,21 @@ CAMERA = SharedCamera(Calibration(100.0, 100.0, 50.0, 40.0), is_known=False)
 
 
 @dataclass
+class Image:
+    name: str
+    num_points3D: int
+    has_pose: bool = True
+
+
 class Part:
-    """A reconstruction of so many frames."""
+    """A reconstruction of so many frames, and of some that hardly a point places."""
 
-    frames: int
-    cameras: dict = field(default_factory=dict)
+    cameras = ()
 
-    def num_reg_images(self) -> int:
-        return self.frames
+    def __init__(self, frames: int) -> None:
+        self.frames = frames
+        points = [20] * frames + [3] * 50
+        self.images = {k: Image(f"{k:03d}", n) for k, n in enumerate(points)}
 
 
 @pytest.mark.parametrize(
@@ -87,12 +96,18 @@ def test_each_way_places_a_room(monkeypatch):
 
 
 def test_frames_that_few_points_place_have_no_pose():
-    @dataclass
-    class Image:
-        name: str
-        num_points3D: int
-        has_pose: bool = True
-
     images = [Image("b", 15), Image("a", 200), Image("c", 14), Image("d", 90, False)]
     model = type("Model", (), {"images": dict(enumerate(images))})
-    assert [image.name for image in video._placed_images(model)] == ["a", "b"]
+    assert [image.name for image in placed_images(model)] == ["a", "b"]
+
+
+@pytest.mark.system
+def test_a_reconstruction_of_too_few_points_is_none(monkeypatch):
+    pytest.importorskip("pycolmap")
+    room = render_room(4, 3, 160, 120)
+    frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(room.images))
+    monkeypatch.setattr(incremental_mapping, "LEAST_POINTS", 10**6)
+    with pytest.raises(InputError, match="no three tell where they were taken"):
+        video.place_frames(
+            ChosenFrames(frames, np.arange(4) / 10), room.camera, True, 0, lambda *_: None
+        )

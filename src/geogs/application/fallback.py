@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.photos import has_pycolmap, seconds_to_place
@@ -127,8 +129,10 @@ class TrackedOrPlaced(Work):
             if driver.stop.lets_finish(work):
                 return True
             driver.stop_early("Structure from motion is stopped")
-        except InputError as error:
-            driver.progress.write(f"{error} What was tracked stays.")
+        except (InputError, RuntimeError) as error:  # of a library; or the GPU's memory is full
+            if isinstance(error, torch.cuda.OutOfMemoryError):
+                torch.cuda.empty_cache()
+            driver.progress.write(f"Structure from motion failed, what was tracked stays: {error}")
         return False
 
     def _video(self) -> Source:
