@@ -39,9 +39,9 @@ class TrackingConfig(Settings, group="tracking"):
     """What measures image motion; auto takes classical, which needs no weights."""
     weights: Annotated[str, NamesFile(), Basic()] = ""
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
-    keyframe_parallax: Fraction = 0.014
+    keyframe_parallax: Fraction = 0.018
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge,
-    without what the camera's rotation alone does; before depths are known, 1.8 times that in
+    without what the camera's rotation alone does; before depths are known, 1.4 times that in
     all."""
     keyframe_overlap: Fraction = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the

@@ -21,7 +21,7 @@ from geogs.world.edges import edge_matches
 from geogs.world.frames import RelativeRotation
 from geogs.world.keyframes import Keyframe
 
-CULL_DISTANCE = 0.007
+CULL_DISTANCE = 0.009
 """A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
 makes one."""
 DEEPER = 3

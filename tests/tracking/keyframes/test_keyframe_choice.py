@@ -29,8 +29,8 @@ def test_motion_makes_a_keyframe_whatever_overlaps() -> None:
 
 def test_before_depths_are_known_the_rotation_counts_and_more_is_asked_for() -> None:
     choice = KeyframeChoice(CONFIG, 512)
-    assert not choice.calls_for(23.0, 1.0)
-    assert choice.calls_for(23.1, 1.0)
+    assert not choice.calls_for(17.9, 1.0)
+    assert choice.calls_for(18.0, 1.0)
 
 
 def test_lost_overlap_makes_a_keyframe_before_the_median_motion_does() -> None:

@@ -12,7 +12,7 @@ from geogs.config import TrackingConfig
 LEAST_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
 hardly moved, so it is the image that is poor."""
-WITH_ROTATION = 1.8
+WITH_ROTATION = 1.4
 """Times the parallax that makes a keyframe is the motion that does before depths are known, since
 part of it is the rotation's."""
 FARTHEST = 0.15
