@@ -329,7 +329,7 @@ def test_depths_are_searched_for_as_many_images_as_time_allows():
     assert sorted(spread_order(range(49))) == list(range(49))
     fewer = spread_order(range(48))[:12]
     assert max(np.diff(sorted(fewer))) <= 5
-    slow = replace(SMALL, search=replace(SMALL.search, depth_ratio=1e-6))
+    slow = replace(SMALL, search=replace(SMALL.search, depth_ratio=0.001))
     scene = Reconstruction(WORKING, slow, budget=6.0)
     for view in make_scene().views:
         scene.add(view.image, view.T_cw)

@@ -156,7 +156,8 @@ def test_frames_that_only_turned_are_read_with_the_others_or_alone(tmp_path):
     write_trajectories(tmp_path, turned, turned)
     assert read_frame_poses(tmp_path).states == 3 * ["orientation only"]
     lost = Trajectory(np.arange(3.0), T_wc, np.zeros(3, bool))
-    write_trajectories(tmp_path, lost, lost)
-    assert not (tmp_path / "orientations.tum").exists()
+    (tmp_path / "lost").mkdir()
+    write_trajectories(tmp_path / "lost", lost, lost)
+    assert not (tmp_path / "lost" / "orientations.tum").exists()
     with pytest.raises(InputError):
-        read_frame_poses(tmp_path)
+        read_frame_poses(tmp_path / "lost")

@@ -7,10 +7,10 @@ gives half a picture and such a line, and no error.
 import io
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -19,9 +19,6 @@ from jaxtyping import Bool, UInt8
 from geogs.documents import open_file, read_bytes
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 LARGEST_PICTURE = 1 << 31
 """Bytes of a file."""
@@ -112,17 +109,20 @@ def upright_size(path: Path) -> tuple[int, int] | None:
 
 
 @contextmanager
-def header_read(file: Path | IO[bytes]) -> Iterator["Image"]:
+def header_read(file: Path | IO[bytes]) -> Iterator[Any]:
     """A picture of which Pillow has read no more than the header, and warns of nothing.
 
     What a damaged file makes one of its many readers stumble over is raised, whatever it is.
     """
     from PIL import Image
 
-    with ExitStack() as stack:
-        stream = stack.enter_context(open_file(file)) if isinstance(file, Path) else file
-        stack.enter_context(warnings.catch_warnings(action="ignore"))
-        yield stack.enter_context(Image.open(stream))
+    opened = open_file(file) if isinstance(file, Path) else nullcontext(file)
+    with (
+        opened as stream,
+        warnings.catch_warnings(action="ignore"),
+        Image.open(stream) as picture,
+    ):
+        yield picture
 
 
 def _promises_too_much(data: np.ndarray) -> bool:
@@ -130,7 +130,10 @@ def _promises_too_much(data: np.ndarray) -> bool:
     from PIL import Image
 
     try:
-        with header_read(io.BytesIO(data.tobytes())) as picture:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(data.tobytes())) as picture,
+        ):
             pixels = picture.width * picture.height
     except Image.DecompressionBombError:
         pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)
