@@ -196,5 +196,6 @@ def test_the_development_rooms_are_found(shared_data):
     assert [s.name for s in find_objects(shared_data)] == ["horse"]
     (scan,) = find_dtu(shared_data / "dtu")
     assert scan.name == "scan24"
-    (kitchen,) = find_seven_scenes(shared_data / "7scenes-redkitchen")
-    assert kitchen.truth.surface == shared_data / "7scenes-redkitchen" / "tsdf_pseudo_gt.ply"
+    folder = shared_data / "7scenes-redkitchen"
+    (kitchen,) = find_seven_scenes(folder)
+    assert kitchen.truth.surface == folder.resolve() / "tsdf_pseudo_gt.ply"
