@@ -147,8 +147,8 @@ def yaml_value(text: str, name: str) -> Any:
         raise InputError(said) from None
 
 
-def in_short(error: Exception, longest: int = 200) -> str:
-    """What an error says, for the inside of a sentence: its first line, plain and not for ever."""
+def in_short(error: Exception | str, longest: int = 200) -> str:
+    """What is said of an error, inside of a sentence: its first line, plain and not for ever."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
     plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
     return plain if len(plain) <= longest else f"{plain[:longest]}..."

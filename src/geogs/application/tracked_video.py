@@ -10,7 +10,7 @@ import torch
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
-from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.driver import Driver, Outcome
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
@@ -24,7 +24,7 @@ BRIEFLY = 40.0
 
 
 @dataclass
-class TrackedVideo(Work):
+class TrackedVideo:
     """A video whose frames are tracked one by one, by a system that has been made ready."""
 
     scene: Slam
@@ -46,10 +46,6 @@ class TrackedVideo(Work):
         if self.metadata.settings.map is not None or self.source.is_live:
             return None
         return run_state(self.metadata, self.scene, self.source)
-
-    def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
-        """The frames that are left, then the final stages."""
-        return self.map(driver, self.locate(driver, checkpoint, new))
 
     def locate(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
         """Poses: the frames that are left, then the adjustment of all keyframes.

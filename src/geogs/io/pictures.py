@@ -7,10 +7,10 @@ gives half a picture and such a line, and no error.
 import io
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -109,16 +109,15 @@ def upright_size(path: Path) -> tuple[int, int] | None:
 
 
 @contextmanager
-def header_read(file: Path | IO[bytes]) -> Iterator[Any]:
+def header_read(path: Path) -> Iterator[Any]:
     """A picture of which Pillow has read no more than the header, and warns of nothing.
 
     What a damaged file makes one of its many readers stumble over is raised, whatever it is.
     """
     from PIL import Image
 
-    opened = open_file(file) if isinstance(file, Path) else nullcontext(file)
     with (
-        opened as stream,
+        open_file(path) as stream,
         warnings.catch_warnings(action="ignore"),
         Image.open(stream) as picture,
     ):

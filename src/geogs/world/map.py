@@ -170,7 +170,8 @@ def check_map(table: MapTable, keyframes: KeyframeTable, size: tuple[int, int]) 
         raise InputError("a view of the map is missing")
     if not all(0 <= n < len(table.mapped) for n in table.order):
         raise InputError("the place in the training is none")
+    mapped = {*table.mapped}
     for id, row in table.views.items():
-        is_searched = id in {*table.mapped} or row.depth is not None
+        is_searched = id in mapped or row.depth is not None
         if is_searched and not (row.depth and all(table.arrays.has(n, id) for n in DEPTH)):
             raise InputError(f"the depth of keyframe {id} is missing")

@@ -35,6 +35,7 @@ from geogs.application.run_settings import RunSettings
 from geogs.cli.main import main
 from geogs.config import Config, InputConfig, MeshConfig
 from geogs.errors import OutputError
+from geogs.evaluation.pages.page import HtmlSection
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh, write_splats
@@ -127,7 +128,9 @@ def quick(monkeypatch) -> None:
     found = MetricScale("a known distance", FACTOR, 0.01)
     monkeypatch.setattr(rescaling, "find_scale", lambda *_: found)
     for module in ("run_page", "evaluation_page"):
-        monkeypatch.setattr(f"geogs.evaluation.pages.{module}.model_html", lambda model: "")
+        monkeypatch.setattr(
+            f"geogs.evaluation.pages.{module}.model_section", lambda model: HtmlSection("")
+        )
 
 
 def a_run(scene: SavedScene, images: Path) -> Callable[[Path], object]:

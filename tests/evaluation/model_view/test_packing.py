@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from box_room import box, circle
-from geogs.evaluation.model_view.model_section import model_html
+from geogs.evaluation.model_view.model_section import model_section
 from geogs.evaluation.model_view.packed_model import STEPS, pack, webgl_axes
 from geogs.evaluation.model_view.shown_model import (
     Colouring,
@@ -123,7 +123,7 @@ def test_disks_keep_normal_and_size(model):
 
 
 def test_html_is_safe_and_needs_nothing_else(model):
-    text = model_html(model)
+    text = model_section(model).html
     assert "<one>" not in text  # names of strangers do not become markup
     assert "The MIT License" in text
     for outside in ('src="http', "@import", "fetch(", 'href="http'):

@@ -6,9 +6,8 @@ import pytest
 from geogs.tracking.flow.cell_texture import (
     SHARP,
     UNINFORMED,
-    cell_certainty,
+    cell_structure,
     structure_tensor,
-    textured_fraction,
 )
 from geogs.world.grid import OFFSET, STRIDE
 
@@ -27,23 +26,25 @@ def inner(certainty: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("across", "known"), [((1.0, 0.0), 0), ((0.0, 1.0), 1)])
 def test_an_edge_counts_across_it_alone(across: tuple[float, float], known: int) -> None:
-    certainty = inner(cell_certainty(wave(across)))
+    certainty = inner(cell_structure(wave(across)).certainty)
     assert certainty[:, known].min() > 0.9
     assert certainty[:, 1 - known].max() < 0.03
 
 
 def test_a_slanted_edge_counts_little_and_no_edge_next_to_nothing() -> None:
-    certainty = inner(cell_certainty(wave((0.7, 0.7))))
+    certainty = inner(cell_structure(wave((0.7, 0.7))).certainty)
     assert certainty.min() > 0.01
     assert certainty.max() < 0.06
-    np.testing.assert_allclose(cell_certainty(np.full((64, 64), 90, np.uint8)), UNINFORMED)
+    np.testing.assert_allclose(
+        cell_structure(np.full((64, 64), 90, np.uint8)).certainty, UNINFORMED
+    )
 
 
 def test_texture_counts_fully() -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (64, 64), np.uint8)
-    np.testing.assert_allclose(cell_certainty(image), 1.0, rtol=1e-5)
-    assert textured_fraction(image) == 1.0
+    np.testing.assert_allclose(cell_structure(image).certainty, 1.0, rtol=1e-5)
+    assert cell_structure(image).textured_fraction == 1.0
 
 
 def test_it_is_what_one_coordinate_is_known_to_while_the_other_is_open() -> None:
@@ -58,7 +59,7 @@ def test_it_is_what_one_coordinate_is_known_to_while_the_other_is_open() -> None
         information = np.minimum(1, values / SHARP + UNINFORMED)
         covariance = (vectors / information) @ vectors.T
         expected.append(1 / np.diag(covariance))
-    found = cell_certainty(image)
+    found = cell_structure(image).certainty
     assert found.min() < 0.1
     assert found.max() > 0.5
     np.testing.assert_allclose(found, np.array(expected), rtol=1e-3)

@@ -65,7 +65,9 @@ def score(tracker: Tracker, walk: tuple[list[RenderedView], np.ndarray]) -> Scor
     for k in keyframes[1:-1]:
         true = views[k.frame_index].depth[4:-3:8, 4:-3:8]
         errors.append(np.abs(float(scale) / k.depth_field()[0] / true - 1).ravel())
-        bare.append(cell_structure(cv2.cvtColor(k.image, cv2.COLOR_RGB2GRAY)) < MIN_STRUCTURE)
+        bare.append(
+            cell_structure(cv2.cvtColor(k.image, cv2.COLOR_RGB2GRAY)).smaller < MIN_STRUCTURE
+        )
     error, where = np.concatenate(errors), np.concatenate(bare)
     assert 0.2 < where.mean() < 0.6
     return Score(ate, float(error.mean()), float(error[where].mean()))
@@ -113,7 +115,7 @@ def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, hel
         told.append(1 / (d * k.confident_information.clamp(min=1e-9).sqrt()))
         alone.append(1 / (d * state.information.clamp(min=1e-9).sqrt()))
         grey = cv2.cvtColor(views[k.frame_index].image, cv2.COLOR_RGB2GRAY)
-        bare.append(torch.from_numpy(cell_structure(grey) < 0.05))
+        bare.append(torch.from_numpy(cell_structure(grey).smaller < 0.05))
     told, alone, bare = (torch.cat(v) for v in (told, alone, bare))
     assert float(alone[bare].median()) > 0.15
     assert 0.02 < float(told[bare].median()) < 0.3

@@ -6,6 +6,7 @@ from importlib.resources import files
 
 from geogs.evaluation.model_view.packed_model import pack, to_json
 from geogs.evaluation.model_view.shown_model import ShownModel
+from geogs.evaluation.pages.page import HtmlSection
 
 SCRIPTS = (
     "unpack.js",
@@ -19,26 +20,28 @@ SCRIPTS = (
 """Scripts of the page, in the order in which they run; ``three.min.js`` comes before them."""
 
 
-def model_scripts() -> tuple[str, str]:
+def _scripts() -> tuple[str, str]:
     """What runs in the page: the library, and ours."""
     own = "\n".join(_file(name) for name in SCRIPTS)
     return _file("three.min.js"), f"(() => {{\n'use strict';\n{own}\n}})();"
 
 
-def model_html(model: ShownModel) -> str:
-    """HTML of the model; it needs nothing from elsewhere, and one page holds one of them."""
+def model_section(model: ShownModel) -> HtmlSection:
+    """The model; it needs nothing from elsewhere, and one page holds one of them."""
+    scripts = _scripts()
     scene, arrays, images = pack(model)
     notes = " ".join(model.notes)
     below = f"<p class=note>{html.escape(notes)}</p>" if notes else ""
-    return "\n".join([
+    markup = "\n".join([
         f"<style>{_file('model.css')}</style>",
         _file("model.html"),
         below,
         f'<script type="application/json" id="model-scene">{to_json(scene)}</script>',
         _data("model-arrays", arrays),
         _data("model-images", images),
-        *(f"<script>{script}</script>" for script in model_scripts()),
+        *(f"<script>{script}</script>" for script in scripts),
     ])  # fmt: skip
+    return HtmlSection(markup, scripts)
 
 
 def _data(name: str, content: bytes) -> str:

@@ -6,11 +6,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geogs.evaluation.model_view.model_section import model_html, model_scripts
+from geogs.evaluation.model_view.model_section import model_section
 from geogs.evaluation.model_view.shown_model import ShownModel
 from geogs.evaluation.pages.page import (
     FiguresSection,
-    HtmlSection,
     PictureSection,
     Section,
     TableSection,
@@ -129,7 +128,7 @@ def write_report(
     numbers = [*error_figures(evaluation), *judged.figures]
     sections: list[Section] = [FiguresSection(said, False, ()) for said in evaluation.doubts]
     sections += [FiguresSection(judged.sentence, judged.is_good, numbers)]
-    sections += [HtmlSection(model_html(model), model_scripts())] if model is not None else []
+    sections += [model_section(model)] if model is not None else []
     sections += [TableSection(heading, (), rows) for heading, rows in groups(evaluation)]
     sections += [PictureSection(title, file) for title, file in pictures]
     sections += run

@@ -1,5 +1,7 @@
 """Where an image has enough structure to be matched, and along which axis, whatever matches it."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,42 +17,56 @@ MIN_STRUCTURE = 0.5
 """Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
 
 
-def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "p"]:
-    """Smaller eigenvalue at the cells of the sample grid, row by row, grey levels^2 / pixel^2."""
-    return smaller_eigenvalue(grey)[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1)
+@dataclass(frozen=True, slots=True)
+class CellStructure:
+    """Structure tensors of an image at the cells of the sample grid, row by row.
+
+    They are kept as their mean eigenvalue and what is left of them, grey levels^2 / pixel^2.
+    """
+
+    mean: Float[np.ndarray, "p"]
+    half: Float[np.ndarray, "p"]
+    """Half of xx - yy."""
+    radius: Float[np.ndarray, "p"]
+    """What the eigenvalues are above and below their mean."""
+
+    @property
+    def smaller(self) -> Float[np.ndarray, "p"]:
+        """Smaller eigenvalue."""
+        return self.mean - self.radius
+
+    @property
+    def textured_fraction(self) -> float:
+        """Fraction of the cells that have texture."""
+        return float((self.smaller > MIN_STRUCTURE).mean())
+
+    @property
+    def certainty(self) -> Float[np.ndarray, "p 2"]:
+        """What a match of each cell says along x and along y, as a part of the full weight.
+
+        A point on an edge is known across the edge, hardly along it. The information of a match is
+        that of the structure tensor with each eigenvalue l replaced by min(1, l / SHARP +
+        UNINFORMED); what it says of one coordinate while the other is open is the inverse of its
+        inverse's diagonal. So an upright edge counts in x, a level one in y, a slanted one little
+        in either.
+        """
+        eigenvalues = (self.mean + self.radius, self.smaller)
+        across, along = (np.minimum(1, value / SHARP + UNINFORMED) for value in eigenvalues)
+        in_x = 0.5 + 0.5 * self.half / np.maximum(self.radius, 1e-6)  # squared cosine of across
+        x, y = along + (across - along) * in_x, across + (along - across) * in_x
+        return np.stack([across * along / y, across * along / x], -1)
+
+
+def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> CellStructure:
+    """Structure of an image at the cells of the sample grid."""
+    xx, yy, xy = (p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(grey))
+    half = (xx - yy) / 2
+    return CellStructure((xx + yy) / 2, half, np.sqrt(half * half + xy * xy))
 
 
 def grey_levels(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
     """An RGB image in grey."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def textured_fraction(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Fraction of the sample grid on which an image has texture."""
-    return float((cell_structure(grey) > MIN_STRUCTURE).mean())
-
-
-def cell_certainty(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "p 2"]:
-    """What a match of each cell says along x and along y, as a part of the full weight.
-
-    A point on an edge is known across the edge, hardly along it. The information of a match is that
-    of the structure tensor with each eigenvalue l replaced by min(1, l / SHARP + UNINFORMED); what
-    it says of one coordinate while the other is open is the inverse of its inverse's diagonal. So
-    an upright edge counts in x, a level one in y, a slanted one little in either.
-    """
-    xx, yy, xy = (p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(grey))
-    mean, half = (xx + yy) / 2, (xx - yy) / 2
-    radius = np.sqrt(half * half + xy * xy)
-    across, along = (np.minimum(1, (mean + sign * radius) / SHARP + UNINFORMED) for sign in (1, -1))
-    in_x = 0.5 + 0.5 * half / np.maximum(radius, 1e-6)  # squared cosine of the direction across
-    x, y = along + (across - along) * in_x, across + (along - across) * in_x
-    return np.stack([across * along / y, across * along / x], -1)
-
-
-def smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Smaller eigenvalue of the structure tensor, grey levels^2 / pixel^2."""
-    xx, yy, xy = structure_tensor(grey)
-    return (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
 
 
 def structure_tensor(

@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.threads import opencv_on_one_thread, worker_count
-from geogs.tracking.flow.cell_texture import cell_certainty, textured_fraction
+from geogs.tracking.flow.cell_texture import cell_structure
 from geogs.tracking.flow.flow_operator import Memories
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
@@ -43,7 +43,7 @@ class ClassicalImage:
     textured: float
     """Fraction of the grid that has texture."""
     certainty: Float[np.ndarray, "p 2"]
-    """What matches of the cells say along x and y, see :func:`cell_certainty`."""
+    """What matches of the cells say along x and y, see :class:`CellStructure`."""
 
 
 class _Level:
@@ -107,7 +107,8 @@ class ClassicalFlow:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         even = np.pad(grey, [(0, n % 2) for n in grey.shape], mode="edge")
         half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        return ClassicalImage(grey, half, textured_fraction(grey), cell_certainty(grey))
+        structure = cell_structure(grey)
+        return ClassicalImage(grey, half, structure.textured_fraction, structure.certainty)
 
     def texture(self, encoded: ClassicalImage) -> float:
         return encoded.textured

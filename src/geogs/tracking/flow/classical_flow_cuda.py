@@ -78,7 +78,7 @@ class CudaImage:
 
     data: Float[Tensor, "n"]
     """Grey pyramid, local means of the brightness, what matches of the cells say along x and y (see
-    :func:`~geogs.tracking.flow.cell_texture.cell_certainty`), one after the other."""
+    :func:`~geogs.tracking.flow.cell_texture.CellStructure`), one after the other."""
     textured: Int[Tensor, "1"]
     """Number of cells with structure, int32."""
 

@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.gpu.transfer import to_device, upload
-from geogs.tracking.flow.cell_texture import grey_levels, textured_fraction
+from geogs.tracking.flow.cell_texture import cell_structure, grey_levels
 from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
     CORRELATION_SCALE,
@@ -114,7 +114,9 @@ class DroidFlow:
             hidden, static = self.network.context(shown)
         grey = grey_levels(image)
         kept = upload(grey, self.device)
-        return DroidImage(features[0], hidden[0], static[0], kept, textured_fraction(grey))
+        return DroidImage(
+            features[0], hidden[0], static[0], kept, cell_structure(grey).textured_fraction
+        )
 
     def texture(self, encoded: DroidImage) -> float:
         return encoded.texture

@@ -273,7 +273,5 @@ def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:
         network.load_state_dict(plain)
     except RuntimeError as error:
         said = str(error).partition("\n")[2] or str(error)
-        raise InputError(
-            f"These are not the weights of DROID-SLAM: {in_short(RuntimeError(said))}"
-        ) from error
+        raise InputError(f"These are not the weights of DROID-SLAM: {in_short(said)}") from error
     return network.eval().requires_grad_(False)

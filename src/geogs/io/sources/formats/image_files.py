@@ -53,12 +53,13 @@ class ImageList:
         calibration: Calibration | None,
         poses_by: str | None = None,
         is_capture: bool = False,
+        usual: ImageFile | None = None,
     ) -> None:
-        """What it says of itself is described in :class:`RecordingInfo`."""
+        """What it says of itself is described in :class:`RecordingInfo`; ``usual`` is what
+        :func:`usual_file` gives, where that is known."""
         self.files = files
-        self.usual = usual_file(files)
-        """One of the images of that size; the first if none can be read."""
-        candidates = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in (self.usual, *files))
+        usual = usual or usual_file(files)
+        candidates = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in (usual, *files))
         image = next((image for image in candidates if image is not None), None)
         if image is None:
             raise InputError(f"{name}: none of its {len(files)} images can be read.")
@@ -93,12 +94,14 @@ def open_image_folder(folder: Path) -> ImageList:
     place = _folder_with_images(folder)
     files = in_order_of_time(_images(place))
     calibration = find_calibration(*dict.fromkeys(_folders_of_project(folder, place)))
-    calibration = calibration or calibration_from_exif(usual_file(files).path)
-    return ImageList("images", folder.resolve().name, files, calibration)
+    usual = usual_file(files)
+    calibration = calibration or calibration_from_exif(usual.path)
+    return ImageList("images", folder.resolve().name, files, calibration, usual=usual)
 
 
 def usual_file(files: Sequence[ImageFile]) -> ImageFile:
-    """The first of those images, from all over the list, that have the most frequent size."""
+    """The first of those images, from all over the list, that have the most frequent size; the
+    first of all if none can be read."""
     asked = files[:: max(1, len(files) // _ASKED)]
     sizes = [upright_size(file.path) for file in asked]
     counts = Counter(size for size in sizes if size is not None)
