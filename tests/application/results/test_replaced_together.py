@@ -35,7 +35,6 @@ from geogs.application.run_settings import RunSettings
 from geogs.cli.main import main
 from geogs.config import Config, InputConfig, MeshConfig
 from geogs.errors import OutputError
-from geogs.evaluation.pages.page import HtmlSection
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh, write_splats
@@ -129,7 +128,7 @@ def quick(monkeypatch) -> None:
     monkeypatch.setattr(rescaling, "find_scale", lambda *_: found)
     for module in ("run_page", "evaluation_page"):
         monkeypatch.setattr(
-            f"geogs.evaluation.pages.{module}.model_section", lambda model: HtmlSection("")
+            f"geogs.evaluation.pages.{module}.model_section", lambda model: ("", ())
         )
 
 

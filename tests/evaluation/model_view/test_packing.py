@@ -123,7 +123,7 @@ def test_disks_keep_normal_and_size(model):
 
 
 def test_html_is_safe_and_needs_nothing_else(model):
-    text = model_section(model).html
+    text = model_section(model)[0]
     assert "<one>" not in text  # names of strangers do not become markup
     assert "The MIT License" in text
     for outside in ('src="http', "@import", "fetch(", 'href="http'):

@@ -6,7 +6,6 @@ from importlib.resources import files
 
 from geogs.evaluation.model_view.packed_model import pack, to_json
 from geogs.evaluation.model_view.shown_model import ShownModel
-from geogs.evaluation.pages.page import HtmlSection
 
 SCRIPTS = (
     "unpack.js",
@@ -26,8 +25,9 @@ def _scripts() -> tuple[str, str]:
     return _file("three.min.js"), f"(() => {{\n'use strict';\n{own}\n}})();"
 
 
-def model_section(model: ShownModel) -> HtmlSection:
-    """The model; it needs nothing from elsewhere, and one page holds one of them."""
+def model_section(model: ShownModel) -> tuple[str, tuple[str, str]]:
+    """HTML of the model, and the scripts in it; it needs nothing from elsewhere, and one page holds
+    one of them."""
     scripts = _scripts()
     scene, arrays, images = pack(model)
     notes = " ".join(model.notes)
@@ -41,7 +41,7 @@ def model_section(model: ShownModel) -> HtmlSection:
         _data("model-images", images),
         *(f"<script>{script}</script>" for script in scripts),
     ])  # fmt: skip
-    return HtmlSection(markup, scripts)
+    return markup, scripts
 
 
 def _data(name: str, content: bytes) -> str:

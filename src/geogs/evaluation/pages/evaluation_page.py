@@ -10,6 +10,7 @@ from geogs.evaluation.model_view.model_section import model_section
 from geogs.evaluation.model_view.shown_model import ShownModel
 from geogs.evaluation.pages.page import (
     FiguresSection,
+    HtmlSection,
     PictureSection,
     Section,
     TableSection,
@@ -128,7 +129,7 @@ def write_report(
     numbers = [*error_figures(evaluation), *judged.figures]
     sections: list[Section] = [FiguresSection(said, False, ()) for said in evaluation.doubts]
     sections += [FiguresSection(judged.sentence, judged.is_good, numbers)]
-    sections += [model_section(model)] if model is not None else []
+    sections += [HtmlSection(*model_section(model))] if model is not None else []
     sections += [TableSection(heading, (), rows) for heading, rows in groups(evaluation)]
     sections += [PictureSection(title, file) for title, file in pictures]
     sections += run

@@ -10,6 +10,7 @@ from geogs.evaluation.model_view.model_section import model_section
 from geogs.evaluation.model_view.shown_model import ShownModel
 from geogs.evaluation.pages.page import (
     FiguresSection,
+    HtmlSection,
     PictureSection,
     Section,
     TableSection,
@@ -45,7 +46,7 @@ def write_run_page(
     """
     name = _shown(str, summary.get("source")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
-    head += [model_section(model)] if model is not None else []
+    head += [HtmlSection(*model_section(model))] if model is not None else []
     place = folder if pictures is None else pictures
     shown = [PictureSection(title, place / file) for file, title in PICTURES.items()]
     sections = [*head, *shown, *run_sections(summary)]
