@@ -5,6 +5,7 @@
 # make pytest   the tests of `make test` alone, by WORKERS (2) processes
 # make fuzz     set up, damage files and options at random, FUZZ (1000) times each
 # make format   set up, sort imports, mend what the linter can, format
+# make lock     set up, write requirements.lock anew: after a change of constraints.txt or dependencies
 PYTHON  ?= python3
 VENV    := .venv
 BIN     := $(VENV)/bin
@@ -15,9 +16,10 @@ PIP     := $(BIN)/python -m pip install --quiet
 # What is compiled is kept for the many processes that tests start, whatever the user's shell says.
 PYTEST  := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 TORCH   := 2.13.0
+CUDA    := triton cuda-bindings cuda-toolkit $(patsubst %,nvidia-%,cudnn-cu13 cusparselt-cu13 nccl-cu13 nvshmem-cu13)
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 
-.PHONY: demo quick test test-all pytest fuzz lint kernels format setup clean
+.PHONY: demo quick test test-all pytest fuzz lint kernels format setup lock clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
@@ -55,14 +57,23 @@ format: $(STAMP)
 
 setup: $(STAMP)
 
-# constraints.txt pins every version that was tested. Where there is no NVIDIA driver the CPU build of
-# torch is taken first (from where pip already looks, else from PyTorch's own index).
-$(STAMP): pyproject.toml constraints.txt
+# constraints.txt pins every version that was tested, requirements.lock the SHA-256 of all their files but
+# torch's: where there is no NVIDIA driver its CPU build is taken (from where pip already looks, else from
+# PyTorch's own index), elsewhere PyPI's. No file is built by what is not pinned.
+$(STAMP): pyproject.toml constraints.txt requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geogs needs Python 3.11 or newer; set PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) --require-hashes -r requirements.lock
 	command -v nvidia-smi >/dev/null || $(PIP) 'torch==$(TORCH)+cpu' || $(PIP) --index-url $(TORCH_CPU_INDEX) 'torch==$(TORCH)+cpu'
-	$(PIP) -c constraints.txt -e '.[dev]'
+	$(PIP) -c constraints.txt --no-build-isolation -e '.[dev]'
 	touch $(STAMP)
+
+# For all systems and Pythons that geogs has; what torch's build for CUDA needs is torch's to choose.
+lock: $(STAMP)
+	$(PIP) -c constraints.txt uv
+	printf '%s\n' $(CUDA) | UV_CUSTOM_COMPILE_COMMAND='make lock' $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 \
+	  --generate-hashes --no-annotate --constraint constraints.txt --excludes /dev/stdin \
+	  --no-emit-package torch --extra dev pyproject.toml --output-file requirements.lock
 
 clean:
 	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
