@@ -26,7 +26,7 @@ Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
 
 KEYFRAME_ARRAYS = {
     "image": UInt8[np.ndarray, "h w 3"],
-    "prior normal": Float32[np.ndarray, "h w 3"],
+    "prior normal": Float16[np.ndarray, "h w 3"],
     "sensor depth": Annotated[Float16[np.ndarray, "h w"], UNBOUNDED, Range(0)],
 }
 """The large arrays that a keyframe may have."""
@@ -106,7 +106,7 @@ class Keyframe:
 
     @prior_normal.setter
     def prior_normal(self, normal: Float[Tensor, "h w 3"]) -> None:
-        self.table.arrays.put("prior normal", self.id, normal.cpu().numpy())
+        self.table.arrays.put("prior normal", self.id, normal.half().cpu().numpy())
 
     @property
     def sensor_depth(self) -> Float32[np.ndarray, "h w"] | None:

@@ -7,6 +7,7 @@ segments is the main map, which is shown and written. Source: the atlas of ORB-S
 
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -258,9 +259,15 @@ def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -
         edges, indices = segment.edges, [record.index for record in segment.frames.records]
         if not all(i != j and (j, i) in edges for i, j in edges):
             raise InputError(f"an edge of segment {segment.number} has no way back")
-        if indices != sorted(indices) or _repeats(indices) or indices[-1:] >= [frames]:
+        if not _ascends(indices) or indices[-1:] >= [frames]:
             raise InputError(f"the frames of segment {segment.number} are not in their order")
+        if not _ascends(segment.final):
+            raise InputError(f"the keyframes of segment {segment.number} are not in their order")
 
 
 def _repeats(numbers: list[int]) -> bool:
     return len(set(numbers)) < len(numbers)
+
+
+def _ascends(numbers: list[int]) -> bool:
+    return all(a < b for a, b in pairwise(numbers))

@@ -55,5 +55,9 @@ def check_world(world: World) -> None:
     check_keyframes(keyframes, [segment.keyframes for segment in segments])
     check_segments(world.segments, keyframes, world.frames)
     check_loops(world.loops, keyframes, {segment.number for segment in segments})
-    if not all(i in keyframes for i in world.unmapped):
-        raise InputError("a keyframe is missing")
+    mapped = [] if world.map is None else world.map.mapped
+    waiting = [i for i in world.unmapped if not (world.maps_at_end and i in mapped)]
+    final = {i for segment in segments for i in segment.final}
+    known = [*mapped, *waiting]
+    if not final.issuperset(known) or len(set(known)) < len(known):
+        raise InputError("a keyframe is mapped twice, or while it may still be removed")

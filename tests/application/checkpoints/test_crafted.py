@@ -3,6 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,13 @@ from geogs.application.checkpoints.run_state import RunMetadata, RunState, Saved
 from geogs.application.run_settings import RunSettings
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
+from geogs.priors.monocular_prior import DepthKind, PriorMaps
+from geogs.shutter.rows import CELL
 from geogs.slam import Slam
+from geogs.types import MeasuredPose, SeenRows
+from geogs.world.world import World
 from quick_systems import quick_config
 
 pytestmark = pytest.mark.system
@@ -26,11 +32,30 @@ SEEDS, EACH = range(4), 25
 POSE, K = "world.keyframes.poses.T_cw.1", "world.keyframes.keyframes.1"
 
 
+class FlatPrior:
+    """Sees a wall in every image."""
+
+    def predict(self, image: np.ndarray) -> PriorMaps:
+        normal = torch.tensor([0.0, 0.0, -1.0]).expand(*image.shape[:2], 3)
+        depth = torch.linspace(1, 2, image[..., 0].size).reshape(image.shape[:2])
+        return PriorMaps(DepthKind.AFFINE_DEPTH, depth, normal)
+
+
 @pytest.fixture(scope="module")
 def frames(small_room):
-    """The camera and some frames of a small room."""
-    source = open_source(small_room, InputConfig(stop=18))
-    return source.camera, list(source)
+    """The camera and some frames of a small room: with all that may be known beside the images,
+    but for the depth of every second, of which a prior is asked."""
+    source = open_source(small_room, InputConfig(stop=18, depth="sensor"))
+    T_wc = torch.from_numpy(np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4))
+    camera = source.camera
+    size = [-(-n // CELL) + 2 for n in (camera.height, camera.width)]
+    rows = SeenRows(torch.zeros(*size, 2).half(), torch.zeros(*size).half(), 0.1)
+    known = [
+        replace(f, depth=f.depth if f.index % 4 else None, rows=rows,
+                pose=MeasuredPose(torch.linalg.inv(T_wc[f.index])))
+        for f in source
+    ]  # fmt: skip
+    return camera, known
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +64,14 @@ def begun(frames, once) -> Path:
 
     def run(folder: Path) -> None:
         camera, images = frames
-        slam = Slam(camera, quick_config(pose_iterations=1))
+        slam = system(camera)
         for frame in images:
             slam.process(frame)
         assert len(slam.executor.mapper.table.disks) > 0
+        made = [slam.world.keyframes[i] for i in slam.segments.keyframe_ids]
+        assert all(any(x is not None for x in what) for what in (
+            [k.prior for k in made], [k.measured for k in made], [k.prior_normal for k in made]
+        ))  # fmt: skip
         metadata = RunMetadata(RunSettings(), "cpu", "", None)
         write_checkpoint(checkpoint_folder(folder), RunState(metadata, slam.settled()))
 
@@ -51,7 +80,12 @@ def begun(frames, once) -> Path:
 
 def resumed(output: Path, frames) -> Slam:
     with SavedRun(output).world(torch.device("cpu")) as world:
-        return Slam(frames[0], quick_config(pose_iterations=1), world=world)
+        return system(frames[0], world)
+
+
+def system(camera: Camera, world: World | None = None) -> Slam:
+    config = replace(quick_config(pose_iterations=1), resident_keyframes=2)
+    return Slam(camera, config, prior=FlatPrior(), world=world)
 
 
 def array(name: str, value: float) -> Callable[[Any, dict[str, Tensor]], None]:
@@ -92,6 +126,11 @@ WRONG: dict[str, Callable[[Any, dict[str, Tensor]], object]] = {
     "a segment of nobody": lambda s, _: s["world"]["segments"].update(main=7),
     "an endless table": lambda s, _: keyframe(s).update(id=2**40),
     "keyframes to come": lambda s, _: s["world"]["keyframes"].update(next_id=1),
+    "a keyframe to be mapped again": lambda s, _: segment(s)["final"].clear(),
+    "keyframes mapped twice": lambda s, _: s["world"]["unmapped"].extend(
+        s["world"]["map"]["mapped"]
+    ),
+    "final keyframes in no order": lambda s, _: segment(s)["final"].reverse(),
     "partners of nobody": lambda s, _: s["world"]["map"]["views"][0][1].update(partners=[999]),
 }
 

@@ -51,13 +51,13 @@ class KeyframePriors:
             keyframe.prior = KeyframePrior(maps.kind, values, zero, one, zero)
 
     def _facing(self, normal: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """Normals that face the camera, in half precision; zero instead of those that cannot be."""
+        """Normals that face the camera; zero instead of those that cannot be."""
         away = (normal * self.graph.keyframes.grid.camera.rays()).sum(-1, keepdim=True) >= 0
         known = normal.square().sum(-1, keepdim=True) > 0
         if not self._warned and int((away & known).sum()) > 0.5 * int(known.sum()):
             self._warned = True
             _log.warning("Most prior normals face away from the camera; check their normal_axes.")
-        return torch.where(away, 0.0, normal).half()
+        return torch.where(away, 0.0, normal)
 
     def adjust(self, ids: Sequence[int]) -> None:
         """Joint depth and scale adjustment of those keyframes that have a prior, poses fixed."""
