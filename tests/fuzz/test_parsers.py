@@ -76,13 +76,13 @@ def test_damaged_files_are_read_or_refused_in_a_sentence(name, example, reads):
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CORPUS.iterdir()))
-def test_files_that_once_led_to_something_else(name, example):
-    parser, (folder, good) = PARSERS[name], example(name)
+def test_files_that_once_led_to_something_else(name, example, reads):
+    folder, good = example(name)
     for case in sorted((CORPUS / name).iterdir()):
         file = next(file for file in good if Path(file).suffix == case.suffix)
         (folder / file).write_bytes(case.read_bytes())
         try:
-            read(parser, folder)
+            reads(name, folder)
         finally:
             (folder / file).write_bytes(good[file])
 

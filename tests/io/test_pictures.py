@@ -54,6 +54,15 @@ def test_a_small_file_that_promises_a_large_picture_is_none(tmp_path):
         assert time.process_time() - begin < 10
 
 
+def test_a_part_of_a_png_that_is_longer_than_the_file_gets_no_memory(tmp_path, monkeypatch):
+    path = write_image(tmp_path / "a.png", gradient_image(0))
+    good = path.read_bytes()
+    assert decoded(path, cv2.IMREAD_COLOR).picture is not None
+    path.write_bytes(good[:33] + b"\xa0" + good[34:])  # the length of what follows the header
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it is decoded"))
+    assert decoded(path, cv2.IMREAD_COLOR).picture is None
+
+
 def test_more_pixels_than_are_read_are_told(tmp_path, capfd):
     (tmp_path / "a.png").write_bytes(empty_png(20_000, 20_000))
     with pytest.raises(InputError, match="more than 178 megapixels"):

@@ -27,7 +27,8 @@ _PIXELS_A_BYTE = 10_000
 _ORIENTATION, _QUARTER_TURNED = 0x0112, (5, 6, 7, 8)
 """Entry of the EXIF, and its values for which width and height are exchanged."""
 _HARMLESS = 1 << 24
-"""Pixels that are decoded in no time, whatever the file holds."""
+"""Pixels that are decoded in no time, whatever the file holds; or bytes."""
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
     """The same for what such a file holds, as bytes."""
     if not len(data):
         return Decoded(None)
-    if _promises_too_much(data):
+    if _promises_too_much(data) or _has_an_endless_part(data):
         return Decoded(None)
     picture, noise = _decode(data, flags, alone=False)
     if noise:  # of this one, or of one that another thread decodes
@@ -139,6 +140,20 @@ def _promises_too_much(data: np.ndarray) -> bool:
     except Exception:  # for the decoder to say
         return False
     return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
+
+
+def _has_an_endless_part(data: np.ndarray) -> bool:
+    """Whether a part of a PNG is said to be far longer than the file, for which OpenCV makes room
+    of up to 4 GiB."""
+    file, at = memoryview(data), len(_PNG)
+    if file[:at] != _PNG:
+        return False
+    while at + 4 <= len(file):
+        length = int.from_bytes(file[at : at + 4], "big")
+        if length > max(_HARMLESS, len(file) - at):
+            return True
+        at += 12 + length  # with its length, its name and its checksum
+    return False
 
 
 def _is_cut_off(data: np.ndarray) -> bool:
