@@ -145,7 +145,7 @@ def _promises_too_much(data: np.ndarray) -> bool:
 def _has_an_endless_part(data: np.ndarray) -> bool:
     """Whether a part of a PNG is said to be far longer than the file, for which OpenCV makes room
     of up to 4 GiB."""
-    file, at = memoryview(data), len(_PNG)
+    file, at = data.data, len(_PNG)
     if file[:at] != _PNG:
         return False
     while at + 4 <= len(file):
