@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM ask to stop once and quit the second time; what fails says how to go on."""
+"""Signals ask to stop once and quit the second time; what fails says how to go on."""
 
 import os
 import signal
@@ -15,19 +15,31 @@ from geogs.application.run import continued
 from geogs.application.run_settings import RunSettings
 from geogs.errors import DeviceError, InputError
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 WAY = " geogs run --resume out goes on."
 
 
-@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("first", SIGNALS)
+@pytest.mark.parametrize("second", SIGNALS)
 def test_the_first_signal_asks_and_the_second_quits(first, second):
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    before = [signal.getsignal(n) for n in SIGNALS]
     with Interruption() as stop:
         os.kill(os.getpid(), first)
         assert stop.requested
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), second)
-    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+    assert [signal.getsignal(n) for n in SIGNALS] == before
+
+
+def test_a_signal_that_is_ignored_asks_for_nothing():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interruption() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.requested
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_the_second_signal_names_the_way_on():

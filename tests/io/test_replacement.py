@@ -153,6 +153,12 @@ def test_a_full_disk_leaves_all_as_it_was(tmp_path, what):
     assert NEW.items() <= texts(tmp_path).items()
 
 
+def test_what_cannot_be_written_is_named_as_it_would_be(tmp_path):
+    with full_disk(tmp_path, 2), pytest.raises(OutputError) as caught:
+        write(tmp_path, NEW)
+    assert str(caught.value).startswith(f"{tmp_path / 'mesh.ply'} cannot be written (No space")
+
+
 @pytest.mark.parametrize("what", ["result", "part", "beside"])
 def test_a_process_that_is_killed_leaves_old_or_new_to_the_next(tmp_path, what):
     folder = tmp_path / "out"

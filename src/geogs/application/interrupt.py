@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request: work stops at the next safe point and keeps what there is."""
+"""Signals as a request to stop: work does at the next safe point, and keeps what there is."""
 
 import os
 import signal
@@ -6,10 +6,16 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""Those that ask to stop: of a terminal, and of systems and schedulers."""
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+"""Those that ask to stop: of a terminal, of systems and schedulers, of a terminal that is gone."""
 _AGAIN = 0.02
 """Seconds until it is looked again whether modules are still being imported."""
+
+
+def asking() -> list[signal.Signals]:
+    """Those of them that nobody has asked to be ignored, as nohup and shells in scripts do."""
+    return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -69,7 +75,8 @@ class Stop:
 class Interruption(Stop):
     """While it is entered, the first Ctrl-C only sets ``requested``; the second quits.
 
-    SIGTERM, by which systems and schedulers end programs, is the same.
+    SIGTERM, by which systems and schedulers end programs, is the same, and so is SIGHUP, which a
+    terminal leaves behind. What is ignored stays so.
     """
 
     def __enter__(self) -> "Interruption":
@@ -77,7 +84,7 @@ class Interruption(Stop):
         # Python takes signals in the main thread alone.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
-            self._before = {n: signal.signal(n, self._handle) for n in SIGNALS}
+            self._before = {n: signal.signal(n, self._handle) for n in asking()}
         return self
 
     def __exit__(self, *exception: object) -> None:

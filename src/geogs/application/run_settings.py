@@ -52,7 +52,8 @@ class RunSettings(Settings):
     frames as --offline does (pip install 'geogs[photos]'), and keep what is better."""
     online_results: bool = False
     """Also write trajectory and mesh as they are after the stream, to online/, and after the final
-    bundle adjustment and the map's update, to adjusted/, where a refinement follows."""
+    bundle adjustment and the map's update, to adjusted/, where a refinement follows; all appear
+    at the run's end, with the result."""
     depth_mesh: bool = False
     """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
     keyframe_images: bool = True

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
-from geogs.application.interrupt import SIGNALS, interrupt
+from geogs.application.interrupt import asking, interrupt
 from geogs.cli.streams import make_unbreakable
 
 
@@ -23,8 +23,8 @@ def take_over() -> None:
     wait for each other, for matrices that are small here: the search for a readout took eight times
     as long on 64 cores as on 16, and on two a third longer than with one thread.
 
-    SIGTERM, by which systems and schedulers end programs, is taken as Ctrl-C: results so far are
-    kept. Streams that are closed, full or gone end no command.
+    SIGTERM, by which systems and schedulers end programs, and SIGHUP are taken as Ctrl-C: results
+    so far are kept. Streams that are closed, full or gone end no command.
     """
     _handle_signals(interrupt)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -61,6 +61,5 @@ def leave(code: int) -> None:
 
 def _handle_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
     if threading.current_thread() is threading.main_thread():
-        for number in SIGNALS:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup asks for
-                signal.signal(number, handler)
+        for number in asking():
+            signal.signal(number, handler)

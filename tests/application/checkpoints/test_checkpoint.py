@@ -182,6 +182,24 @@ def _fail_at(patch: pytest.MonkeyPatch, call: str, nth: int) -> None:
     patch.setattr(os, call, failing)
 
 
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_full_disk_at_the_first_state_leaves_nothing(tmp_path, monkeypatch, call):
+    _fail_at(monkeypatch, call, 0)
+    with pytest.raises(OutputError, match="No space left"):
+        write_checkpoint(checkpoint_folder(tmp_path), state(1))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("writes", [False, True])
+def test_what_a_kill_at_the_first_state_leaves_goes_with_the_next_result(tmp_path, writes):
+    (tmp_path / "checkpoint").mkdir()
+    (tmp_path / "checkpoint" / ".manifest.json.part").write_text("{")
+    if writes:
+        write_checkpoint(checkpoint_folder(tmp_path), state(1))
+    checkpoint_folder(tmp_path).remove()
+    assert list(tmp_path.iterdir()) == []
+
+
 def manifest_number(path: Path) -> int:
     return json.loads(path.read_text())["number"] if path.exists() else 0
 

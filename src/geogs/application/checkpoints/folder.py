@@ -186,8 +186,10 @@ class CheckpointFolder:
             if manifest is not None:
                 self._delete([*manifest.files, _UNFINISHED])
                 self._delete([MANIFEST])
-                if manifest.is_our_folder:
-                    self.path.rmdir()
+            is_ours = self._is_just_begun() if manifest is None else manifest.is_our_folder
+            if is_ours:
+                self._delete([_UNFINISHED])
+                self.path.rmdir()
 
     def _last(self) -> Manifest:
         """The manifest so far; a new one, in a folder that there is then, if there is none."""
@@ -196,7 +198,7 @@ class CheckpointFolder:
             self.path.mkdir()
             is_our_folder = True
         except FileExistsError:
-            is_our_folder = False
+            is_our_folder = self._is_just_begun()
         last = self.manifest()
         if last is None:
             return Manifest(FORMAT, __version__, "", is_our_folder, 0, {}, [])
@@ -204,17 +206,29 @@ class CheckpointFolder:
             there = set(os.listdir(folder))
         return replace(last, files=[name for name in last.files if name in there])
 
+    def _is_just_begun(self) -> bool:
+        """Whether there is at most what a process leaves that is killed at its first manifest."""
+        with self._opened() as folder:
+            return {*os.listdir(folder)} <= {_UNFINISHED}
+
     def _write_manifest(self, manifest: Manifest) -> None:
         values = pack(Manifest, manifest).values
         said = _json(values)
         signed = {"checksum": Sum.of(said).sha256, "seal": seal(said)}
-        with self._open(_UNFINISHED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as file:
-            file.write(_json(values | signed))
-            file.flush()
-            os.fsync(file.fileno())
-        with self._opened() as folder:
-            os.replace(_UNFINISHED, MANIFEST, src_dir_fd=folder, dst_dir_fd=folder)
-            os.fsync(folder)
+        try:
+            with self._open(_UNFINISHED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as file:
+                file.write(_json(values | signed))
+                file.flush()
+                os.fsync(file.fileno())
+            with self._opened() as folder:
+                os.replace(_UNFINISHED, MANIFEST, src_dir_fd=folder, dst_dir_fd=folder)
+                os.fsync(folder)
+        except OSError:
+            self._delete([_UNFINISHED])
+            with suppress(OSError):
+                if manifest.is_our_folder:
+                    self.path.rmdir()  # it holds more, unless that was the first manifest
+            raise
 
     def _delete(self, names: Collection[str]) -> None:
         with self._opened() as folder:

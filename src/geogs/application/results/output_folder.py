@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from geogs.documents import read_json
+from geogs.documents import expanded, read_json
 from geogs.errors import InputError, OutputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.replacement import recover
@@ -61,15 +61,23 @@ def _is_locked(file: int, path: Path) -> bool:
 def claimed(folder: Path) -> Iterator[Path]:
     """The folder of a result, made where there is none; inside, nobody else writes there.
 
-    What a command left there that was cut off is completed or undone.
+    What a command left there that was cut off is completed or undone. Folders that are made for it
+    go again where nothing came into them.
 
     Raises:
         OutputError: it cannot be made or written, or another process writes there.
     """
-    output = prepare_output_folder(folder)
-    with only_writer(output):
-        recover(output)
-        yield output
+    folder = expanded(folder)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        output = prepare_output_folder(folder)
+        with only_writer(output):
+            recover(output)
+            yield output
+    finally:
+        with suppress(OSError):
+            for path in made:
+                path.rmdir()
 
 
 def free_folder(wanted: Path, fingerprint: str) -> Path:

@@ -27,6 +27,7 @@ them, so that one that was made elsewhere and copied here is not taken for one o
 """
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -70,9 +71,11 @@ def replaced(folder: Path, what: Extent) -> Iterator[Path]:
         new = _begun(place)
     try:
         yield folder / new
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError), Directory.opened(folder) as place:
             place.delete_all(new)
+        if isinstance(error, OutputError):  # where it was to be, not where it lay meanwhile
+            raise OutputError(str(error).replace(new + os.sep, "")) from error
         raise
     with _sentence(folder), Directory.opened(folder) as place:
         _put_in_place(place, _committed(place, new, what))
