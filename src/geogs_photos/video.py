@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from geogs.application.photos import PlacedVideo, stretch_length
+from geogs.application.chosen_frames import ChosenFrames
+from geogs.application.photos import PlacedVideo
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
-from geogs.io.sources.frame_source import Source
-from geogs.stopwatch import Stopwatch
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
@@ -23,41 +22,16 @@ from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.poses import Progress, structure_of
 from geogs_photos.pycolmap_library import load_colmap
-from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames
 from geogs_photos.upright import upright_rotation
 
 NEXT = 6
 """Chosen frames after each that it is matched with in any case."""
 
 
-def place_video(video: Source, seed: int, report: Progress, stopwatch: Stopwatch) -> PlacedVideo:
-    """Choose the sharp frames of a video and find where they were taken.
-
-    Its camera stays as it is where its calibration is given. What is wanted of it, and what it
-    raises: ``geogs.application.photos.place_video``.
-    """
-    with stopwatch("choosing frames"):
-        every = stretch_length(video.fps, video.length)
-        chosen = sharpest_frames(video, every)
-    with stopwatch("structure from motion"):
-        return place_frames(chosen, video.camera, not video.is_calibration_open, seed, report)
-
-
 def place_frames(
     chosen: ChosenFrames, camera: Camera, is_known: bool, seed: int, progress: Progress
 ) -> PlacedVideo:
-    """Find where frames of one camera were taken; of the largest part that hangs together.
-
-    Args:
-        chosen: the frames.
-        camera: of the frames; where the search begins if it is not known.
-        is_known: whether the camera is to stay as it is.
-        seed: of the random choices.
-        progress: follows the work.
-
-    Raises:
-        InputError: pycolmap is missing, or fewer than three frames hang together.
-    """
+    """As asked of it in ``geogs.application.photos.place_frames``."""
     colmap = load_colmap()
     begin = Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,

@@ -47,6 +47,9 @@ def test_another_way_is_wanted_where_frames_are_missing_or_nothing_is_to_be_reli
         (replace(LOST, lost=0.28), LOST, False),  # hardly more
         (replace(GOOD, position=0.08), LOST, False),  # more, but nobody knows where
         (replace(GOOD, depth=0.5), LOST, False),
+        (replace(LOST, depth=0.35), replace(LOST, lost=0.7, depth=0.38), True),  # as well, more
+        (replace(LOST, depth=0.4), replace(LOST, lost=0.7, depth=0.38), False),
+        (replace(LOST, depth=0.6), TURNED, False),  # no shape
         (replace(GOOD, position=np.nan), LOST, False),
     ],
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from geogs.application.chosen_frames import ChosenFrames
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
@@ -13,7 +14,6 @@ from geogs_photos import fragments, incremental_mapping, video
 from geogs_photos.database import SharedCamera
 from geogs_photos.fragments import rejoined
 from geogs_photos.incremental_mapping import placed_images
-from geogs_photos.sharp_frames import ChosenFrames
 from posed_layouts import render_room
 
 CAMERA = SharedCamera(Calibration(100.0, 100.0, 50.0, 40.0), is_known=False)

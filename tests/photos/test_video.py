@@ -4,37 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.photos import PlacedVideo, stretch_length
+from geogs.application.chosen_frames import ChosenFrames
+from geogs.application.photos import PlacedVideo
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
 from geogs_photos.localise import Localiser, matches_to_points
 from geogs_photos.photo_features import find_features
-from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, sharpness
 from geogs_photos.video import place_frames
 from lit_rooms import lit_room
 from posed_layouts import render_room
-
-
-def test_of_each_stretch_the_sharpest_frame_is_taken():
-    import cv2
-
-    random = np.random.default_rng(0)
-    sharp = random.integers(0, 255, (40, 50, 3), dtype=np.uint8)
-    blurs = [2.0, 0.0, 1.0, 1.5, 3.0, 0.5, 2.5]
-    images = [cv2.GaussianBlur(sharp, (0, 0), b) if b else sharp for b in blurs]
-    frames = [Frame(k, k / 10, image) for k, image in enumerate(images)]
-    chosen = sharpest_frames(frames, 3)
-    assert [frame.index for frame in chosen.frames] == [1, 5, 6]
-    np.testing.assert_allclose(chosen.timestamps, np.arange(7) / 10)
-    assert sharpness(images[1]) > sharpness(images[5]) > sharpness(images[0])
-
-
-@pytest.mark.parametrize(
-    ("fps", "length", "every"),
-    [(30.0, None, 10), (30.0, 1000, 10), (30.0, 100, 2), (30.0, 10_000, 40), (5.0, 90, 1)],
-)
-def test_about_three_frames_a_second_but_neither_few_nor_very_many(fps, length, every):
-    assert stretch_length(fps, length) == every
 
 
 def test_a_point_seen_twice_does_not_compete_with_itself():

@@ -10,7 +10,7 @@ import torch
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.photos import has_pycolmap, seconds_to_place
+from geogs.application.photos import has_pycolmap
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
@@ -88,7 +88,12 @@ class TrackedOrPlaced(Work):
         if why_not:
             say(f"note: Structure from motion, which may place more frames, is left out: {why_not}")
             return None
-        seconds = seconds_to_place(self._opened.fps, self.scene.frames)
+        from geogs.application.offline import PlacedOffline
+
+        placed = PlacedOffline(settings.config, self._video(), self._tracked.scene.stopwatch)
+        if not self._succeeds(driver, lambda: placed.choose(driver)):
+            return None
+        seconds = placed.seconds_to_place
         if not has_pycolmap():
             say(
                 "warning: structure from motion may place more frames: pip install 'geogs[photos]' "
@@ -100,10 +105,6 @@ class TrackedOrPlaced(Work):
             f"{_in_words(tracked)} Trying structure from motion, about {duration(seconds)}; Ctrl-C "
             "keeps what was tracked."
         )
-        from geogs.application.offline import PlacedOffline
-
-        stopwatch = self._tracked.scene.stopwatch
-        placed = PlacedOffline(settings.config, self._video(), stopwatch)
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
         found = placed.judged()
@@ -154,10 +155,13 @@ def is_wanted(tracked: Verdict | None) -> bool:
 def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
     """Whether frames that were placed by structure from motion are to be taken.
 
-    Their places and depths have to be well known, and they clearly more, or as many and to be
-    relied on where what was tracked is not.
+    Their places and depths have to be well known, or no worse than those that were tracked, and
+    they clearly more, or as many and to be relied on where what was tracked is not.
     """
-    if not (placed.position <= MAX_POSITION_DEVIATION and placed.depth <= MAX_DEPTH_DEVIATION):
+    position, depth = MAX_POSITION_DEVIATION, MAX_DEPTH_DEVIATION
+    if tracked is not None:
+        position, depth = max(position, tracked.position), max(depth, tracked.depth)
+    if not (placed.position <= position and placed.depth <= depth and placed.has_shape):
         return False
     more = _placed_part(placed) - _placed_part(tracked)
     is_relied_on = tracked is not None and tracked.is_reliable

@@ -8,10 +8,12 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
+from geogs.application.chosen_frames import ChosenFrames, choose_frames
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.photos import PlacedVideo, localiser, place_video
+from geogs.application.photos import PlacedVideo, localiser, place_frames, seconds_to_place
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_preset
+from geogs.evaluation.duration import duration
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
@@ -41,6 +43,7 @@ class PlacedOffline(Work):
         self._config = replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
         self.source = video
         self._stopwatch = stopwatch or Stopwatch()
+        self._chosen: ChosenFrames | None = None
 
     @property
     def stopwatch(self) -> Stopwatch:
@@ -54,18 +57,40 @@ class PlacedOffline(Work):
             InputError: pycolmap is missing, or the frames do not tell where they were taken.
             KeyboardInterrupt: it was stopped before there was a map.
         """
+        self.choose(driver)
+        driver.progress.write(
+            f"Finding where they were taken takes about {duration(self.seconds_to_place)}."
+        )
         self.place(driver)
         return self.map(driver, checkpoint)
 
+    def choose(self, driver: Driver) -> None:
+        """Choose the frames to be placed first. Raises KeyboardInterrupt if it was stopped."""
+        video = self.source
+        with self._stopwatch("choosing frames"):
+            self._chosen = choose_frames(video, video.fps, video.length, driver.report)
+
+    @property
+    def seconds_to_place(self) -> float:
+        """About how long :meth:`place` takes, once frames have been chosen."""
+        chosen = self._chosen
+        assert chosen is not None, "no frames have been chosen"
+        return seconds_to_place(len(chosen.frames), len(chosen.timestamps))
+
     def place(self, driver: Driver) -> None:
-        """Poses of the sharp frames by structure from motion, of the others against their points.
+        """Poses of the chosen frames by structure from motion, of the others against their points.
 
         Raises:
             InputError: pycolmap is missing, or the frames do not tell where they were taken.
             KeyboardInterrupt: it was stopped.
         """
-        config = self._config
-        placed = place_video(self.source, config.seed, driver.report, self._stopwatch)
+        config, video, chosen = self._config, self.source, self._chosen
+        assert chosen is not None, "no frames have been chosen"
+        self._chosen = None  # it takes much memory
+        with self._stopwatch("structure from motion"):
+            is_known = not video.is_calibration_open
+            placed = place_frames(chosen, video.camera, is_known, config.seed, driver.report)
+        del chosen
         driver.progress.write(
             f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "
             f"{placed.error:.2f} pixels from where they were seen."

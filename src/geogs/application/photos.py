@@ -1,7 +1,6 @@
 """Structure from motion of photographs and of videos, as another package registers it."""
 
 import importlib.util
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -11,30 +10,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from geogs.application.chosen_frames import ChosenFrames
 from geogs.application.interrupt import Stop
 from geogs.application.run_progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.stopwatch import StageProgress, Stopwatch
+from geogs.stopwatch import StageProgress
 from geogs.threads import worker_count
 from geogs.types import Frame
 
 GROUP = "geogs.photos"
-"""Entry points: ``open_photographs``, ``place_video`` and ``Localiser``, as used below."""
+"""Entry points: ``open_photographs``, ``place_frames`` and ``Localiser``, as used below."""
 
 Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
 
-SECONDS = 0.33
-"""Time of a video from which structure from motion is given one frame."""
-SPARSE = 6.0
-"""Frames a second up to which it is given all: neighbours share little enough as it is."""
-FEWEST, MOST = 40, 250
-"""Frames that it is given of a video whose length is known, at least and at most."""
 SECONDS_PER_FRAME = 2.5
 """Of one core, to find where such a frame was taken: about 0.15 for features, 0.2 to choose
 pairs, 1 to match some 22 of them and 0.6 to put all together (50 frames of 512 pixels, and 90 of
@@ -76,18 +69,10 @@ class PlacedVideo:
         return np.unique(np.concatenate(self.positions), axis=0)
 
 
-def stretch_length(fps: float, length: int | None) -> int:
-    """Frames of a video of which structure from motion is given one."""
-    every = max(1, round(SECONDS * fps)) if fps > SPARSE else 1
-    if length is not None:
-        every = max(math.ceil(length / MOST), min(every, max(1, length // FEWEST)))
-    return every
-
-
-def seconds_to_place(fps: float, length: int) -> float:
-    """About how long it takes to find where the frames of a video were taken."""
-    given = length / stretch_length(fps, length)
-    core_seconds = SECONDS_PER_FRAME * given + SECONDS_PER_OTHER * (length - given)
+def seconds_to_place(chosen: int, length: int) -> float:
+    """About how long it takes to find where the frames of a video were taken, of which so many are
+    given to structure from motion."""
+    core_seconds = SECONDS_PER_FRAME * chosen + SECONDS_PER_OTHER * (length - chosen)
     return core_seconds / worker_count()
 
 
@@ -96,24 +81,23 @@ def has_pycolmap() -> bool:
     return importlib.util.find_spec("pycolmap") is not None
 
 
-def place_video(
-    video: Source,
-    seed: int,
-    report: StageProgress,
-    stopwatch: Stopwatch,
+def place_frames(
+    chosen: ChosenFrames, camera: Camera, is_known: bool, seed: int, report: StageProgress
 ) -> PlacedVideo:
-    """Choose the sharp frames of a video and find where they were taken.
+    """Find where frames of one camera were taken; of the largest part that hangs together.
 
     Args:
-        video: read once; its camera stays as it is where its calibration is given.
+        chosen: the frames.
+        camera: of the frames; where the search begins if it is not known.
+        is_known: whether the camera is to stay as it is.
         seed: of the random choices.
         report: follows the work; what it raises ends it.
-        stopwatch: gets the seconds.
 
     Raises:
         InputError: pycolmap is missing, or fewer than three frames hang together.
     """
-    placed: PlacedVideo = _registered("place_video")(video, seed, report, stopwatch)
+    place = _registered("place_frames")
+    placed: PlacedVideo = place(chosen, camera, is_known, seed, report)
     return placed
 
 
