@@ -203,7 +203,7 @@ def archive(draw: st.DrawFn, data: bytes) -> bytes:
                 arrays[draw(st.sampled_from(("world_mat_99", "world_mat_x", "é")))] = array
             case _:
                 odd = st.sampled_from((np.nan, np.inf, 1e300, 1e-300, 0.0, -1.0))
-                array = array.astype(np.float64)
+                array = array.real.astype(np.float64)
                 if array.size:
                     array.flat[draw(st.integers(0, array.size - 1))] = draw(odd)
                 arrays[name] = array

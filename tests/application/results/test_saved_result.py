@@ -88,6 +88,10 @@ def test_lost_frames_are_known_from_the_table(tmp_path):
     (folder / "trajectory_uncertainty.csv").write_text("\n".join(["timestamp,state", *rows]))
     found = geogs.load_result(folder).trajectory
     assert found.tracked.tolist() == [True, False, True, True, True]
+    for others in ([], ["77.5,tracked,1,1,1"], [row.replace("tracked", "lost") for row in rows]):
+        (folder / "trajectory_uncertainty.csv").write_text("\n".join(["timestamp,state", *others]))
+        with pytest.raises(InputError, match="no tracked frame of trajectory.tum; leave it out"):
+            _ = geogs.load_result(folder).trajectory
 
 
 def test_frames_without_a_place_come_back_between_the_others(tmp_path):

@@ -49,7 +49,7 @@ def test_depths_of_replica_have_the_scale_of_their_camera(tmp_path):
     np.testing.assert_allclose(second.depth.metres(), ramp(2000) / 2000, rtol=1e-3)
     camera["scale"] = 0
     (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    with pytest.raises(InputError, match="scale of the depths is 0"):
+    with pytest.raises(InputError, match="scale of the depths is no number"):
         open_source(tmp_path, InputConfig())
 
 

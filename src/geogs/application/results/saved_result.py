@@ -83,6 +83,8 @@ class SavedResult:
         known = [T_cw.get(t) if state == "tracked" else None for t, state, _ in frames]
         turned = [T_cw.get(t) if state == "orientation only" else None for t, state, _ in frames]
         only = [None if T is None else T[:3, :3] for T in turned]
+        if not any(T is not None for T in known):
+            raise InputError(f"{table} names no tracked frame of trajectory.tum; leave it out.")
         return bridged(np.array([t for t, _, _ in frames]), known, only)
 
     @cached_property

@@ -64,7 +64,7 @@ def _units_per_metre(scene: Path) -> float:
         camera = document.get("camera") if isinstance(document, dict) else None
         scale = camera.get("scale", _PER_METRE) if isinstance(camera, dict) else _PER_METRE
         if type(scale) not in (int, float) or not 0 < scale < 1e9:
-            raise InputError(f"{file}: the scale of the depths is {str(scale)[:40]}, not a number.")
+            raise InputError(f"{file}: the scale of the depths is no number above 0; correct it.")
         return float(scale)
     return _PER_METRE
 
