@@ -49,7 +49,10 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
 EVERY = 1 if os.environ.get("GEOGS_FUZZ") else 10
 """Only every so many-th value of an option is tried, others of the next one; by `make fuzz` all."""
 
-TEXTS = ("nan", "inf", "-1e400", "x", "", "9" * 5000, "0x10", "none")
+TEXTS = (
+    "nan", "inf", "-1e400", "1e-300", "-1e-300", "1e300", "-1", "x", "", "9" * 5000, "0x10", "none",
+    "\ud800", "\u202e", "a\nb", "\0", "nan,nan",
+)  # fmt: skip
 
 
 def values(leaf: Leaf) -> set[str]:
