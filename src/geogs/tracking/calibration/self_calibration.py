@@ -14,7 +14,8 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
 from geogs.tracking.calibration.stretch import Report, Stretch
-from geogs.tracking.calibration.view_gatherer import ViewGatherer
+from geogs.tracking.calibration.view_gatherer import ViewGatherer, distant_flows
+from geogs.tracking.calibration.view_graph import view_graph_estimate
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
@@ -60,7 +61,8 @@ def self_calibrate(
 
     Aspect and principal point of ``camera`` are believed, its focal length is only one of several
     to start from. Flow is measured by the operator without a network. Stretch after stretch of the
-    video is used until all together are confident. ``report`` is called with the fraction done;
+    video is used until all together are confident; where none of them tells, the epipolar geometry
+    of distant pairs of their views is asked. ``report`` is called with the fraction done;
     what it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black
     where ``black_is_masked``.
     """
@@ -70,17 +72,24 @@ def self_calibrate(
     estimates: list[Estimate] = []
     failure = ""
     for n in range(STRETCHES):
-        found = _ask(Stretch(grid, operator, gatherer, radial, _part_of(report, n)))
-        if isinstance(found, Estimate):
-            estimates.append(found)
+        said = _ask(Stretch(grid, operator, gatherer, radial, _part_of(report, n)))
+        if isinstance(said, Estimate):
+            estimates.append(said)
         else:
-            failure = failure or found
+            failure = failure or said
         if gatherer.is_over or (estimates and joined(estimates).deviation < CONFIDENT):
             break
-    if not estimates:
+    found = joined(estimates) if estimates else None
+    if found is None or not found.deviation < UNRELIABLE:
+        asked = _part_of(report, STRETCHES)
+        flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
+        by_pairs = view_graph_estimate(camera, flows)
+        if by_pairs is not None and by_pairs.deviation < UNRELIABLE:
+            found = by_pairs
+    if found is None:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
-    return _verdict(camera, radial, joined(estimates), gatherer.frames)
+    return _verdict(camera, radial, found, gatherer.frames)
 
 
 def _ask(stretch: Stretch) -> Estimate | str:
