@@ -18,6 +18,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.intrinsics_file import camera_of
+from geogs.limits import POSITIVE, RIGID, holds
 from geogs.types import MapSnapshot
 
 FORMAT_VERSION = 1
@@ -211,13 +212,17 @@ def _views(file: MapFile) -> MapViews:
     ids, times, T_cw, masked = (tensors[f"keyframe_{name}"] for name in names)
     if not times.shape == masked.shape == ids.shape or T_cw.shape != (*ids.shape, 4, 4):
         raise ValueError("its keyframes differ in number")
+    origin, unit = np.array(said["origin"], np.float64).reshape(3), float(said["unit"])
+    numbers = (((RIGID,), T_cw), ((), times), ((), origin), ((POSITIVE,), unit))
+    if not all(holds(marks, value) for marks, value in numbers):
+        raise ValueError("a pose is none, or a number is not finite")
     return MapViews(
         camera=camera_of(said["camera"]),
         render_camera=camera_of(said["render_camera"]),
         min_alpha=float(said["min_alpha"]),
         max_spread=float(said["max_spread"]),
-        origin=np.array(said["origin"], np.float64).reshape(3),
-        unit=float(said["unit"]),
+        origin=origin,
+        unit=unit,
         disks=MapSnapshot(position, disks.quaternion, scale, disks.opacity),
         keyframe_id=ids.long().numpy(),
         timestamp=times.double().numpy(),
