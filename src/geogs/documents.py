@@ -33,7 +33,10 @@ UNUSABLE = (
 
 def expanded(path: str | Path) -> Path:
     """The path with ~ as the folder of the user; as it is where there is no such."""
-    return Path(os.path.expanduser(path))
+    try:
+        return Path(os.path.expanduser(path))
+    except ValueError:  # a zero byte in the name of a user
+        return Path(path)
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
