@@ -6,7 +6,6 @@ in many containers, it raises an error.
 
 import os
 import stat
-import tempfile
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -38,6 +37,8 @@ def temporary_folder() -> Path:
 
     Who can write where kernels are kept can have programs run.
     """
+    import tempfile  # a tenth of the time of ``geogs --version``, and seldom needed
+
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(tempfile.gettempdir()) / f"geogs-kernels-{user}"
     try:

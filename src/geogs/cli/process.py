@@ -4,7 +4,6 @@ A program that imports geogs keeps its own state: none of this is done for it.
 """
 
 import atexit
-import logging
 import os
 import signal
 import sys
@@ -36,6 +35,8 @@ def show_warnings() -> None:
 
     A log that can no longer be written, as on a full disk, ends nothing and says nothing.
     """
+    import logging
+
     logging.raiseExceptions = False
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("warning: %(message)s"))
