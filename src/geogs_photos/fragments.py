@@ -7,14 +7,26 @@ the largest part, which short parts cannot tell, and mapped incrementally.
 """
 
 import shutil
+from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
 from geogs_photos.database import SharedCamera
-from geogs_photos.incremental_mapping import largest_first, placed_images, put_together
+from geogs_photos.incremental_mapping import (
+    LEAST_POINTS,
+    largest_first,
+    placed_images,
+    put_together,
+)
 from geogs_photos.pycolmap_library import load_colmap
 
+LEAST_VIEWS = 3
+"""Pictures that see a point which passes the scale on from one to another."""
 WHOLE = 0.9
 """Part of the frames that one reconstruction has to hold for nothing else to be tried."""
 
@@ -39,18 +51,44 @@ def rejoined(
         threads: to compute with.
         progress: called with a stage and its finished part; what it raises ends the work.
     """
-    best = list(parts)
+    best = [firmly_joined(part) for part in parts]
     is_known = all(camera.is_known for camera in cameras)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
-        best = max(best, _globally(database, is_known, seed, threads), key=_placed)
+        once = _globally(database, is_known, seed, threads)
+        best = max(best, [firmly_joined(part) for part in once], key=_placed)
         progress("finding poses globally", 1.0)
     if best and _placed(best) < WHOLE * count and not is_known:
         again = _with_camera_of(
             best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
         )
-        best = max(best, again, key=_placed)
+        best = max(best, [firmly_joined(part) for part in again], key=_placed)
     return best
+
+
+def firmly_joined(model: Any) -> Any:
+    """The largest part of a reconstruction whose scale is one; the other pictures lose their poses.
+
+    Between two pictures scale is passed on by points that a third one sees as well. Where only a
+    few such points join two parts, how large and how far one is as seen from the other is made up.
+    """
+    shared: Counter[tuple[int, int]] = Counter()
+    for point in model.points3D.values():
+        seen_by = sorted({element.image_id for element in point.track.elements})
+        if len(seen_by) >= LEAST_VIEWS:
+            shared.update(combinations(seen_by, 2))
+    images = sorted(image.image_id for image in model.images.values() if image.has_pose)
+    place = {number: k for k, number in enumerate(images)}
+    joined = [(place[a], place[b]) for (a, b), count in shared.items() if count >= LEAST_POINTS]
+    rows, columns = ([pair[k] for pair in joined] for k in (0, 1))
+    graph = coo_array(([1] * len(joined), (rows, columns)), shape=(len(images), len(images)))
+    _, part = connected_components(graph, directed=False)
+    largest = Counter(part.tolist()).most_common(1)[0][0] if len(images) else 0
+    for number, own in zip(images, part.tolist(), strict=True):
+        if own != largest:
+            model.deregister_frame(model.images[number].frame_id)
+    model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
+    return model
 
 
 def _placed(parts: Sequence[Any]) -> int:

@@ -1,7 +1,10 @@
 """Ways that are tried where structure from motion of a video falls into parts."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
 from geogs_photos import fragments, incremental_mapping, video
 from geogs_photos.database import SharedCamera
-from geogs_photos.fragments import rejoined
+from geogs_photos.fragments import firmly_joined, rejoined
 from geogs_photos.incremental_mapping import placed_images
 from posed_layouts import render_room
 
@@ -60,12 +63,55 @@ def test_of_three_ways_the_one_that_puts_most_into_one(
 
         return way
 
+    monkeypatch.setattr(fragments, "firmly_joined", lambda part: part)
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
     parts = [Part(n) for n in first]
     found = rejoined(parts, Path("none"), 100, [CAMERA], 0, 1, lambda *_: None)
     assert asked == tried
     assert (found[0].frames if found else None) == best
+
+
+def model_of(pictures: int, points: Iterable[Sequence[int]]) -> Any:
+    """A reconstruction of pictures 1, 2 ... and of points that some of them see."""
+    images = {
+        n: SimpleNamespace(image_id=n, frame_id=100 + n, has_pose=True)
+        for n in range(1, pictures + 1)
+    }
+    tracks = [
+        SimpleNamespace(track=SimpleNamespace(elements=[SimpleNamespace(image_id=n) for n in seen]))
+        for seen in points
+    ]
+
+    def deregister_frame(frame: int) -> None:
+        images[frame - 100].has_pose = False
+
+    return SimpleNamespace(
+        images=images,
+        points3D=dict(enumerate(tracks)),
+        deregister_frame=deregister_frame,
+        tear_down=lambda: None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("between", "kept"),
+    [
+        ([], {1, 2, 3, 4}),
+        ([(4, 5)] * 200, {1, 2, 3, 4}),  # of these 5 has a direction, and no distance
+        ([(3, 4, 5)] * 14, {1, 2, 3, 4}),
+        ([(3, 4, 5)] * 15, {1, 2, 3, 4, 5, 6, 7}),
+        ([(4, 5, 6)] * 15, {1, 2, 3, 4, 5, 6, 7}),
+    ],
+)
+def test_parts_without_a_common_scale_are_not_one(between, kept):
+    points = [(1, 2, 3)] * 30 + [(2, 3, 4)] * 20 + [(5, 6, 7)] * 500 + between
+    model = firmly_joined(model_of(7, points))
+    assert {n for n, image in model.images.items() if image.has_pose} == kept
+
+
+def test_a_reconstruction_of_nothing_stays_nothing():
+    assert not firmly_joined(model_of(0, [])).images
 
 
 @pytest.mark.system
