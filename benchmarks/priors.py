@@ -27,7 +27,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.monocular_prior import DepthKind, MonocularPrior
 from geogs.slam import Slam
-from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, structure_tensor
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE
@@ -94,7 +94,7 @@ def score(tracker: Tracker, walk: Walk) -> Score:
         depth = walk.views[k.frame_index].depth[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE]
         errors.append(np.abs(float(scale) / k.inverse_depth.numpy() / depth - 1).ravel())
         grey = cv2.cvtColor(k.image, cv2.COLOR_RGB2GRAY)
-        bare.append(cell_structure(grey) < MIN_STRUCTURE)
+        bare.append(cell_structure(grey).smaller < MIN_STRUCTURE)
     error, where = np.concatenate(errors), np.concatenate(bare)
     return Score(
         ate, float(np.median(error)), float(error.mean()), float(np.median(error[where])),
@@ -133,7 +133,9 @@ def map_score(slam: Slam, walk: Walk) -> MapScore:
             cv2.resize(m, size, interpolation=nearest) for m in (view.depth, view.normal)
         )
         grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
-        plain = (smaller_eigenvalue(grey) < MIN_STRUCTURE).astype(np.uint8)
+        xx, yy, xy = structure_tensor(grey)
+        smaller = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+        plain = (smaller < MIN_STRUCTURE).astype(np.uint8)
         known = seen.depth.numpy() > 0
         errors.append(np.abs(scale * seen.depth.numpy() / depth - 1)[known])
         cosine = (normal * seen.normal.numpy()).sum(-1).clip(-1, 1)

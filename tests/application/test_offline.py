@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application import offline, photos
+from geogs.application import chosen_frames, offline
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
@@ -20,7 +20,7 @@ FRAMES = 12
 @pytest.mark.system
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(photos, "FEWEST", FRAMES // 2)
+    monkeypatch.setattr(chosen_frames, "FEWEST", FRAMES // 2)
     monkeypatch.setattr(offline, "reconstruct_preset", lambda _: SMALL)
     room = render_room(FRAMES, 3, 320, 240)
     for k, image in enumerate(room.images):

@@ -56,6 +56,8 @@ def check_world(world: World) -> None:
     check_segments(world.segments, keyframes, world.frames)
     check_loops(world.loops, keyframes, {segment.number for segment in segments})
     mapped = [] if world.map is None else world.map.mapped
+    if not all(i in keyframes for i in (*world.unmapped, *mapped)):
+        raise InputError("a keyframe is missing")
     waiting = [i for i in world.unmapped if not (world.maps_at_end and i in mapped)]
     final = {i for segment in segments for i in segment.final}
     known = [*mapped, *waiting]
