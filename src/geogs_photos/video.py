@@ -1,7 +1,9 @@
 """Structure from motion of chosen frames of a video."""
 
+import math
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +26,26 @@ from geogs_photos.poses import Progress, structure_of
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.upright import upright_rotation
 
+MOST_CHANGE = 0.1
+"""Relative. Where the focal length ends farther from one that the video told, both cannot be right,
+and shape and path bend with it: of a camera that turns, points at wrong distances explain any."""
 NEXT = 6
 """Chosen frames after each that it is matched with in any case."""
 
 
 def place_frames(
-    chosen: ChosenFrames, camera: Camera, is_known: bool, seed: int, progress: Progress
+    chosen: ChosenFrames,
+    camera: Camera,
+    is_known: bool,
+    is_found: bool,
+    seed: int,
+    progress: Progress,
 ) -> PlacedVideo:
     """As asked of it in ``geogs.application.photos.place_frames``."""
     colmap = load_colmap()
     begin = Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,
-        is_guess=not is_known,
+        is_guess=not (is_known or is_found),
     )  # fmt: skip
     features = thread_map(
         lambda frame: find_features(frame.image), chosen.frames, lambda f: progress("features", f)
@@ -60,7 +70,11 @@ def place_frames(
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
-    return _placed(best, chosen, entries, is_known)
+    placed = _placed(best, chosen, entries, is_known)
+    if is_found and abs(math.log(placed.calibration.fx / camera.fx)) > MOST_CHANGE:
+        unknown = np.full(len(images), np.inf)
+        return replace(placed, deviation=unknown, rotation=unknown, depth=unknown)
+    return placed
 
 
 def _placed(

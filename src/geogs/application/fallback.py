@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,9 +87,10 @@ class TrackedOrPlaced(Work):
         if why_not:
             say(f"note: Structure from motion, which may place more frames, is left out: {why_not}")
             return None
-        from geogs.application.offline import PlacedOffline
+        from geogs.application.offline import PlacedOffline, beginning_with
 
-        placed = PlacedOffline(settings.config, self._video(), self._tracked.scene.stopwatch)
+        video = beginning_with(self._opened, self._tracked.source)
+        placed = PlacedOffline(settings.config, video, self._tracked.scene.stopwatch)
         if not self._succeeds(driver, lambda: placed.choose(driver)):
             return None
         seconds = placed.seconds_to_place
@@ -135,16 +135,6 @@ class TrackedOrPlaced(Work):
                 torch.cuda.empty_cache()
             driver.progress.write(f"Structure from motion failed, what was tracked stays: {error}")
         return False
-
-    def _video(self) -> Source:
-        """The video with what the run found of its camera, where nobody gave that only to begin
-        with."""
-        opened, found = self._opened, self._tracked.source
-        video = opened.with_shutter(found.shutter)
-        if not opened.is_calibration_open:
-            return video
-        begin = found.calibration
-        return video.with_calibration(replace(opened.calibration, fx=begin.fx, fy=begin.fy))
 
 
 def is_wanted(tracked: Verdict | None) -> bool:

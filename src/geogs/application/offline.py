@@ -88,8 +88,11 @@ class PlacedOffline(Work):
         assert chosen is not None, "no frames have been chosen"
         self._chosen = None  # it takes much memory
         with self._stopwatch("structure from motion"):
-            is_known = not video.is_calibration_open
-            placed = place_frames(chosen, video.camera, is_known, config.seed, driver.report)
+            told = video.calibration.refinement
+            placed = place_frames(
+                chosen, video.camera, not video.is_calibration_open,
+                told is not None and told.failure is None, config.seed, driver.report,
+            )  # fmt: skip
         del chosen
         driver.progress.write(
             f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "
@@ -121,6 +124,18 @@ class PlacedOffline(Work):
         # Not before, as it would say of which frames the map is to be made.
         scene.know(self.trajectory)
         return outcome
+
+
+def beginning_with(video: Source, found: Source) -> Source:
+    """A video with the shutter that was found of it, and the focal length, where nobody gave one:
+    that is where structure from motion begins, which finds its own."""
+    begun = video.with_shutter(found.shutter)
+    if not video.is_calibration_open:
+        return begun
+    told = found.calibration
+    return begun.with_calibration(
+        replace(video.calibration, fx=told.fx, fy=told.fy, refinement=told.refinement)
+    )
 
 
 class OfflineScene(Reconstruction):

@@ -82,7 +82,12 @@ def has_pycolmap() -> bool:
 
 
 def place_frames(
-    chosen: ChosenFrames, camera: Camera, is_known: bool, seed: int, report: StageProgress
+    chosen: ChosenFrames,
+    camera: Camera,
+    is_known: bool,
+    is_found: bool,
+    seed: int,
+    report: StageProgress,
 ) -> PlacedVideo:
     """Find where frames of one camera were taken; of the largest part that hangs together.
 
@@ -90,6 +95,8 @@ def place_frames(
         chosen: the frames.
         camera: of the frames; where the search begins if it is not known.
         is_known: whether the camera is to stay as it is.
+        is_found: whether the video told its focal length before; where another comes out, poses
+            and depths count as unknown.
         seed: of the random choices.
         report: follows the work; what it raises ends it.
 
@@ -97,7 +104,7 @@ def place_frames(
         InputError: pycolmap is missing, or fewer than three frames hang together.
     """
     place = _registered("place_frames")
-    placed: PlacedVideo = place(chosen, camera, is_known, seed, report)
+    placed: PlacedVideo = place(chosen, camera, is_known, is_found, seed, report)
     return placed
 
 

@@ -73,9 +73,10 @@ def run(
         compiled_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer)
         if settings.offline:
-            from geogs.application.offline import PlacedOffline
+            from geogs.application.offline import PlacedOffline, beginning_with
 
-            return driver.complete(PlacedOffline(config, opened))
+            told = self_calibrated(opened, config, device, progress, stop)
+            return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
         return driver.complete(TrackedOrPlaced(_begun(settings, driver, opened, base), opened))
 
 
