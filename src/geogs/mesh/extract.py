@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -25,6 +25,11 @@ _SAMPLED_VIEWS = 40
 _SAMPLED_POINTS = 400_000
 _MOST_OUT_OF_REACH = 0.05
 """Part of the surface that may lie beyond the volume, as stray points do."""
+OVERRUN = 1.5
+"""Times the memory limit that a volume may take: the plan knows a sample of the pixels, and of what
+is scattered, such as the far end of an outdoor view, each further pixel has blocks of its own."""
+COARSER = 1.5
+"""Times larger are the voxels that are tried next."""
 _FACES_PER_SQUARE = 2.4
 """Marching cubes makes about so many triangles per voxel face of surface."""
 
@@ -101,8 +106,10 @@ def extract_mesh(
     """Fuse depth maps; their surface, cleaned, coloured from the views' images and decimated.
 
     ``views`` is gone through up to three times (plan, fuse, colour) in order, so a lazy sequence
-    may render on demand. The work is done on the device of the first depth map. ``progress`` is
-    called with the stage ("fuse", "colour", "merge"), what is done of it and all there is to do.
+    may render on demand. A volume that outgrows its plan by half, where the surface scatters, is
+    fused anew with larger voxels. The work is done on the device of the first depth map.
+    ``progress`` is called with the stage ("fuse", "colour", "merge"), what is done of it and all
+    there is to do.
 
     Raises InputError if there are no views, no valid depth or no surface.
     """
@@ -111,7 +118,15 @@ def extract_mesh(
         raise InputError("There are no depth maps to make a mesh from.")
     plan = plan_volume(views, config)
     _log.info("voxel %.4g, about %.0f MiB", plan.voxel, plan.bytes / 2**20)
-    tsdf = fuse(views, plan, progress)
+    most = OVERRUN * config.memory_limit * 2**30
+    while (tsdf := fuse(views, plan, progress, most)) is None:
+        if config.voxel is not None:
+            raise InputError(
+                f"A voxel of {config.voxel:g} needs more than {most / 2**30:.1f} GiB for the "
+                "volume; use a larger voxel or leave it to be chosen."
+            )
+        plan = replace(plan, voxel=COARSER * plan.voxel)
+        _log.info("too large: voxel %.4g", plan.voxel)
     mesh = extract_surface(tsdf, config.min_weight)
     mesh = cleaned(mesh, config, FreeSpace.of(tsdf, config.min_weight))
     del tsdf
@@ -130,12 +145,16 @@ def fuse(
     views: Sequence[DepthMapView],
     plan: VolumePlan,
     progress: Callable[[str, int, int], None] | None = None,
-) -> SparseTsdf:
-    """All views in one volume, on the device of the first depth map."""
+    most: float = math.inf,
+) -> SparseTsdf | None:
+    """All views in one volume, on the device of the first depth map; None as soon as that takes
+    more than ``most`` bytes."""
     device = views[0].depth.device
     tsdf = SparseTsdf(plan.voxel, plan.truncation, device, plan.blocks)
     for number, view in enumerate(views):
         integrate(tsdf, view, plan)
+        if len(tsdf) * BYTES_PER_BLOCK > most:
+            return None
         if progress:
             progress("fuse", number + 1, len(views))
     return tsdf
