@@ -58,7 +58,8 @@ def check_world(world: World) -> None:
     mapped = [] if world.map is None else world.map.mapped
     if not all(i in keyframes for i in (*world.unmapped, *mapped)):
         raise InputError("a keyframe is missing")
-    waiting = [i for i in world.unmapped if not (world.maps_at_end and i in mapped)]
+    done = {*mapped} if world.maps_at_end else set()
+    waiting = [i for i in world.unmapped if i not in done]
     final = {i for segment in segments for i in segment.final}
     known = [*mapped, *waiting]
     if not final.issuperset(known) or len(set(known)) < len(known):
