@@ -124,8 +124,8 @@ def test_where_only_results_can_be_written_a_scene_is_rendered(tmp_path):
 def test_names_in_an_old_locale_are_escaped(tmp_path, name):
     (tmp_path / "räum").mkdir()
     done = geogs(
-        f"weights verify '{tmp_path}/räum'", **{name: "C"}, PYTHONUTF8="0",
-        PYTHONCOERCECLOCALE="0",
+        f"weights verify '{tmp_path}/räum'", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0",
+        **{"LC_ALL": None, "LC_CTYPE": None, name: "C"},
     )  # fmt: skip
     assert done.returncode == 2
     assert b"Traceback" not in done.stderr

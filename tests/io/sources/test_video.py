@@ -9,6 +9,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.io.sources.formats import video_file
 from geogs.io.sources.formats.video_file import clockwise_quarter_turns, turn_upright
 from geogs.io.sources.sniff import open_source
 from io_samples import gradient_image, write_video
@@ -107,7 +108,17 @@ def test_truncated_video_gives_the_frames_before_the_cut_and_is_told(tmp_path, c
     assert caplog.messages == []
 
 
-def test_damaged_packets_are_skipped_and_counted(tmp_path, caplog):
+@pytest.mark.parametrize("threads", [1, 2, 16])
+def test_damaged_packets_are_skipped_and_counted(tmp_path, caplog, monkeypatch, threads):
+    # More threads hold more packets back, up to the end of the file.
+    opened = video_file._open
+
+    def open_with_threads(path):
+        container = opened(path)
+        container.streams.video[0].codec_context.thread_count = threads
+        return container
+
+    monkeypatch.setattr(video_file, "_open", open_with_threads)
     path = write_video(tmp_path / "v.mp4", noise(30), codec="mpeg4", gop=1)
     data = bytearray(path.read_bytes())
     middle = len(data) // 2

@@ -166,9 +166,8 @@ def test_a_gpu_holds_the_same_cells():
     judged(graph)
     expected = [k.moving for k in graph.keyframes]
     store, device = graph.keyframes, torch.device("cuda")
-    store.grid = SampleGrid(CAMERA, device)
+    store.table.grid = SampleGrid(CAMERA, device)
     for keyframe in store:
-        keyframe.grid = store.grid
         keyframe.inverse_depth, keyframe.moving = keyframe.inverse_depth.to(device), None
     for edge in graph.edges.values():
         edge.pixels, edge.weight = edge.pixels.to(device), edge.weight.to(device)

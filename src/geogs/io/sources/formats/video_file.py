@@ -1,6 +1,8 @@
 """Video files through FFmpeg (PyAV), with the container's own time stamps."""
 
+import itertools
 import logging
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -132,19 +134,29 @@ def _decoded(container: InputContainer, path: Path) -> Iterator[av.VideoFrame | 
     """Decode to the end or to where the file is cut off; none stands for a damaged packet."""
     stream = container.streams.video[0]
     stream.thread_type = "AUTO"
-    packets = container.demux(stream)
-    while True:
+    count, shown, latest = 0, -math.inf, -math.inf
+    for packet in _packets(container, path):
+        if packet.pts is not None and not packet.is_discard:
+            latest = max(latest, packet.pts)
         try:
-            packet = next(packets, None)
-        except av.error.FFmpegError as error:
-            _log.warning("%s is damaged or cut off (%s).", path, error.strerror)
-            return
-        if packet is None:
-            return
-        try:
-            frames = packet.decode()
+            frames: list[av.VideoFrame | None] = list(packet.decode())
         except av.error.FFmpegError:
-            yield None
-            continue
+            frames = [None]
         for frame in frames:
-            yield None if frame.is_corrupt else frame
+            count += 1
+            if frame is not None and frame.pts is not None:
+                shown = max(shown, frame.pts)
+            yield None if frame is None or frame.is_corrupt else frame
+    # What threads still hold at the end comes in one call, which a damaged packet cuts short.
+    if shown < latest and stream.codec_context.thread_count != 1:
+        with _open(path) as again:
+            again.streams.video[0].codec_context.thread_count = 1
+            yield from itertools.islice(_decoded(again, path), count, None)
+
+
+def _packets(container: InputContainer, path: Path) -> Iterator[av.Packet]:
+    """Packets to the end, the empty last one too, or to where the file is cut off."""
+    try:
+        yield from container.demux(container.streams.video[0])
+    except av.error.FFmpegError as error:
+        _log.warning("%s is damaged or cut off (%s).", path, error.strerror)
