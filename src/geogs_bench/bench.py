@@ -7,11 +7,11 @@ from pathlib import Path
 from geogs.errors import InputError
 from geogs_bench.bench_options import BenchOptions
 from geogs_bench.benchmark import Benchmark
-from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
+from geogs_bench.catalogue.registry import BENCHMARKS, EDGES, find_benchmark
 from geogs_bench.data.benchmark_scene import Option
 from geogs_bench.data.motion_cells import render_cells
 from geogs_bench.data.synthetic_rooms import no_data, synthetic_rooms
-from geogs_bench.harness import Harness
+from geogs_bench.harness import Harness, score_given
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
 from geogs_bench.results.record import Record
 from geogs_bench.runners.command_runners import runners
@@ -36,6 +36,8 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:
         OutputError: the folder cannot be written.
     """
     benchmark = find_benchmark(_name(settings))
+    if settings.result is not None:
+        return _given(settings, benchmark, settings.result)
     wishes = _wishes(settings, benchmark)
     output = settings.output or Path("out") / f"bench-{benchmark.name}"
     data = settings.data or _made_data(benchmark, output, wishes.scenes, say)
@@ -45,6 +47,20 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:
         benchmark, output, runners(), say, fresh=settings.fresh, rescore=settings.rescore
     )
     return Benched(benchmark, output, harness.run(jobs))
+
+
+def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> Benched:
+    """Score a result of earlier."""
+    if benchmark is not EDGES:
+        raise InputError(f"--result is for {EDGES.name}; {benchmark.name} scores its own runs.")
+    if settings.data is None:
+        raise InputError("--result needs the sequence that it was made of, too.")
+    scenes = find_scenes(benchmark, settings.data.expanduser(), _names(settings.scenes))
+    if len(scenes) != 1:
+        names = ", ".join(scene.name for scene in scenes)
+        raise InputError(f"--result is of one sequence; choose it by --scenes: {names}.")
+    output = settings.output or result / f"bench-{benchmark.name}"
+    return Benched(benchmark, output, score_given(benchmark, scenes[0], result, output))
 
 
 def _name(settings: BenchOptions) -> str:

@@ -44,6 +44,8 @@ class BenchOptions(Settings):
     """As in geogs run and geogs reconstruct; without one, what they choose."""
     set: tuple[str, ...] = ()
     """Any option of geogs run or geogs reconstruct (--set mapping.iterations=12); repeatable."""
+    result: Path | None = None
+    """Edges: score this result of the one sequence DATA, and run nothing."""
     fresh: bool = False
     """Run everything again."""
     rescore: bool = False

@@ -10,6 +10,7 @@ from pathlib import Path
 from geogs.errors import GeogsError
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs_bench.benchmark import Benchmark
+from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.machine import forget_peak_memory, machine_name, program_version
 from geogs_bench.plan import BenchmarkJob
 from geogs_bench.results.record import Cost, Provenance, Record, read_record, write_json
@@ -129,6 +130,29 @@ class Harness:
         run = CompletedRun(source, provenance, cost_of(result, seconds))
         write_completed_run(folder, run)
         return run
+
+
+def score_given(
+    benchmark: Benchmark, scene: BenchmarkScene, folder: Path, output: Path
+) -> list[Record]:
+    """The record of a result that some earlier command left, with its report in ``output``.
+
+    Raises:
+        InputError: the result cannot be read or does not fit the scene.
+        OutputError: the report cannot be written.
+    """
+    result = ResultFolder(folder.expanduser().resolve())
+    prepare_output_folder(output)
+    summary = result.summary
+    seconds = float(summary.get("seconds", {}).get("total", 0.0))
+    provenance = Provenance(
+        benchmark.command, str(summary.get("version", "")), machine_name(),
+        str(summary.get("device", "")), int(summary.get("seed", 0)), "",
+    )  # fmt: skip
+    record = Record(benchmark.name, scene.name, "", str(result.path), provenance)
+    record = scored(replace(record, cost=cost_of(result, seconds)), scene, result)
+    write_report(output, benchmark, [record])
+    return [record]
 
 
 def cost_of(result: ResultFolder, seconds: float) -> Cost:

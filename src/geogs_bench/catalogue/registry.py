@@ -5,6 +5,7 @@ from geogs_bench import published as paper
 from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.catalogue.ablations import ABLATIONS
 from geogs_bench.data.benchmark_scene import Option
+from geogs_bench.data.depth_scenes import find_depth
 from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.motion_cells import FULL, SMALL, find_motions
 from geogs_bench.data.posed_scenes import find_objects, find_posed_rooms
@@ -19,6 +20,7 @@ from geogs_bench.tables.columns import (
     dtu_layout,
     motion_layout,
     photo_layout,
+    place_layouts,
     rgbd_layout,
     trajectory_layout,
     vertex_layout,
@@ -201,6 +203,21 @@ MOTIONS_SMALL = Benchmark(
     cells=SMALL,
 )
 
+EDGES = Benchmark(
+    "edges",
+    "Depth by kind of place: edges, thin things, what is behind them, bare walls, sky",
+    "run",
+    find_depth,
+    "sequences with exact or measured depth: rooms and streets as geogs synth writes them, rooms "
+    "with a true surface, TUM RGB-D or 7-Scenes with depth images",
+    "geogs synth, or any sequence with depth in these layouts",
+    place_layouts(),
+    notes=(
+        "The mesh is seen from the estimated poses, after one scale for the whole sequence, so "
+        "that errors of the trajectory do not count.",
+    ),
+)
+
 OBJECTS = Benchmark(
     "objects",
     "Objects with masks: surfaces from known poses",
@@ -221,7 +238,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     benchmark.name: benchmark
     for benchmark in (
         REPLICA, SCANNET, SCANNETPP, TUM, SEVEN_SCENES, DTU, ROOMS, POSED_ROOMS, MOTIONS,
-        MOTIONS_SMALL, OBJECTS,
+        MOTIONS_SMALL, EDGES, OBJECTS,
         *ABLATIONS,
     )
 }  # fmt: skip

@@ -71,8 +71,8 @@ class BenchmarkScene:
     truth: Truth
     options: tuple[Option, ...] = ()
     """That this scene needs, such as its intrinsics."""
-    kind: Literal["room", "object", "scan", "motion"] = "room"
+    kind: Literal["room", "object", "scan", "motion", "depth"] = "room"
     """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU; of a
-    motion the trajectory alone is scored."""
+    motion the trajectory alone is scored, of depth the views alone."""
     has_depth: bool = False
     """Whether the images come with the depth of a sensor."""

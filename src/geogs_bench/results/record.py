@@ -20,6 +20,11 @@ StageName = Literal["online", "adjusted", "depth fusion", "final"]
 the keyframes' depths fused without the disks; after the refinement that the paper has not, or from
 known poses the result."""
 
+Place = Literal["all", "open", "edge", "thin", "behind thin", "bare", "grazing", "sky"]
+PLACES: tuple[Place, ...] = get_args(Place)
+"""Kinds of place in a view: ``all`` has depth, ``open`` is none of those after it; these overlap,
+but for the sky."""
+
 
 @dataclass(frozen=True)
 class SurfaceScore:
@@ -97,6 +102,32 @@ class MotionScore:
 
 
 @dataclass(frozen=True)
+class PlaceScore:
+    """Depth of the mesh in the places of one kind; percent of their pixels where no unit is said.
+
+    Of the sky no more is known than whether there is a surface in it.
+    """
+
+    place: Place
+    share: float
+    """Of all pixels whose true depth is known."""
+    covered: float
+    """Where the mesh is seen."""
+    median_error: float | None = None
+    """Percent of the depth, where it is seen."""
+    within_2: float | None = None
+    """Off by no more than 2 %; holes are wrong."""
+    within_5: float | None = None
+    """Off by no more than 5 %; holes are wrong."""
+    in_front: float | None = None
+    """Nearer than the truth by more than 5 %: fringes and sheets."""
+    behind: float | None = None
+    """Farther than the truth by more than 5 %."""
+    normal: float | None = None
+    """Median angle between the normals, degrees; none where no true plane is there."""
+
+
+@dataclass(frozen=True)
 class StageScore:
     """A result as it stood at a stage."""
 
@@ -162,6 +193,7 @@ class Record:
     stages: tuple[StageScore, ...] = ()
     photo: PhotoScore | None = None
     motion: MotionScore | None = None
+    places: tuple[PlaceScore, ...] = ()
     curve: tuple[CurvePoint, ...] = ()
     error: str | None = None
     """Why there are no numbers."""
@@ -169,6 +201,10 @@ class Record:
     def stage(self, name: StageName) -> StageScore | None:
         """The scores of a stage."""
         return next((s for s in self.stages if s.stage == name), None)
+
+    def place(self, name: str) -> PlaceScore | None:
+        """The scores of a kind of place."""
+        return next((s for s in self.places if s.place == name), None)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -110,6 +110,16 @@ class ResultFolder:
         file = self._file(stage, name)
         return None if file is None else read_tum_trajectory(file)
 
+    def final_mesh(self) -> Surface | None:
+        """The surface of the result, whatever its last stage; none where there is none."""
+        file = self.path / "mesh.ply"
+        return read_surface(file) if file.is_file() else None
+
+    def final_trajectory(self) -> Trajectory | None:
+        """The poses of the frames whose place is known; none where there are none."""
+        file = self.path / "trajectory.tum"
+        return read_tum_trajectory(file) if file.is_file() else None
+
     def poses(self) -> Trajectory | None:
         """All poses and orientations of the result, whatever its last stage, in order of time."""
         is_there = (self.path / "trajectory.tum").is_file()

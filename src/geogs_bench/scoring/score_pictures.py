@@ -8,10 +8,12 @@ from jaxtyping import Float
 from geogs.evaluation.pages import plots
 from geogs.evaluation.pages.shading import viewpoints
 from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.depth_pictures import DEPTH_PICTURE, DEPTH_TITLE
 from geogs_bench.scoring.room_scores import Comparison
 from geogs_bench.scoring.slam_scores import StageErrors
 
 PICTURES = {
+    DEPTH_PICTURE: DEPTH_TITLE,
     "bench_surface.png": "surface, truth and error",
     "bench_trajectory.png": "trajectory",
     "keyframes.png": "renders",

@@ -7,6 +7,8 @@ import numpy as np
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.results.record import Record
 from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.depth_pictures import DEPTH_PICTURE, draw_depths
+from geogs_bench.scoring.depth_scores import score_depth
 from geogs_bench.scoring.judges import judge_of
 from geogs_bench.scoring.motion_scores import score_motion
 from geogs_bench.scoring.photo_scores import score_photo
@@ -25,6 +27,10 @@ def scored(record: Record, scene: BenchmarkScene, result: ResultFolder) -> Recor
     seed = record.provenance.seed
     if scene.kind == "motion":
         return replace(record, motion=score_motion(scene, result))
+    if scene.kind == "depth":
+        places, views = score_depth(scene, result)
+        draw_depths(result.path / "report" / DEPTH_PICTURE, views)
+        return replace(record, places=places)
     if record.provenance.command in ("run", "update"):
         stages = score_slam(scene, result, seed)
         _draw_last(stages, result)

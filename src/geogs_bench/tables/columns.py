@@ -5,7 +5,14 @@ from typing import Literal
 
 from geogs_bench.benchmark import Column, Layout, Published
 from geogs_bench.published import PublishedTable
-from geogs_bench.results.record import Record, StageName, StageScore, Weighting
+from geogs_bench.results.record import (
+    PLACES,
+    Place,
+    Record,
+    StageName,
+    StageScore,
+    Weighting,
+)
 
 Value = Callable[[Record], float | None]
 """What a column shows of a record."""
@@ -195,6 +202,43 @@ def motion_layout() -> Layout:
         "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
         "twentieth of the path's extent and no more than a fifth of the frames lost.",
     )
+
+
+_PLACES: tuple[tuple[str, str, str, int], ...] = (
+    ("Within 5 % of the true depth (% of the pixels; holes are wrong)", "within_5", "", 1),
+    ("Within 2 % of the true depth (% of the pixels; holes are wrong)", "within_2", "", 1),
+    (
+        "Surface in front of the true one by more than 5 % (% of the pixels)", "in_front",
+        "Fringes around things, and sheets that close the gaps between them.", 2,
+    ),
+    ("Surface behind the true one by more than 5 % (% of the pixels)", "behind", "", 2),
+    (
+        "Covered (% of the pixels)", "covered",
+        "In the sky: where a surface is that should not be there.", 1,
+    ),
+    ("Median error of the depth (%), where there is a surface", "median_error", "", 2),
+    ("Median error of the normals (degrees)", "normal", "", 1),
+    ("Share of all pixels whose depth is known (%)", "share", "Kinds overlap.", 2),
+)  # fmt: skip
+"""Title, field, note and digits of every table of depth by kind of place."""
+
+
+def place_layouts() -> tuple[Layout, ...]:
+    """A table for each measure of depth, with a column for each kind of place."""
+    return tuple(
+        Layout(title, tuple(Column(p, place(p, name), digits) for p in PLACES), note)
+        for title, name, note, digits in _PLACES
+    )
+
+
+def place(kind: Place, name: str) -> Value:
+    """A field of the scores of a kind of place."""
+
+    def value(record: Record) -> float | None:
+        scored = record.place(kind)
+        return None if scored is None else getattr(scored, name)
+
+    return value
 
 
 def result_layout() -> Layout:

@@ -1,0 +1,40 @@
+"""Sequences whose depth is known in their views: rendered, measured, or by a true surface."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from geogs.io.sources.formats.tum import is_tum
+from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.replica_scenes import find_replica
+from geogs_bench.data.scene_folders import folders_like
+from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
+
+
+def find_depth(root: Path) -> list[BenchmarkScene]:
+    """Rooms, streets and sequences of sensors below ``root``, or ``root`` itself.
+
+    Those in the layout of Replica have depth images or a true surface, others depth images.
+    """
+    rendered = [
+        scene
+        for scene in find_replica(root)
+        if scene.truth.surface is not None or _has_rendered_depth(scene.source)
+    ]
+    kinect = [_with_sensor(folder) for folder in folders_like(root, _is_tum_with_depth)]
+    seven_scenes = [scene for scene in find_seven_scenes(root) if scene.has_depth]
+    return [replace(scene, kind="depth") for scene in (*rendered, *kinect, *seven_scenes)]
+
+
+def _with_sensor(folder: Path) -> BenchmarkScene:
+    poses = folder / "groundtruth.txt"
+    truth = Truth(TruePoses(poses) if poses.is_file() else None)
+    return BenchmarkScene(folder.resolve().name, folder, truth, has_depth=True)
+
+
+def _is_tum_with_depth(folder: Path) -> bool:
+    """Where ``geogs synth`` lists its images like TUM, the depths are in no such list."""
+    return is_tum(folder) and (folder / "depth.txt").is_file()
+
+
+def _has_rendered_depth(folder: Path) -> bool:
+    return next((folder / "results").glob("depth*.png"), None) is not None

@@ -1,0 +1,95 @@
+"""Views of a result beside their true depth: image, both depths, error by its sign, kinds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from geogs.io.writers.atomic import atomic_file
+from geogs_bench.results.record import Place
+from geogs_bench.scoring.depth_scores import JudgedView
+
+DEPTH_PICTURE = "bench_depth.png"
+"""In the report of a result."""
+DEPTH_TITLE = (
+    "image; true depth; depth of the mesh; error up to 15 % (red in front, blue behind, black "
+    "missing, grey not judged); places (yellow edge, magenta thin, cyan behind thin, green bare, "
+    "orange grazing, blue sky)"
+)
+_WORST = 0.15
+"""Relative error of the full colours."""
+_FRONT, _BEHIND = (200, 0, 0), (0, 60, 220)
+_MISSING, _UNKNOWN = (0, 0, 0), (128, 128, 128)
+_COLOURS: dict[Place, tuple[int, int, int]] = {
+    "bare": (90, 190, 90), "grazing": (240, 150, 40), "edge": (240, 230, 60),
+    "behind thin": (60, 210, 220), "thin": (230, 40, 210), "sky": (80, 120, 230),
+}  # fmt: skip
+"""Later ones are drawn over earlier ones."""
+
+
+def draw_depths(path: Path, views: Sequence[JudgedView], most: int = 5) -> None:
+    """A row for each of some views, spread over the sequence.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
+    picture = np.concatenate([_row(views[k]) for k in chosen])
+    with atomic_file(path) as stream:
+        stream.write(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+
+
+def _row(judged: JudgedView) -> UInt8[np.ndarray, "h w2 3"]:
+    true = judged.view.depth
+    known = true[(true > 0) & np.isfinite(true)]
+    ends = np.quantile(1 / known, [0.02, 0.98]) if len(known) else np.array([0.0, 1.0])
+    panels = [
+        judged.view.image,
+        _depth_colours(true, ends),
+        _depth_colours(np.where(np.isfinite(judged.found), judged.found, 0), ends),
+        error_colours(true, judged.found),
+        _place_colours(judged.view.image, judged.places),
+    ]
+    return np.concatenate(panels, 1)
+
+
+def _depth_colours(
+    depth: Float[np.ndarray, "h w"], ends: Float[np.ndarray, "2"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Inverse depth from far (blue) to near (red); black where there is none."""
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
+    level = np.clip((inverse - ends[0]) / max(ends[1] - ends[0], 1e-9), 0, 1)
+    mapped = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)
+    there = (depth > 0) & np.isfinite(depth)
+    return np.where(there[..., None], cv2.cvtColor(mapped, cv2.COLOR_BGR2RGB), np.uint8(0))
+
+
+def error_colours(
+    true: Float[np.ndarray, "h w"], found: Float[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """White where the depth is right, red where it is too near, blue where it is too far.
+
+    Black are holes, but in the sky, where a hole is right and a surface in front of it.
+    """
+    sky, unknown, hole = np.isinf(true), ~(true > 0), ~np.isfinite(found)
+    depth = np.where(sky | unknown, 1.0, true)
+    error = np.where(hole, 0.0, found) / depth - 1
+    error = np.where(sky, np.where(hole, 0.0, -1.0), error)
+    worst = np.where((error < 0)[..., None], _FRONT, _BEHIND)
+    strength = np.minimum(np.abs(error) / _WORST, 1)[..., None]
+    colours = 255 + strength * (worst - 255.0)
+    colours[hole & ~sky] = _MISSING
+    colours[unknown] = _UNKNOWN
+    return np.asarray(colours.round().astype(np.uint8))
+
+
+def _place_colours(
+    image: UInt8[np.ndarray, "h w 3"], places: dict[Place, Bool[np.ndarray, "h w"]]
+) -> UInt8[np.ndarray, "h w 3"]:
+    grey = np.repeat(image.mean(-1, keepdims=True), 3, -1)
+    for place, colour in _COLOURS.items():
+        mask = places[place]
+        grey[mask] = 0.35 * grey[mask] + 0.65 * np.array(colour)
+    return np.asarray(grey.round().astype(np.uint8))
