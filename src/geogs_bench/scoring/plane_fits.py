@@ -56,8 +56,9 @@ def fit_planes(depth: Float[np.ndarray, "h w"], side: int, tolerance: float) -> 
     known = (depth > 0) & np.isfinite(depth)
     weight = known.astype(np.float64)
     w = np.where(known, 1 / np.where(known, depth, 1.0).astype(np.float64), 0.0)
-    rows, columns = np.indices(depth.shape)
-    u, v = columns.astype(np.float64), rows.astype(np.float64)
+    height, width = depth.shape
+    u = np.tile(np.arange(width, dtype=np.float64), (height, 1))
+    v = np.tile(np.arange(height, dtype=np.float64)[:, None], (1, width))
 
     def total(values: np.ndarray) -> np.ndarray:
         border = cv2.BORDER_CONSTANT
