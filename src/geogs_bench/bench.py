@@ -94,7 +94,7 @@ def _wishes(settings: BenchOptions, benchmark: Benchmark) -> Wishes:
         common.append(Option("preset", settings.preset))
     if settings.depth_fusion:
         common.append(Option("depth-mesh"))
-    if benchmark.command == "run":
+    if benchmark.command == "run" and benchmark.keeps_online:
         common.append(Option("online-results"))
     return Wishes(
         _names(settings.scenes),

@@ -79,3 +79,5 @@ class Benchmark:
     """Whether objects and scans, whose poses are known, are reconstructed and rooms are run."""
     cells: tuple[Cell, ...] = ()
     """Sequences that are rendered where the user gives no data."""
+    keeps_online: bool = True
+    """Whether a run keeps, and its scores show, how it stood after the stream; it costs time."""

@@ -5,7 +5,7 @@ from geogs_bench import published as paper
 from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.catalogue.ablations import ABLATIONS
 from geogs_bench.data.benchmark_scene import Option
-from geogs_bench.data.depth_scenes import find_depth
+from geogs_bench.data.depth_scenes import CELLS, find_depth
 from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.motion_cells import FULL, SMALL, find_motions
 from geogs_bench.data.posed_scenes import find_objects, find_posed_rooms
@@ -209,13 +209,16 @@ EDGES = Benchmark(
     "run",
     find_depth,
     "sequences with exact or measured depth: rooms and streets as geogs synth writes them, rooms "
-    "with a true surface, TUM RGB-D or 7-Scenes with depth images",
+    "with a true surface, TUM RGB-D or 7-Scenes with depth images; without a folder rooms and a "
+    "street are rendered",
     "geogs synth, or any sequence with depth in these layouts",
     place_layouts(),
     notes=(
         "The mesh is seen from the estimated poses, after one scale for the whole sequence, so "
         "that errors of the trajectory do not count.",
     ),
+    cells=CELLS,
+    keeps_online=False,
 )
 
 OBJECTS = Benchmark(

@@ -5,9 +5,20 @@ from pathlib import Path
 
 from geogs.io.sources.formats.tum import is_tum
 from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.motion_cells import Cell
 from geogs_bench.data.replica_scenes import find_replica
 from geogs_bench.data.scene_folders import folders_like
 from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
+from geogs_synth.camera.flaws import Flaws
+
+CELLS: tuple[Cell, ...] = (
+    Cell("room-0", "handheld", Flaws(), 100, 400, 300),
+    Cell("room-1", "handheld", Flaws(), 100, 400, 300, seed=1),
+    Cell("dining-0", "dining", Flaws(), 100, 400, 300),
+    Cell("dining-1", "dining", Flaws(), 100, 400, 300, seed=1),
+    Cell("street-0", "driving", Flaws(), 60, 496, 150),
+)
+"""What is rendered where the user gives no data: rooms, rooms of thin things, a street."""
 
 
 def find_depth(root: Path) -> list[BenchmarkScene]:

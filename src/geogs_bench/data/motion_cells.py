@@ -28,14 +28,16 @@ class Cell:
     height: int
     moving: float = 0.0
     """Share of the image that moves."""
+    seed: int = 0
+    """Of the place and of the path."""
 
     @property
     def place(self) -> MotionKind:
-        """One of the motions through the same place, of which there are three."""
+        """One of the motions through the same place, of which there are four."""
         return self.motion if self.motion in PLACES else "handheld"
 
 
-PLACES: tuple[MotionKind, ...] = ("handheld", "driving", "corridor")
+PLACES: tuple[MotionKind, ...] = ("handheld", "dining", "driving", "corridor")
 """A motion through each place."""
 
 
@@ -116,9 +118,10 @@ def render_cells(
     if strangers := [name for name in names if name not in known]:
         raise InputError(f"there is no cell {strangers[0]}; choose of {', '.join(known)}.")
     missing = [c for c in cells if (not names or c.name in names) and not _is_there(c, folder)]
-    for place in PLACES:
-        some = [cell for cell in missing if cell.place == place]
-        raycaster = _raycaster(place) if some else None
+    seeds = sorted({cell.seed for cell in missing})
+    for place, seed in ((place, seed) for place in PLACES for seed in seeds):
+        some = [cell for cell in missing if (cell.place, cell.seed) == (place, seed)]
+        raycaster = _raycaster(place, seed) if some else None
         for cell in some:
             say(f"rendering {cell.name}")
             _render(cell, folder / cell.name, raycaster)
@@ -142,18 +145,18 @@ def _is_there(cell: Cell, folder: Path) -> bool:
     return any((folder / cell.name).glob("points_seen_*.ply"))
 
 
-def _raycaster(place: MotionKind) -> "Raycaster":
+def _raycaster(place: MotionKind, seed: int) -> "Raycaster":
     from geogs_synth.raycast.raycaster import Raycaster
     from geogs_synth.sequence.location import make_scene
 
-    return Raycaster(make_scene(place, 0), _threads())
+    return Raycaster(make_scene(place, seed), _threads())
 
 
 def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
     from geogs_synth.sequence.replica_files import write_sequence
 
     write_sequence(
-        folder, cell.frames, cell.width, cell.height,
+        folder, cell.frames, cell.width, cell.height, cell.seed,
         motion=cell.motion, flaws=cell.flaws, moving=cell.moving,
         threads=_threads(), raycaster=raycaster,
     )  # fmt: skip

@@ -93,11 +93,14 @@ def _mark_jumps(line: Float64[np.ndarray, "n"], marks: Bool[np.ndarray, "n"]) ->
 
 
 def thin_things(inverse: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """What an opening of the inverse depth takes away, where that is long."""
-    square = np.ones((THIN, THIN), np.uint8)
+    """What an opening of the inverse depth takes away, where that is long.
+
+    Beyond the border, and where nothing is known, things are taken to go on.
+    """
+    square, half = np.ones((THIN, THIN), np.uint8), THIN // 2
     unknown = np.isnan(inverse)
-    low = cv2.erode(np.where(unknown, np.inf, inverse), square)
-    opened = cv2.dilate(np.where(np.isinf(low), 0.0, low), square)
+    padded = np.pad(np.where(unknown, np.inf, inverse), half, constant_values=np.inf)
+    opened = cv2.dilate(cv2.erode(padded, square), square)[half:-half, half:-half]
     narrow = ~unknown & (np.nan_to_num(inverse) * (1 - JUMP) > opened)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(narrow.astype(np.uint8))
     length = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])

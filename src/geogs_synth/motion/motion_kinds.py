@@ -8,5 +8,6 @@ RoomMotionKind = Literal[
 ]  # fmt: skip
 """Through a room."""
 ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
-MotionKind = Literal[RoomMotionKind, "driving", "corridor"]
-"""Through a room, along a street, or along a corridor almost without texture."""
+MotionKind = Literal[RoomMotionKind, "dining", "driving", "corridor"]
+"""Through a room, around a table in a room of thin things, along a street, or along a corridor
+almost without texture."""

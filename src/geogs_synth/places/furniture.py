@@ -64,7 +64,7 @@ def _pick(rng: np.random.Generator, options: tuple[int, ...]) -> int:
     return options[rng.integers(len(options))]
 
 
-def _four_legs(
+def four_legs(
     build: SceneBuilder, width: float, depth: float, height: float, thickness: float, texture_: int
 ) -> None:
     for x in (-width / 2 + thickness, width / 2 - thickness):
@@ -107,7 +107,7 @@ def _book_pile(build: SceneBuilder, rng: np.random.Generator, materials: Materia
         z += h
 
 
-def _trinket(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
+def trinket(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
     """A vase, a ball, a pile of books or a bowl."""
     match rng.integers(4):
         case 0:
@@ -141,7 +141,7 @@ def bookshelf(
         row = build.at(-inner / 2, depth - 0.04, z)
         _row_of_books(row, rng, materials, books, room)
         if books < inner:
-            _trinket(build.at((books - 0.02) / 2, 0.18, z), rng, materials)
+            trinket(build.at((books - 0.02) / 2, 0.18, z), rng, materials)
 
 
 def sofa(build: SceneBuilder, rng: np.random.Generator, materials: Materials, width: float) -> None:
@@ -176,7 +176,7 @@ def desk(build: SceneBuilder, rng: np.random.Generator, materials: Materials, wi
     """A desk with drawers, a picture screen, objects, and a chair drawn up to it."""
     depth, height = 0.62, 0.74
     build.box((0, depth / 2, height - 0.015), (width, depth, 0.03), materials.walnut)
-    _four_legs(build, width, depth, height - 0.03, 0.05, materials.walnut)
+    four_legs(build, width, depth, height - 0.03, 0.05, materials.walnut)
     side = rng.choice((-1.0, 1.0))
     x = side * (width / 2 - 0.24)
     for k in range(3):
@@ -189,13 +189,13 @@ def desk(build: SceneBuilder, rng: np.random.Generator, materials: Materials, wi
     top.box((0, 0, 0.1), (0.04, 0.03, 0.18), materials.metal)
     top.box((0, 0.02, 0.31), (0.56, 0.03, 0.35), materials.metal, front=picture)
     _row_of_books(build.at(x - 0.15, 0.3, height), rng, materials, 0.3, 0.28)
-    _trinket(build.at(-side * (width / 2 - 0.16), 0.36, height), rng, materials)
+    trinket(build.at(-side * (width / 2 - 0.16), 0.36, height), rng, materials)
     chair(build.at(-side * 0.1, 0.34, yaw=rng.uniform(-0.5, 0.5)), rng, materials)
 
 
 def chair(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
     """A wooden chair that looks towards -y, its back at y = 0.42."""
-    _four_legs(build.at(0, 0), 0.44, 0.44, 0.44, 0.04, materials.oak)
+    four_legs(build.at(0, 0), 0.44, 0.44, 0.44, 0.04, materials.oak)
     build.box((0, 0.22, 0.455), (0.44, 0.44, 0.03), materials.oak)
     build.box((0, 0.21, 0.485), (0.4, 0.38, 0.035), _pick(rng, materials.cushion))
     for side in (-1, 1):
@@ -209,7 +209,7 @@ def sideboard(
 ) -> None:
     """A low cabinet with doors, vases and books on top."""
     depth, bottom, height = 0.42, 0.14, 0.6
-    _four_legs(build, width, depth, bottom, 0.04, materials.metal)
+    four_legs(build, width, depth, bottom, 0.04, materials.metal)
     body = (width, depth, height)
     build.box((0, depth / 2, bottom + height / 2), body, materials.walnut)
     doors = 3
@@ -226,7 +226,7 @@ def sideboard(
         if k % 2:
             _vase(spot, rng, materials, rng.uniform(0.2, 0.38))
         else:
-            _trinket(spot, rng, materials)
+            trinket(spot, rng, materials)
 
 
 def floor_lamp(build: SceneBuilder, materials: Materials) -> None:
@@ -270,7 +270,7 @@ def round_table(build: SceneBuilder, rng: np.random.Generator, materials: Materi
         if k == 0:
             _vase(spot, rng, materials, 0.24)
         else:
-            _trinket(spot, rng, materials)
+            trinket(spot, rng, materials)
 
 
 def pouf(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:

@@ -16,7 +16,7 @@ _TEXEL = 0.003
 
 
 @dataclass(frozen=True)
-class _Wall:
+class Wall:
     """A wall with its frame: x to the right along it seen from behind, y into the room."""
 
     build: SceneBuilder
@@ -34,29 +34,29 @@ def make_room(seed: int = 0) -> Scene:
     size = rng.uniform([4.3, 3.9, 2.55], [5.0, 4.3, 2.75])
     build = SceneBuilder(rng)
     materials = furniture.make_materials(build, rng)
-    walls = _walls(build, size)
-    _surfaces(build, rng, size, walls, materials)
+    walls = room_walls(build, size)
+    cover_surfaces(build, rng, size, walls, materials)
     _furnish_walls(rng, walls, size[2], materials)
     _furnish_middle(build, rng, size, materials)
     return build.build(size)
 
 
-def _walls(build: SceneBuilder, size: np.ndarray) -> list[_Wall]:
+def room_walls(build: SceneBuilder, size: np.ndarray) -> list[Wall]:
     """South, east, north, west, their frames at the middle of each wall on the floor."""
     w, d, _ = size
     return [
-        _Wall(build.at(w / 2, 0.0), w),
-        _Wall(build.at(w, d / 2, yaw=math.pi / 2), d),
-        _Wall(build.at(w / 2, d, yaw=math.pi), w),
-        _Wall(build.at(0.0, d / 2, yaw=-math.pi / 2), d),
+        Wall(build.at(w / 2, 0.0), w),
+        Wall(build.at(w, d / 2, yaw=math.pi / 2), d),
+        Wall(build.at(w / 2, d, yaw=math.pi), w),
+        Wall(build.at(0.0, d / 2, yaw=-math.pi / 2), d),
     ]
 
 
-def _surfaces(
+def cover_surfaces(
     build: SceneBuilder,
     rng: np.random.Generator,
     size: np.ndarray,
-    walls: list[_Wall],
+    walls: list[Wall],
     materials: Materials,
 ) -> None:
     """Walls, floor, ceiling, beams and skirting."""
@@ -106,7 +106,7 @@ def wall_image(rng: np.random.Generator, kind: int, width: float, height: float)
 
 
 def _furnish_walls(
-    rng: np.random.Generator, walls: list[_Wall], height: float, materials: Materials
+    rng: np.random.Generator, walls: list[Wall], height: float, materials: Materials
 ) -> None:
     """One main piece to each wall, smaller things beside it, pictures above."""
     for place, main in enumerate(rng.permutation(4)):
@@ -128,7 +128,7 @@ def _furnish_walls(
             case 2:
                 furniture.desk(piece, rng, materials, rng.uniform(1.2, 1.5))
                 furniture.pouf(corner, rng, materials)
-                _window(wall, rng, materials, height)
+                add_window(wall, rng, materials, height)
             case _:
                 furniture.sideboard(piece, rng, materials, rng.uniform(1.5, 1.9))
                 for x in (-0.8, 0.1, 0.85):
@@ -153,7 +153,7 @@ def add_picture(
     furniture.picture(wall, (x, z), (shape[1] * scale, shape[0] * scale), canvas, frame)
 
 
-def _window(wall: _Wall, rng: np.random.Generator, materials: Materials, height: float) -> None:
+def add_window(wall: Wall, rng: np.random.Generator, materials: Materials, height: float) -> None:
     """A window that glows and lights the room with daylight."""
     w, h = 1.5, 0.95
     z = height - 0.35 - h / 2

@@ -8,6 +8,7 @@ from geogs.geometry.camera import Camera
 from geogs_synth.motion.motion_kinds import MotionKind
 from geogs_synth.motion.room_motions import Motion, room_motion
 from geogs_synth.places.corridor import make_corridor, walk
+from geogs_synth.places.dining_room import make_dining_room
 from geogs_synth.places.room import make_room
 from geogs_synth.places.street import drive, make_street
 from geogs_synth.places.traffic import street_traffic
@@ -66,6 +67,12 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
             kind, f"procedural street, seed {seed}", seed, scene, drive(seed),
             width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
         )  # fmt: skip
+    if kind == "dining":
+        return Location(
+            kind, f"procedural dining room, seed {seed}", seed, scene,
+            room_motion("handheld", scene, seed),
+            width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
+        )  # fmt: skip
     if kind == "corridor":
         return Location(
             kind, f"procedural corridor, seed {seed}", seed, scene, walk(scene, seed),
@@ -81,6 +88,8 @@ def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
     """The room, street or corridor of the seed that a motion goes through."""
     if kind == "driving":
         return make_street(seed)
+    if kind == "dining":
+        return make_dining_room(seed)
     return make_corridor(seed) if kind == "corridor" else make_room(seed)
 
 
