@@ -1,4 +1,4 @@
-"""Depth by kind of place, of results whose errors are known: a sheet, a hole, a surface in the sky."""
+"""Depth by kind of place, of results with known errors: a sheet, a hole, a surface in the sky."""
 
 import json
 from dataclasses import replace

@@ -130,15 +130,14 @@ def test_what_has_no_depth_is_of_no_kind_and_a_sensors_shadow_hides_no_edge() ->
     assert not kinds(same)["edge"].any()
 
 
-def test_bare_is_where_the_image_hardly_changes() -> None:
-    image = TEXTURE.copy()
-    image[:, 40:] = 128
-    image[:, 40:, :] += np.linspace(0, 20, 80).astype(np.uint8)[None, :, None]  # 0.25 a pixel
-    noise = np.random.default_rng(1).normal(0, 1.5, image.shape)
-    image[:, 40:] = np.clip(image.astype(float) + noise, 0, 255).round()[:, 40:]
-    found = kinds(wall(), image)["bare"]
+@pytest.mark.parametrize(("levels", "is_bare"), [(0.5, True), (1.5, False)])
+def test_bare_is_where_the_image_hardly_changes_but_for_noise(levels: float, is_bare: bool) -> None:
+    image = TEXTURE.astype(float)
+    image[:, 40:] = 60 + levels * np.arange(80)[:, None]
+    image[:, 40:] += np.random.default_rng(1).normal(0, 1.5, SHAPE)[:, 40:, None]
+    found = kinds(wall(), image.round().clip(0, 255).astype(np.uint8))["bare"]
     assert not found[:, :40].any()
-    assert found[:, 60:].mean() > 0.95
+    assert found[10:80, 60:110].mean() == pytest.approx(float(is_bare), abs=0.02)
 
 
 def test_grazing_is_by_the_ray_not_by_the_axis() -> None:

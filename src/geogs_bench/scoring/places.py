@@ -19,8 +19,9 @@ THIN, LONG = 13, 20
 """Pixels: a thin thing leaves no room for a square of such a side, and is so long at least."""
 BEHIND = 20
 """Pixels around a thin thing in which what is farther than it counts as behind it."""
-BARE = 0.4
-"""Grey levels a pixel, root mean square over 9 x 9 pixels: a smaller gradient is bare."""
+BARE = 1.0
+"""Grey levels a pixel, root mean square over 9 x 9 pixels of the smoothed image: a smaller gradient
+is bare. Plain walls of photographs have 0.3 to 0.9, of shading and of what noise is left."""
 GRAZING = 75.0
 """Degrees between the normal and the ray."""
 _LONGEST_GAP = 32

@@ -1,4 +1,4 @@
-"""A room of thin things from a seed: legs of a table and of chairs, a railing, a lattice, a cable."""
+"""A room of thin things from a seed: legs of table and chairs, a railing, a lattice, a cable."""
 
 import math
 
