@@ -56,7 +56,8 @@ def write_sequence(folder: Path, *, sky: bool = False, depths: bool = True) -> P
     rng = np.random.default_rng(0)
     u = np.arange(CAMERA.width)
     for k, T_wc in enumerate(poses()):
-        image = rng.integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
+        coarse = rng.integers(0, 255, (CAMERA.height // 3, CAMERA.width // 3, 3), np.uint8)
+        image = coarse.repeat(3, 0).repeat(3, 1)
         cv2.imwrite(str(results / f"frame{k:06d}.png"), image)
         x = (u - CAMERA.cx) / CAMERA.fx * 2.0 + T_wc[0, 3]
         row = np.where((x > BAR[0]) & (x < BAR[1]), 2.0, WALL)
@@ -154,6 +155,30 @@ def test_of_the_sky_a_surface_in_it_is_told(tmp_path) -> None:
     sky = next(s for s in scores if s.place == "sky")
     assert sky.covered == pytest.approx(100 * 20 / 45, abs=1.5)
     assert (error_colours(views[0].view.depth, views[0].found)[44 - 10] == (200, 0, 0)).all()
+
+
+def test_a_sequence_at_another_rate_has_the_true_poses_of_its_own_times(tmp_path) -> None:
+    """As ``geogs synth`` writes a street: the lists of TUM beside, and no depth in them."""
+    folder = write_sequence(tmp_path / "road", sky=True)
+    times = np.arange(FRAMES) / 10
+    names = (f"{t:.6f} results/frame{k:06d}.png" for k, t in enumerate(times))
+    (folder / "rgb.txt").write_text("\n".join(names))
+    T_wc = poses()
+    T_wc[:, 0, 3] *= 4  # so far that another frame's pose would show
+    known = np.ones(FRAMES, bool)
+    write_tum_trajectory(folder / "groundtruth.txt", Trajectory(times, T_wc, known))
+    ground = ((-9.0, 9.0, 0.0, 9.0, WALL), (*BAR, 0.0, 9.0, 2.0))
+    write_mesh(folder / "mesh.ply", *quads(*ground))
+    result = write_result(tmp_path / "out", *ground)
+    write_tum_trajectory(result / "trajectory.tum", Trajectory(times, T_wc, known))
+    write_mesh(result / "mesh.ply", *quads(*ground))
+    (scene,) = find_depth(folder)
+    scores, _ = score_depth(scene, ResultFolder(result))
+    by_name = {s.place: s for s in scores}
+    assert by_name["all"].within_2 > 99
+    assert by_name["thin"].within_2 > 99
+    assert by_name["sky"].share == pytest.approx(100 * 45 / 90, abs=1)
+    assert by_name["sky"].covered < 0.5
 
 
 def test_the_scale_is_the_median_of_all_views_not_of_each() -> None:

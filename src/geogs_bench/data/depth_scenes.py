@@ -27,13 +27,20 @@ def find_depth(root: Path) -> list[BenchmarkScene]:
     Those in the layout of Replica have depth images or a true surface, others depth images.
     """
     rendered = [
-        scene
+        _with_times(scene)
         for scene in find_replica(root)
         if scene.truth.surface is not None or _has_rendered_depth(scene.source)
     ]
     kinect = [_with_sensor(folder) for folder in folders_like(root, _is_tum_with_depth)]
     seven_scenes = [scene for scene in find_seven_scenes(root) if scene.has_depth]
     return [replace(scene, kind="depth") for scene in (*rendered, *kinect, *seven_scenes)]
+
+
+def _with_times(scene: BenchmarkScene) -> BenchmarkScene:
+    """The scene with poses that have times, where ``geogs synth`` wrote them, too."""
+    if not (scene.source / "groundtruth.txt").is_file():
+        return scene
+    return replace(scene, truth=replace(scene.truth, poses=TruePoses(scene.source)))
 
 
 def _with_sensor(folder: Path) -> BenchmarkScene:

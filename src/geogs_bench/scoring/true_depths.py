@@ -127,11 +127,13 @@ def _from_surface(
     if truth is None or scene.truth.surface is None:
         raise InputError(f"{scene.name} has neither depth images nor a true surface with poses.")
     surface = read_surface(scene.truth.surface)
+    nothing = np.float32(np.inf if _is_outdoors(scene.source) else 0)
     views = []
     for frame in spread([frame for frame in frames if _has_pose(frame, truth)], most):
         T_cw = np.linalg.inv(pose_at(truth, frame.timestamp))
         depth, _ = render_mesh(surface.vertices, surface.faces, camera, T_cw)
-        known = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+        known = np.where(np.isfinite(depth), depth, nothing).astype(np.float32)
+        known = np.where(_moving(scene.source, frame), np.float32(0), known)
         views.append(TrueView(frame.index, frame.timestamp, frame.image, known))
     return views
 
