@@ -17,8 +17,8 @@ class SynthOptions(Settings):
     """Renders a scene, drawn at random, as a moving camera sees it, with exact truth.
 
     A furnished room and a perfect camera, if nothing else is said; ``--motion driving`` goes
-    through a street. Flaws of the camera: those of ``--camera``, and single ones beside it,
-    ``--flaws.readout 0.03``.
+    through a street, ``--motion dining`` around a table among thin things. Flaws of the camera:
+    those of ``--camera``, and single ones beside it, ``--flaws.readout 0.03``.
     """
 
     output: Annotated[Path, Positional()]

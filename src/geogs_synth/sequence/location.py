@@ -57,7 +57,7 @@ class Location:
 
 
 def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> Location:
-    """The room, street or corridor of the seed, and the motion through it.
+    """The room, dining room, street or corridor of the seed, and the motion through it.
 
     ``scene``, if it is there already, is not made again.
     """
@@ -85,7 +85,7 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
 
 
 def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
-    """The room, street or corridor of the seed that a motion goes through."""
+    """The room, dining room, street or corridor of the seed that a motion goes through."""
     if kind == "driving":
         return make_street(seed)
     if kind == "dining":

@@ -1,0 +1,39 @@
+"""The dining room: what is thin in it, and that its path keeps clear."""
+
+import numpy as np
+import pytest
+
+from geogs_bench.scoring.places import places_of
+from geogs_bench.scoring.plane_fits import fit_planes
+from geogs_synth.places.dining_room import make_dining_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.location import Location, make_location
+
+
+@pytest.fixture(scope="module")
+def location() -> Location:
+    return make_location("dining", 0)
+
+
+def test_it_is_the_same_each_time(location: Location) -> None:
+    room, again = location.scene, make_dining_room(0)
+    assert (room.solids.centre == again.solids.centre).all()
+    assert (room.texture_shift == again.texture_shift).all()
+    assert len(room.solids.kind) < 400
+
+
+def test_its_path_is_half_a_metre_from_everything(location: Location) -> None:
+    centres = location.motion.path(np.arange(0, 280, 7) / 30)[:, :3, 3]
+    assert location.scene.clearance(centres).min() > 0.5
+
+
+def test_thin_things_and_what_is_behind_them_are_in_view(location: Location) -> None:
+    camera, raycaster = location.camera(160, 120), Raycaster(location.scene, 1)
+    shares = []
+    for T_wc in location.motion.path(np.array([0.0, 3.0, 6.0])):
+        view = raycaster.render(camera, T_wc)
+        places = places_of(view.depth, view.image, camera, fit_planes(view.depth, 7, 0.003))
+        shares.append([places["thin"].mean(), places["behind thin"].mean()])
+    thin, behind = np.mean(shares, 0)
+    assert thin > 0.05
+    assert behind > 0.15
