@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from geogs.evaluation.surfaces.raster import render_mesh
 from geogs_bench.scoring.places import places_of
 from geogs_bench.scoring.plane_fits import fit_planes
 from geogs_synth.places.dining_room import make_dining_room
-from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import Location, make_location
+from geogs_synth.sequence.scene_mesh import scene_mesh
 
 
 @pytest.fixture(scope="module")
@@ -28,11 +29,12 @@ def test_its_path_is_half_a_metre_from_everything(location: Location) -> None:
 
 
 def test_thin_things_and_what_is_behind_them_are_in_view(location: Location) -> None:
-    camera, raycaster = location.camera(160, 120), Raycaster(location.scene, 1)
+    camera, (vertices, faces, *_) = location.camera(200, 150), scene_mesh(location.scene)
+    image = np.zeros((150, 200, 3), np.uint8)
     shares = []
     for T_wc in location.motion.path(np.array([0.0, 3.0, 6.0])):
-        view = raycaster.render(camera, T_wc)
-        places = places_of(view.depth, view.image, camera, fit_planes(view.depth, 7, 0.003))
+        depth, _ = render_mesh(vertices, faces, camera, np.linalg.inv(T_wc))
+        places = places_of(depth, image, camera, fit_planes(depth, 7, 0.003))
         shares.append([places["thin"].mean(), places["behind thin"].mean()])
     thin, behind = np.mean(shares, 0)
     assert thin > 0.05
