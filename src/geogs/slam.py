@@ -25,7 +25,7 @@ from geogs.slam_output import SlamOutput
 from geogs.stopwatch import StageProgress, Stopwatch, unwatched
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
-from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
+from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MetricScale
@@ -154,7 +154,7 @@ class Slam(SlamOutput):
             global_bundle(main, lambda f, _: progress("bundle adjustment", f))
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
-                self.world.uncertainty = keyframe_uncertainty(main).calibrated(main)
+                self.world.uncertainty = frame_uncertainty(main)
         self.loops.replaced_by_bundle()
         self.world.adjusted = len(main.segment.ids)
         self._update_map()

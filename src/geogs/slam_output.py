@@ -102,7 +102,7 @@ class SlamOutput:
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
 
     def uncertainty(self) -> Uncertainty | None:
-        """How well the keyframes are known, by all matches of the last adjustment.
+        """How well the tracked frames are known, by all matches of the last adjustment.
 
         None before that: what is left of the matches until then are the latest alone. Where no map
         could be started there is no keyframe, and nothing is known.

@@ -155,7 +155,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Standard deviations of keyframes, earliest first; infinite where nothing is known."""
+    """Standard deviations of frames, earliest first; infinite where nothing is known."""
 
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
@@ -166,6 +166,13 @@ class Uncertainty:
     """That of its orientation, radians."""
     depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """That of its depths, as a part of them: the median."""
+
+    def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
+        """Interpolated in time, constant beyond the ends; infinite where there is nothing."""
+        if not len(self.timestamps):
+            return Uncertainty(timestamps, *(np.full(len(timestamps), np.inf) for _ in range(3)))
+        known = (self.position, self.rotation, self.depth)
+        return Uncertainty(timestamps, *(np.interp(timestamps, self.timestamps, c) for c in known))
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ class World:
     is_refined: bool = False
     """Whether the map was trained over all keyframes at the end."""
     uncertainty: Uncertainty | None = None
-    """How well keyframes are known, by the last adjustment of all after the stream."""
+    """How well frames are known, by the last adjustment of all keyframes after the stream."""
     metric_scale: MetricScale | None = None
     """By what lengths were brought to metres."""
 

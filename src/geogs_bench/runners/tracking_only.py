@@ -19,7 +19,7 @@ from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
+from geogs.tracking.frame_uncertainty import frame_uncertainty
 
 
 @on_one_torch_thread
@@ -56,7 +56,7 @@ def track_to_folder(
         slam.loops.update(slam.segments.finish(), True)
         global_bundle(slam.segments.main)
         trajectory = slam.trajectory()
-        known = keyframe_uncertainty(slam.segments.main).calibrated(slam.segments.main)
+        known = frame_uncertainty(slam.segments.main)
         write_trajectories(folder, trajectory, slam.keyframe_trajectory())
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)

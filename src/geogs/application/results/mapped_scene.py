@@ -34,7 +34,7 @@ class MappedScene(Protocol):
         ...
 
     def uncertainty(self) -> Uncertainty | None:
-        """How well the keyframes are known; none where the poses were given."""
+        """How well frames are known; none where the poses were given."""
         ...
 
     def snapshot(self) -> MapSnapshot:

@@ -40,7 +40,7 @@ class Result:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """How well the keyframes are known; none where the poses were given."""
+        """How well frames are known; none where the poses were given."""
         return self.scene.uncertainty()
 
     @cached_property

@@ -52,7 +52,7 @@ def verdict(
     Args:
         trajectory: of all frames.
         keyframes: of the keyframes alone.
-        known: how well these are known.
+        known: how well frames are known.
         why_not: why no map could be started, if so.
     """
     centres = keyframes.T_wc[:, :3, 3]

@@ -15,17 +15,15 @@ HEADER = "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth
 def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertainty) -> None:
     """Write a row per frame: its state and standard deviations as of ``Uncertainty``.
 
-    The state is tracked, orientation only or lost. Between keyframes deviations are interpolated
-    in time; a frame that is not tracked has none.
+    The state is tracked, orientation only or lost. Between the frames of ``known`` deviations are
+    interpolated in time; a frame that is not tracked has none.
     """
     at = trajectory.timestamps
-    columns = [known.position, np.degrees(known.rotation), known.depth]
-    between = [
-        np.interp(at, known.timestamps, c) if len(c) else np.full(len(at), np.inf) for c in columns
-    ]
+    there = known.at(at)
+    columns = there.position, np.degrees(there.rotation), there.depth
     rows = [HEADER]
     for n, state in enumerate(trajectory.states):
-        numbers = [f"{c[n]:.6g}" if state == "tracked" else "" for c in between]
+        numbers = [f"{c[n]:.6g}" if state == "tracked" else "" for c in columns]
         rows.append(",".join([repr(float(at[n])), state, *numbers]))
     write_text(path, "\n".join([*rows, ""]))
 

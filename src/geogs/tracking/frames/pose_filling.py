@@ -1,6 +1,6 @@
 """Pose of every frame on the present keyframes, from the sparse flow kept along the way."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -24,6 +24,8 @@ SOLVED_TOGETHER = 64
 """Frames whose poses are solved, or observations that are corrected, at a time; bounds memory."""
 ITERATIONS = 8
 """Steps of the motion-only adjustment of a frame."""
+HUBER = 3.0
+"""Deviations beyond which a match of a frame counts linearly."""
 
 
 def solve_trajectory(
@@ -39,14 +41,11 @@ def solve_trajectory(
     interpolated, too. Without a map (``has_map``) nothing but rotations is known of any.
     """
     records = sorted([*frames.records, *elsewhere], key=lambda r: r.index)
-    keyframe_at = {s.frame_index: s.id for s in keyframes}
-    located = frames.records if has_map else []
-    tracked = [r for r in located if r.anchor is not None and r.anchor in keyframes]
-    free = [r for r in tracked if r.index not in keyframe_at and r.observations]
+    tracked = tracked_on(frames, keyframes) if has_map else []
     solved: dict[int, Tensor] = {r.index: pose_of(r, keyframes) for r in tracked}
-    for start in range(0, len(free), SOLVED_TOGETHER):
-        part = free[start : start + SOLVED_TOGETHER]
-        poses = _solved(part, keyframes)
+    solver = motion_solver(keyframes.grid, sparse_cells(keyframes.grid))
+    for part, problem in observed(tracked, keyframes):
+        poses, _ = solver.solve(problem, iterations=ITERATIONS, huber=HUBER)
         solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
     oriented = orientations(
         {r.index: r.rotations for r in records}, {n: T[:3, :3] for n, T in solved.items()}
@@ -86,16 +85,36 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
             observation.shift = shift
 
 
-def _solved(records: list[FrameRecord], keyframes: KeyframeSet) -> Float[Tensor, "n 4 4"]:
-    """Poses of frames by their observations."""
+def tracked_on(frames: FrameLog, keyframes: KeyframeSet) -> list[FrameRecord]:
+    """The frames that have a pose relative to one of the keyframes, these among them."""
+    return [r for r in frames.records if r.anchor is not None and r.anchor in keyframes]
+
+
+def observed(
+    tracked: Sequence[FrameRecord], keyframes: KeyframeSet
+) -> Iterator[tuple[list[FrameRecord], MotionProblem]]:
+    """The frames between keyframes that these see, some at a time, at the poses they were left at.
+
+    Matches are those of :func:`~geogs.tracking.frames.frame_recorder.sparse_cells`.
+    """
+    are_keyframes = {s.frame_index for s in keyframes}
+    seen = [
+        r for r in tracked
+        if r.index not in are_keyframes and any(o.keyframe in keyframes for o in r.observations)
+    ]  # fmt: skip
+    for start in range(0, len(seen), SOLVED_TOGETHER):
+        part = seen[start : start + SOLVED_TOGETHER]
+        yield part, _problem(part, keyframes)
+
+
+def _problem(records: Sequence[FrameRecord], keyframes: KeyframeSet) -> MotionProblem:
+    """Frames and all their observations; a match is as sure as the depth of its cell, too."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     pairs = [
         (n, o) for n, r in enumerate(records) for o in r.observations if o.keyframe in keyframes
     ]
     start = torch.stack([pose_of(r, keyframes) for r in records])
-    if not pairs:
-        return start
     ids = [o.keyframe for _, o in pairs]
     frame = torch.tensor([n for n, _ in pairs])
     depth = keyframes.inverse_depths(ids)[:, cells]
@@ -105,9 +124,7 @@ def _solved(records: list[FrameRecord], keyframes: KeyframeSet) -> Float[Tensor,
     p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
     weight = depth_aware_weight(weight, p.depth_jacobian, information)
     pixels = unpacked_positions(grid, torch.stack([o.shifted for _, o in pairs]))
-    problem = MotionProblem(start, depth, source, frame, pixels, weight)
-    T, _ = motion_solver(grid, cells).solve(problem, iterations=ITERATIONS)
-    return T
+    return MotionProblem(start, depth, source, frame, pixels, weight)
 
 
 def depth_aware_weight(

@@ -45,7 +45,14 @@ def pose_deviation(
     known = keyframe.confident_information[None]
     weight = depth_aware_weight(match.weight[:1], p.depth_jacobian, known) * p.valid[..., None]
     J = p.pose_jacobian[0]
-    H = torch.einsum("icp,jcp,pc->ij", J, J, weight[0]).double().cpu()
+    return left_open(torch.einsum("icp,jcp,pc->ij", J, J, weight[0]).double().cpu())
+
+
+def left_open(H: Float[Tensor, "6 6"]) -> PoseDeviation:
+    """Deviations of a pose by the normal equations of its left perturbation; float64, on the CPU.
+
+    Infinite where these leave a direction open.
+    """
     scale = H.diagonal().clamp(min=1e-30).rsqrt()
     inverse, failed = torch.linalg.inv_ex(scale[:, None] * H * scale)
     if int(failed):

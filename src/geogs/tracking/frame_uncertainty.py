@@ -1,0 +1,78 @@
+"""How well a tracker knows its frames: the keyframes around them, and each by its own matches."""
+
+import math
+
+import numpy as np
+import torch
+
+from geogs.bundle.device_choice import motion_solver
+from geogs.bundle.flow_term import normal_equations, residual_norms, weighed_residuals
+from geogs.bundle.projection import linearise
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.frames.frame_recorder import sparse_cells
+from geogs.tracking.frames.pose_filling import HUBER, ITERATIONS, observed, tracked_on
+from geogs.tracking.keyframe_uncertainty import COMMON_ERRORS, keyframe_uncertainty
+from geogs.tracking.locate.pose_deviation import PoseDeviation, left_open
+from geogs.tracking.tracker import Tracker
+from geogs.types import Uncertainty
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import KeyframeSet
+
+EXPECTED_RESIDUAL = math.sqrt(2 * math.log(2))
+"""Median length of an error in two dimensions, in its deviations."""
+
+
+def frame_uncertainty(tracker: Tracker) -> Uncertainty:
+    """Deviations of all tracked frames of a tracker that has a map, by its present edges.
+
+    A frame between keyframes is as far off as they are (their calibrated deviations, interpolated
+    in time), and by what its own few matches leave open beside (:func:`own_deviations`); the two
+    are independent. Depths are those of the keyframes around.
+    """
+    log, keyframes = tracker.map.recorder.log, tracker.keyframes
+    tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
+    times = np.array([r.timestamp for r in tracked], np.float64)
+    around = keyframe_uncertainty(tracker).calibrated(tracker).at(times)
+    known = {k.frame_index: PoseDeviation(0.0, 0.0) for k in keyframes}
+    known |= own_deviations(log, keyframes)
+    unknown = PoseDeviation(np.inf, np.inf)
+    own = [known.get(r.index, unknown) for r in tracked]
+    return Uncertainty(
+        times,
+        np.hypot(around.position, np.array([d.position for d in own])),
+        np.hypot(around.rotation, np.array([d.rotation for d in own])),
+        around.depth,
+    )
+
+
+def own_deviations(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, PoseDeviation]:
+    """Deviations of frames between keyframes relative to these, by the indices of the frames.
+
+    What the matches of a frame leave open at its solution (:func:`left_open`), a match being as
+    unsure as their residuals are long: deviations times the frame's median residual over the one
+    to be expected, and times ``COMMON_ERRORS``. Frames that no match tells of are left out.
+    Source: the variance factor a posteriori of least squares, by a median for robustness.
+    """
+    grid, found = keyframes.grid, dict[int, PoseDeviation]()
+    cells = sparse_cells(grid)
+    solver = motion_solver(grid, cells)
+    for part, problem in observed(tracked_on(frames, keyframes), keyframes):
+        T, _ = solver.solve(problem, iterations=ITERATIONS, huber=HUBER)
+        T_ji = T[problem.frame] @ se3_inverse(problem.T_source)
+        p = linearise(grid.camera, grid.rays[cells], T_ji, problem.inverse_depth)
+        r, w = weighed_residuals(p, problem.pixels, problem.weight, HUBER)
+        H, _ = normal_equations(p.pose_jacobian * w.mT[:, None], p.pose_jacobian, r)
+        total = torch.zeros(len(part), 6, 6, dtype=H.dtype)
+        total.index_add_(0, problem.frame, H.cpu())
+        norm = residual_norms(p, problem.pixels, problem.weight).cpu()
+        used = (p.valid & (problem.weight[..., 0] > 0)).cpu()
+        for n, record in enumerate(part):
+            edges = problem.frame == n
+            if bool(used[edges].any()):
+                factor = COMMON_ERRORS * float(norm[edges][used[edges]].median())
+                factor /= EXPECTED_RESIDUAL
+                open_ = left_open(total[n])
+                found[record.index] = PoseDeviation(
+                    factor * open_.position, factor * open_.rotation
+                )
+    return found
