@@ -6,6 +6,8 @@ import numpy as np
 import torch
 
 from geogs.depth.depth_view import DepthView, depth_images
+from geogs.depth.plane_sweep import SweepResult
+from geogs.depth.refinement import SlantedDepth
 from geogs.geometry.camera import Camera
 
 WORKING = Camera(fx=160.0, fy=160.0, cx=95.5, cy=71.5, width=192, height=144)
@@ -77,3 +79,37 @@ def _turn(axis_angle: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(axis_angle).as_matrix()
+
+
+FOREGROUND, WALL, FATTENED = np.float32(0.5), np.float32(0.4), 3
+"""Inverse depths of two surfaces, and pixels by which the nearer seems wider than it is."""
+
+
+def inside(height: int, width: int, beyond: int = 0) -> np.ndarray:
+    """Pixels of a square in the middle of an image, and of so many beyond its sides."""
+    y, x = np.mgrid[:height, :width]
+    half = height // 4 + beyond
+    return (np.abs(y - height // 2) <= half) & (np.abs(x - width // 2) <= half)
+
+
+def fattened(height: int, width: int) -> tuple[SlantedDepth, np.ndarray, np.ndarray, SweepResult]:
+    """A square before a slanted bare wall that a search has fattened, for ``resolve_edges``.
+
+    Its confidence, the image's colours, and a sweep whose costs tell the square from the wall and
+    nothing beside it.
+    """
+    rng = np.random.default_rng(5)
+    square, halo = inside(height, width), inside(height, width, FATTENED)
+    slope = np.float32(2e-4)
+    wall = WALL + slope * np.arange(width, dtype=np.float32) * np.ones((height, 1), np.float32)
+    rho = np.where(halo, FOREGROUND, wall) * (1 + 1e-3 * rng.standard_normal((height, width)))
+    zero = np.zeros((height, width), np.float32)
+    slope_x = np.where(halo, np.float32(0.0), slope).astype(np.float32)
+    guide = np.where(square, 0.7, 0.3) + 0.02 * rng.standard_normal((3, height, width))
+    planes = np.linspace(0.3, 0.6, 31, dtype=np.float32)
+    away = np.abs(planes - np.where(square, FOREGROUND, wall)[..., None]) / 0.02
+    costs = np.where((halo & ~square)[..., None], 0.6, np.minimum(away, 1.0)).astype(np.float32)
+    confidence = rng.uniform(0.6, 0.95, (height, width)).astype(np.float32)
+    refined = SlantedDepth(rho.astype(np.float32), slope_x, zero, zero + 5)
+    sweep = SweepResult(rho.astype(np.float32), zero, zero, planes, costs)
+    return refined, confidence, guide.astype(np.float32), sweep

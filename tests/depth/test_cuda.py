@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
-from depth_scene import WORKING, DepthScene, make_scene, trace
+from depth_scene import WORKING, DepthScene, fattened, make_scene, trace
 from geogs.config import DepthConfig
 from geogs.depth import plane_sweep as cpu_sweep
 from geogs.depth import plane_sweep_kernels as sweep_loops
@@ -23,6 +23,7 @@ from geogs.depth.completion import (
 )
 from geogs.depth.confidence import depth_confidence
 from geogs.depth.cuda import completion as completion_module
+from geogs.depth.cuda import edges as edges_module
 from geogs.depth.cuda import fusion as check_module
 from geogs.depth.cuda import plane_sweep as sweep_module
 from geogs.depth.cuda import refinement as refine_module
@@ -31,6 +32,7 @@ from geogs.depth.cuda.images import KeyframeImages, packed
 from geogs.depth.cuda.plane_sweep import PlaneSlots, SweptDepth
 from geogs.depth.cuda.refinement import PixelPositions, SlantedMaps, TrackerMaps
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth, homographies
+from geogs.depth.edges import resolve_edges
 from geogs.depth.evidence import (
     TrackerEvidence,
     choose_start,
@@ -77,7 +79,9 @@ def setting(
 ) -> Setting:
     """A few pixels in the emulator; the real size on a GPU."""
     if request.param == "emulated":
-        use_emulator(monkeypatch, completion_module, sweep_module, refine_module, check_module)
+        use_emulator(
+            monkeypatch, completion_module, sweep_module, refine_module, edges_module, check_module
+        )
         monkeypatch.setattr(cpu_sweep, "SUPPORT_RADIUS", 2)
         most_planes, device, size = 29, "cpu", (WORKING.resized(37, 30), 1.6)
     elif torch.cuda.is_available():
@@ -213,7 +217,7 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
     )
     images = KeyframeImages.of(view, setting.device)
     _close(refine_module.gather_patches(images.fine, places), patches.samples, rounding)
-    guide = cpu_refinement._colour_guide(view, setting.render)
+    guide = cpu_refinement.colour_guide(view, setting.render)
     _close(images.colours, guide, 1e-6)
 
 
@@ -271,8 +275,12 @@ def test_start_is_the_surer_of_sweep_and_tracker(setting):
     shape = tracker.prior_weight.shape
     swept = tracker.inverse_depth * (F(0.9) + F(0.2) * _random(*shape))
     cost, margin = _random(*shape, seed=1), F(4.0) * _random(*shape, seed=2)
-    expected = choose_start(tracker, SweepResult(swept, cost, margin))
-    maps = SweptDepth(*(_to(setting, m) for m in (swept, cost, margin)))
+    costs = np.zeros((*shape, setting.most_planes), F)
+    expected = choose_start(tracker, SweepResult(swept, cost, margin, setting.planes, costs))
+    slots = PlaneSlots.of(setting.planes, setting.device)
+    maps = SweptDepth(
+        *(_to(setting, m) for m in (swept, cost, margin)), slots, _by_slot(setting, costs, slots)
+    )
     rho, sure = refine_module.choose_start(_maps(setting), maps)
     _close(rho, expected[0], 1e-6)
     _close(sure, expected[1], 1e-5)
@@ -336,9 +344,28 @@ def test_confidence(setting):
     refined = cpu_refinement.SlantedDepth(held, zero, zero, support)
     expected = depth_confidence(refined, margin, tracker)
     maps = SlantedMaps(*(_to(setting, m) for m in (rho, zero, zero, support)))
-    depth, confidence = refine_module.judge(maps, _to(setting, margin), _maps(setting), near, far)
-    _close(depth, 1.0 / held, 1e-6)
+    confidence = refine_module.judge(maps, _to(setting, margin), _maps(setting), near, far)
+    _close(maps.inverse_depth, held, 1e-6)
     _close(confidence, expected, 1e-4)
+
+
+def test_edges(setting):
+    shape = setting.scene.truth[0].shape
+    refined, confidence, guide, swept = fattened(*shape)
+    expected, sure = resolve_edges(refined, confidence, guide, swept)
+    slots = PlaneSlots.of(swept.planes, setting.device)
+    zero = _to(setting, 0 * confidence)
+    costs = _by_slot(setting, swept.costs, slots)
+    planes = (refined.inverse_depth, refined.slope_x, refined.slope_y, refined.support)
+    got, got_sure = edges_module.resolve_edges(
+        SlantedMaps(*(_to(setting, m) for m in planes)), _to(setting, confidence),
+        _to(setting, guide), SweptDepth(zero, zero, zero, slots, costs),
+    )  # fmt: skip
+    assert float((expected.inverse_depth != refined.inverse_depth).mean()) > 0.01
+    _close(got.inverse_depth, expected.inverse_depth, 1e-4, 0.998)
+    _close(got.slope_x, expected.slope_x, 1e-4, 0.998)
+    _close(got.slope_y, expected.slope_y, 1e-4, 0.998)
+    _close(got_sure, sure, 1e-3, 0.998)
 
 
 def _engines(setting: Setting) -> tuple[CpuDepthEngine, CudaDepthEngine]:

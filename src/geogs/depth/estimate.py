@@ -8,9 +8,10 @@ from geogs.config import DepthConfig
 from geogs.depth.completion import complete_inverse_depth
 from geogs.depth.confidence import depth_confidence
 from geogs.depth.depth_view import DepthView, KeyframeDepth
+from geogs.depth.edges import resolve_edges
 from geogs.depth.evidence import choose_start, tracker_evidence
 from geogs.depth.plane_sweep import plane_sweep, sweep_planes
-from geogs.depth.refinement import refine_depth
+from geogs.depth.refinement import colour_guide, refine_depth
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
 
@@ -26,10 +27,11 @@ def estimate_depth(
     """Dense depth of a keyframe from the tracker's grid and from matching with its neighbours.
 
     Completion of the grid, plane sweep with semi-global matching around it, refinement of both on
-    slanted patches, and a calibrated confidence. ``neighbours`` are best chosen by
-    ``select_sweep_neighbours``; without any, the completed grid is all there is. ``limits`` are the
-    nearest and farthest depth to search; by default the tracker's, widened. Deterministic;
-    releases the interpreter lock, so that several keyframes can be estimated at once in threads.
+    slanted patches, a calibrated confidence, and the sides of depth edges by colour. ``neighbours``
+    are best chosen by ``select_sweep_neighbours``; without any, the completed grid is all there is.
+    ``limits`` are the nearest and farthest depth to search; by default the tracker's, widened.
+    Deterministic; releases the interpreter lock, so that several keyframes can be estimated at once
+    in threads.
     """
     completed = complete_inverse_depth(
         reference.inverse_depth, reference.information, reference.image
@@ -45,6 +47,6 @@ def estimate_depth(
     start = choose_start(tracker, sweep)
     refined = refine_depth(reference, neighbours, render, working, *start, tracker)
     refined.inverse_depth = np.clip(refined.inverse_depth, 0.5 / far, 2.0 / near)
-    return KeyframeDepth(
-        1.0 / refined.inverse_depth, depth_confidence(refined, sweep.margin, tracker)
-    )
+    confidence = depth_confidence(refined, sweep.margin, tracker)
+    refined, confidence = resolve_edges(refined, confidence, colour_guide(reference, render), sweep)
+    return KeyframeDepth(1.0 / refined.inverse_depth, confidence)

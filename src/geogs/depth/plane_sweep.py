@@ -43,6 +43,10 @@ class SweepResult:
     """Matching cost 1 - NCC of the winner, 0 (alike) to 1.2."""
     margin: Float32[np.ndarray, "h w"]
     """Aggregated cost of the best other plane less the winner's: how unique the match is."""
+    planes: Float32[np.ndarray, "p"]
+    """Inverse depths that were tried, equally spaced."""
+    costs: Float32[np.ndarray, "h w p"]
+    """Matching cost of each, averaged over pixels of like colour and pulled to the prior."""
 
 
 def sweep_planes(
@@ -119,7 +123,7 @@ def plane_sweep(
         lambda *rows: kernels.pick_planes(*rows, total, volume, position, cost, margin), len(guide)
     )
     spacing = (planes[-1] - planes[0]) / np.float32(len(planes) - 1)
-    return SweepResult(planes[0] + position * spacing, cost, margin)
+    return SweepResult(planes[0] + position * spacing, cost, margin, planes, volume)
 
 
 def matching_costs(

@@ -16,7 +16,7 @@ from geogs.threads import over_rows
 
 PATCH_REACH = 2
 """Patches of 5 x 5 samples, one render pixel apart."""
-PATCH_CONTRAST = 200.0
+PATCH_CONTRAST = 500.0
 """How fast a patch sample's weight falls with its grey difference, squared."""
 REFINE_STEPS = 3
 """Photometric steps, each with a fit of local planes."""
@@ -83,7 +83,7 @@ def refine_depth(
     photometric optimum, the tracker's value (robust) and the local plane.
     """
     patches = _gather_patches(reference, neighbours, render, working)
-    guide = _colour_guide(reference, render)
+    guide = colour_guide(reference, render)
     state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
         _fit_planes(state, confidence, guide, radius, tolerance, 0.0)
@@ -150,7 +150,7 @@ def _fit_planes(
     state.slope_x, state.slope_y = slope_x, slope_y
 
 
-def _colour_guide(reference: DepthView, render: Camera) -> Float32[np.ndarray, "3 h w"]:
+def colour_guide(reference: DepthView, render: Camera) -> Float32[np.ndarray, "3 h w"]:
     """The colour image at the render size in [0, 1], channels first."""
     size = (render.width, render.height)
     small = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)

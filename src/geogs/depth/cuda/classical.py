@@ -12,6 +12,7 @@ from torch import Tensor
 
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.completion import can_complete, complete
+from geogs.depth.cuda.edges import resolve_edges
 from geogs.depth.cuda.fusion import check, vote
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
@@ -174,4 +175,6 @@ class CudaDepthEngine:
             own, torch.stack([o.fine for o in others]), upload(finely, device), self._positions,
             *choose_start(tracker, swept), tracker,
         )  # fmt: skip
-        return judge(refined, swept.margin, tracker, plan.near, plan.far)
+        confidence = judge(refined, swept.margin, tracker, plan.near, plan.far)
+        refined, confidence = resolve_edges(refined, confidence, own.colours, swept)
+        return 1.0 / refined.inverse_depth, confidence

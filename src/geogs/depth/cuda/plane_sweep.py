@@ -59,6 +59,9 @@ class SweptDepth:
     inverse_depth: Float32[Tensor, "h w"]
     cost: Float32[Tensor, "h w"]
     margin: Float32[Tensor, "h w"]
+    planes: PlaneSlots
+    costs: Float32[Tensor, "h w s"]
+    """By slot."""
 
 
 def match_planes(
@@ -125,7 +128,7 @@ def pick_planes(
         -(-h * w // 4), (32, 4), paths, volume, planes.per, h * w, planes.count, planes.first,
         planes.spacing, *out,
     )  # fmt: skip
-    return SweptDepth(*out)
+    return SweptDepth(*out, planes, volume)
 
 
 def sweep(

@@ -202,17 +202,18 @@ struct ConfidenceWeights {
   float bias, margin, tracker_agrees, tracker_differs, jump, support, tolerance;
 };
 
-// Depth 1 / rho, with rho held within [least, most], and the chance that it is right.
+// rho held within [least, most], and the chance that the depth 1 / rho is right.
 // weights: ConfidenceWeights.
 extern "C" __global__ void judge_depth(
     const float* rho, const float* margin, const float* support, const float* tracker,
     const float* tracker_weight, const float* weights, int h, int w, float least, float most,
-    float* depth, float* confidence) {
+    float* held, float* confidence) {
   const int x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y;
   if (x >= w || y >= h) return;
   const int p = y * w + x;
   float near = fminf(fmaxf(rho[p], least), most), far = near;  // extreme inverse depths around
   const float z = 1.f / near;
+  held[p] = near;
   for (int v = max(y - 1, 0); v <= min(y + 1, h - 1); v++)
     for (int u = max(x - 1, 0); u <= min(x + 1, w - 1); u++) {
       const float other = fminf(fmaxf(rho[v * w + u], least), most);
@@ -226,6 +227,5 @@ extern "C" __global__ void judge_depth(
   float score = c.bias + c.margin * fminf(fmaxf(margin[p], 0.f), 4.f);
   score += known * (c.tracker_agrees * agrees + c.tracker_differs * (1.f - agrees));
   score += c.jump * jump + c.support * __logf(support[p] + 0.1f);
-  depth[p] = z;
   confidence[p] = 1.f / (1.f + __expf(-score));
 }

@@ -182,14 +182,15 @@ def judge(
     tracker: TrackerMaps,
     near: float,
     far: float,
-) -> tuple[Tensor, Tensor]:
-    """Depth, held within half of ``near`` and twice ``far``, and its confidence."""
+) -> Float32[Tensor, "h w"]:
+    """Hold the inverse depth within half of 1 / ``far`` and twice 1 / ``near``; its confidence."""
     h, w = margin.shape
-    depth, confidence = torch.empty_like(margin), torch.empty_like(margin)
+    held, confidence = torch.empty_like(margin), torch.empty_like(margin)
     weights = upload(np.array(WEIGHTS, np.float32), margin.device)
     kernels_for(SOURCE, margin.device)["judge_depth"](
         (-(-w // 32), -(-h // 4)), (32, 4), refined.inverse_depth, margin, refined.support,
-        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, depth,
+        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, held,
         confidence,
     )  # fmt: skip
-    return depth, confidence
+    refined.inverse_depth = held
+    return confidence

@@ -1,0 +1,47 @@
+"""The test at depth edges of ``edges.py`` on a GPU."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from geogs.depth.cuda.plane_sweep import SweptDepth
+from geogs.depth.cuda.refinement import SlantedMaps
+from geogs.depth.edges import (
+    APART,
+    CONTRAST,
+    COST_TRUST,
+    MEAN_SHIFTS,
+    MOVED_CONFIDENCE,
+    PASSES,
+    WIDTH,
+    reach_of,
+)
+from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import upload
+
+SOURCE = Path(__file__).with_name("edges.cu")
+
+
+def resolve_edges(
+    refined: SlantedMaps,
+    confidence: Float32[Tensor, "h w"],
+    colours: Float32[Tensor, "3 h w"],
+    swept: SweptDepth,
+) -> tuple[SlantedMaps, Float32[Tensor, "h w"]]:
+    """As ``geogs.depth.edges.resolve_edges``; ``colours`` is the image in [0, 1]."""
+    h, w = confidence.shape
+    planes = swept.planes
+    settings = np.array([CONTRAST, APART, WIDTH, COST_TRUST, MOVED_CONFIDENCE], np.float32)
+    settings = upload(settings, confidence.device)
+    maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
+    for _ in range(PASSES):
+        out = [torch.empty_like(confidence) for _ in maps]
+        kernels_for(SOURCE, confidence.device)["resolve_edges"](
+            (-(-w // 32), -(-h // 4)), (32, 4), *maps, colours, swept.costs, settings, planes.per,
+            planes.count, planes.first, planes.spacing, reach_of((h, w)), MEAN_SHIFTS, h, w, *out,
+        )  # fmt: skip
+        maps = out
+    return SlantedMaps(*maps[:3], refined.support), maps[3]

@@ -1,0 +1,67 @@
+"""Which side of a depth edge a pixel is on: colour decides where matching cannot.
+
+A window that holds a silhouette matches at the silhouette's depth, and beside it, on a bare wall,
+nothing contradicts: the foreground is fattened. The wall's colour goes on to the silhouette.
+"""
+
+import numpy as np
+from jaxtyping import Float32
+
+from geogs.depth import edge_kernels as kernels
+from geogs.depth.plane_sweep import SweepResult
+from geogs.depth.refinement import SlantedDepth
+from geogs.threads import over_rows
+
+REACH = 0.019
+"""Surfaces so far away have a say, in long edges of the image: 6 pixels of 320."""
+LEAST_REACH = 4
+"""Pixels, in small images."""
+CONTRAST = 300.0
+"""How fast a pixel's say falls with its colour difference, squared; the fall is squared, too."""
+APART = 0.015
+"""Relative difference of inverse depth from which a pixel around is of another surface."""
+WIDTH = 0.02
+"""Relative width of the kernel with which the mode of such pixels is sought."""
+MEAN_SHIFTS = 3
+"""Steps to the mode."""
+COST_TRUST = 6.0
+"""What a matching cost that is less by 1 counts, as a log ratio of weights."""
+PASSES = 2
+"""Times that all pixels are asked; what has moved is in the way of the next no more."""
+MOVED_CONFIDENCE = 0.7
+"""Share of the confidence around that a pixel keeps which takes another plane, as measured."""
+
+
+def reach_of(shape: tuple[int, ...]) -> int:
+    """Pixels that ``REACH`` is in an image."""
+    return max(LEAST_REACH, round(REACH * max(shape)))
+
+
+def resolve_edges(
+    refined: SlantedDepth,
+    confidence: Float32[np.ndarray, "h w"],
+    guide: Float32[np.ndarray, "3 h w"],
+    sweep: SweepResult,
+) -> tuple[SlantedDepth, Float32[np.ndarray, "h w"]]:
+    """The depth with each pixel on the surface that it most likely shows, and the confidence.
+
+    A pixel may take the plane of farther or nearer pixels around. Each of these has a say by its
+    confidence and its likeness in colour (adaptive support weights, Yoon and Kweon 2006). The modes
+    of their planes' inverse depths there are candidates (mean shift), as in a weighted median
+    filter of a disparity map (Ma et al. 2013), and the sweep's aggregated cost of each counts, too.
+    ``guide`` is the image in [0, 1].
+    """
+    maps = refined.inverse_depth, refined.slope_x, refined.slope_y, confidence
+    f, planes = np.float32, sweep.planes
+    spacing = (planes[-1] - planes[0]) / f(max(len(planes) - 1, 1))
+    settings = [f(x) for x in (CONTRAST, APART, WIDTH, COST_TRUST)]
+    for _ in range(PASSES):
+        old, maps = maps, tuple(np.empty_like(m) for m in maps)
+        over_rows(
+            lambda *rows, old=old, new=maps: kernels.resolve_edges(
+                *rows, *old, guide, sweep.costs, planes[0], spacing, reach_of(confidence.shape),
+                *settings, MEAN_SHIFTS, f(MOVED_CONFIDENCE), *new,
+            ),
+            len(confidence),
+        )  # fmt: skip
+    return SlantedDepth(*maps[:3], refined.support), maps[3]
