@@ -51,12 +51,12 @@ def resolve_edges(
     filter of a disparity map (Ma et al. 2013), and the sweep's aggregated cost of each counts, too.
     ``guide`` is the image in [0, 1].
     """
-    maps = refined.inverse_depth, refined.slope_x, refined.slope_y, confidence
+    maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
     f, planes = np.float32, sweep.planes
     spacing = (planes[-1] - planes[0]) / f(max(len(planes) - 1, 1))
     settings = [f(x) for x in (CONTRAST, APART, WIDTH, COST_TRUST)]
     for _ in range(PASSES):
-        old, maps = maps, tuple(np.empty_like(m) for m in maps)
+        old, maps = maps, [np.empty_like(m) for m in maps]
         over_rows(
             lambda *rows, old=old, new=maps: kernels.resolve_edges(
                 *rows, *old, guide, sweep.costs, planes[0], spacing, reach_of(confidence.shape),
@@ -64,4 +64,5 @@ def resolve_edges(
             ),
             len(confidence),
         )  # fmt: skip
-    return SlantedDepth(*maps[:3], refined.support), maps[3]
+    rho, slope_x, slope_y, confidence = maps
+    return SlantedDepth(rho, slope_x, slope_y, refined.support), confidence

@@ -34,8 +34,8 @@ def resolve_edges(
     """As ``geogs.depth.edges.resolve_edges``; ``colours`` is the image in [0, 1]."""
     h, w = confidence.shape
     planes = swept.planes
-    settings = np.array([CONTRAST, APART, WIDTH, COST_TRUST, MOVED_CONFIDENCE], np.float32)
-    settings = upload(settings, confidence.device)
+    constants = np.array([CONTRAST, APART, WIDTH, COST_TRUST, MOVED_CONFIDENCE], np.float32)
+    settings = upload(constants, confidence.device)
     maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
     for _ in range(PASSES):
         out = [torch.empty_like(confidence) for _ in maps]
@@ -44,4 +44,5 @@ def resolve_edges(
             planes.count, planes.first, planes.spacing, reach_of((h, w)), MEAN_SHIFTS, h, w, *out,
         )  # fmt: skip
         maps = out
-    return SlantedMaps(*maps[:3], refined.support), maps[3]
+    rho, slope_x, slope_y, confidence = maps
+    return SlantedMaps(rho, slope_x, slope_y, refined.support), confidence

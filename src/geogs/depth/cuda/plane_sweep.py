@@ -123,12 +123,12 @@ def pick_planes(
 ) -> SweptDepth:
     """The winners of the summed path costs."""
     h, w = volume.shape[:2]
-    out = [volume.new_empty(h, w) for _ in range(3)]
+    rho, cost, margin = (volume.new_empty(h, w) for _ in range(3))
     kernels_for(AGGREGATION, volume.device)["pick_planes"](
         -(-h * w // 4), (32, 4), paths, volume, planes.per, h * w, planes.count, planes.first,
-        planes.spacing, *out,
+        planes.spacing, rho, cost, margin,
     )  # fmt: skip
-    return SweptDepth(*out, planes, volume)
+    return SweptDepth(rho, cost, margin, planes, volume)
 
 
 def sweep(

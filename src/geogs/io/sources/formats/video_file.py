@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -154,7 +155,7 @@ def _decoded(container: InputContainer, path: Path) -> Iterator[av.VideoFrame | 
             yield from itertools.islice(_decoded(again, path), count, None)
 
 
-def _packets(container: InputContainer, path: Path) -> Iterator[av.Packet]:
+def _packets(container: InputContainer, path: Path) -> Iterator["av.Packet[Any]"]:
     """Packets to the end, the empty last one too, or to where the file is cut off."""
     try:
         yield from container.demux(container.streams.video[0])
