@@ -88,6 +88,7 @@ def resolve_edges(
     size = (2 * reach + 1) ** 2
     samples = np.empty((5, size), np.float32)
     mode = np.empty(4, np.float32)
+    weights, sums = np.empty(2, np.float32), np.empty(2, np.float32)
     little, enough = np.float32(0.1), np.float32(0.3)
     for y in range(first, last):
         for x in range(rho.shape[1]):
@@ -98,7 +99,9 @@ def resolve_edges(
                 y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, samples
             )
             far, near = own * (ONE - apart), own * (ONE + apart)
-            same, weights, sums = ZERO, np.zeros(2, np.float32), np.zeros(2, np.float32)
+            same = ZERO
+            weights[:] = ZERO
+            sums[:] = ZERO
             for i in range(count):
                 value, weight = samples[0, i], samples[3, i]
                 if value <= far or value >= near:

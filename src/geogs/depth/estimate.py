@@ -45,8 +45,9 @@ def estimate_depth(
         reference, neighbours, render, planes, tracker.inverse_depth, tracker.prior_weight
     )
     start = choose_start(tracker, sweep)
-    refined = refine_depth(reference, neighbours, render, working, *start, tracker)
+    guide = colour_guide(reference, render)
+    refined = refine_depth(reference, neighbours, render, working, *start, tracker, guide)
     refined.inverse_depth = np.clip(refined.inverse_depth, 0.5 / far, 2.0 / near)
     confidence = depth_confidence(refined, sweep.margin, tracker)
-    refined, confidence = resolve_edges(refined, confidence, colour_guide(reference, render), sweep)
+    refined, confidence = resolve_edges(refined, confidence, guide, sweep)
     return KeyframeDepth(1.0 / refined.inverse_depth, confidence)

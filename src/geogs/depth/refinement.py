@@ -75,15 +75,16 @@ def refine_depth(
     rho: Float32[np.ndarray, "h w"],
     confidence: Float32[np.ndarray, "h w"],
     tracker: TrackerEvidence,
+    guide: Float32[np.ndarray, "3 h w"],
 ) -> SlantedDepth:
     """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
 
     They begin at the inverse depth ``rho``; ``confidence`` (0 to 1) says which pixels make the
-    first planes. After each step a pixel's inverse depth is the precision-weighted mean of the
-    photometric optimum, the tracker's value (robust) and the local plane.
+    first planes; ``guide`` is the image of :func:`colour_guide`. After each step a pixel's inverse
+    depth is the precision-weighted mean of the photometric optimum, the tracker's value (robust)
+    and the local plane.
     """
     patches = _gather_patches(reference, neighbours, render, working)
-    guide = colour_guide(reference, render)
     state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
         _fit_planes(state, confidence, guide, radius, tolerance, 0.0)
