@@ -171,7 +171,7 @@ def test_image_list_with_missing_files(tmp_path):
         (InputConfig(intrinsics="50,50,32,inf"), "infinity"),
         (InputConfig(intrinsics="50,50,32,24,nan,0,0,0"), "NaN"),
         (InputConfig(intrinsics="0,50,32,24"), "must be positive"),
-        (InputConfig(intrinsics="50,-50,32,24"), "must be positive"),
+        (InputConfig(intrinsics="-50,50,32,24"), "must be positive"),
         (InputConfig(intrinsics="50,50,32"), "hold 3 numbers"),
         (InputConfig(intrinsics="500,500,320,240"), "another resolution"),
         (InputConfig(intrinsics="camera.json"), "neither auto, nor a file"),

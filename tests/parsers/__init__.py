@@ -4,6 +4,7 @@ from parsers.base import Parser
 from parsers.calibrations import calibrations
 from parsers.depths import depths
 from parsers.fleets import fleets
+from parsers.layouts import layouts
 from parsers.networks import networks
 from parsers.photographs import photographs
 from parsers.pose_priors import pose_priors
@@ -18,6 +19,6 @@ def parsers() -> dict[str, Parser]:
     """All of them by name."""
     groups = (
         calibrations, recordings, depths, pose_priors, photographs, posed, results, surfaces,
-        states, fleets, networks,
+        states, fleets, networks, layouts,
     )  # fmt: skip
     return {name: parser for group in groups for name, parser in group().items()}

@@ -47,6 +47,19 @@ def calibrations() -> dict[str, Parser]:
         "calibration-colmap": (
             "cameras.txt", "# one\n1 OPENCV 64 48 50 50 32 24 0.01 0 0 0\n", mutations.text
         ),
+        "calibration-kitti": (
+            "calib.txt", "P0: 50 0 31.5 0 0 50 23.5 0 0 0 1 0\nTr: 1 0 0\n", mutations.text
+        ),
+        "calibration-pincam": ("a.pincam", "64 48 50 50 31.5 23.5\n", mutations.text),
+        "calibration-scannetpp": (
+            "pose_intrinsic_imu.json",
+            json.dumps({"frame_000000": {"intrinsic": [[50, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]}}),
+            mutations.json_text,
+        ),
+        "calibration-record3d": (
+            "metadata", json.dumps({"w": 64, "h": 48, "K": [50, 0, 0, 0, 50, 0, 31.5, 23.5, 1]}),
+            mutations.json_text,
+        ),
         "calibration-numbers": ("calib.txt", "50 50 31.5 23.5 0.01 0 0 0\n", mutations.text),
         "calibration-matrix": ("k.txt", "50 0 31.5\n0 50 23.5\n0 0 1\n", mutations.text),
     }  # fmt: skip

@@ -112,9 +112,9 @@ class EvalSettings(Settings):
     output: Annotated[Path, Positional()]
     """Folder of a result, as ``geogs run`` writes it."""
     gt: Path
-    """True poses: a TUM file, a traj.txt of 4x4 rows (row k is at k / 30 s), or the folder of a
-    Replica, TUM, 7-Scenes or synthetic sequence, or of images with known poses (COLMAP, DTU...);
-    the true surface is then found, too."""
+    """True poses: a TUM file, a traj.txt of 4x4 rows (row k is at k / 30 s), the file of a data set
+    (KITTI, EuRoC, TUM-VI, TartanAir, ARKitScenes, ICL-NUIM), or the folder of a sequence, or of
+    images with known poses (COLMAP, DTU...); the true surface is then found, too."""
     protocol: Literal["area", "samples", "vertex", "object", "dtu"] = "area"
     """How surfaces are compared: by area with exact distances, area-weighted from samples to
     samples (NICE-SLAM), vertex-weighted (Splat-SLAM, HI-SLAM2), a single object inside its masks

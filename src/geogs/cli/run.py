@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunOptions(LiveSettings, Verbosity, RunSettings):
-    """Reconstruct a video, images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
+    """Reconstruct a video, images, a bag of ROS, or a sequence of a data set as it lies on disk.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
     Several videos of one place: ``geogs run a.mp4 b.mp4``. A camera: ``geogs run camera:0``, until

@@ -9,12 +9,14 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import EvaluatedPhoto
 from geogs.evaluation.surfaces.silhouettes import Silhouette
-from geogs.io.pose_files import read_poses
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import holds_posed_images, open_posed_source
+from geogs.io.sources.truth_files import read_truth
 from geogs.types import Trajectory
 
 _METRES = {"millimetres": 0.001}
+_MODEL = ("images.txt", "cameras.txt")
+"""Files of a COLMAP model, of which one may stand for it."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +41,23 @@ class TrueScene:
 def read_true_scene(path: Path) -> TrueScene:
     """Read true poses: a pose file, a folder with one, or any image set with known poses.
 
+    Of a data set with several cameras the poses are of the one whose folder of images is given,
+    else of the one that would be read of the sequence.
+
     Raises:
         InputError: there are no poses.
     """
     try:
-        return TrueScene(path, read_poses(path))
+        return TrueScene(path, read_truth(path))
     except InputError as error:
-        if not path.exists() or (path.is_file() and path.suffix in (".txt", ".tum", ".csv")):
+        is_model = path.is_file() and path.name in _MODEL
+        is_table = path.is_file() and path.suffix in (".txt", ".tum", ".csv", ".traj", ".freiburg")
+        if not path.exists() or (is_table and not is_model):
             raise
         try:
             source = open_posed_source(path)
         except InputError as why:
-            raise (why if holds_posed_images(path) else error) from None
+            raise (why if is_model or holds_posed_images(path) else error) from None
     metres = _METRES.get(source.scene_scale, 1.0)
     T_wc = np.linalg.inv(source.T_cw)
     T_wc[:, :3, 3] *= metres

@@ -39,15 +39,35 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
         InputError: the file is missing, empty, not of eight columns, or its quaternions are not.
     """
     path = Path(path)
-    rows = _read_table(path, columns=(8,), layout="t tx ty tz qx qy qz qw")
-    quaternion = rows[:, 4:]
-    norm = np.linalg.norm(quaternion, axis=1)
-    valid = np.isfinite(rows).all(axis=1) & (np.abs(norm - 1) < 0.1)
-    _check_quaternions(path, rows, valid)
-    rows = _keep_poses(path, rows, valid)
+    rows = read_rows(path, columns=(8,), layout="t tx ty tz qx qy qz qw")
+    seconds, position, xyzw = rows[:, 0], rows[:, 1:4], rows[:, 4:]
+    _check_quaternions(path, rows, _has_pose(np.column_stack([seconds, position]), xyzw))
+    return quaternion_trajectory(path, seconds, position, xyzw)
+
+
+def quaternion_trajectory(
+    path: Path,
+    seconds: Float[np.ndarray, "n"],
+    position: Float[np.ndarray, "n 3"],
+    xyzw: Float[np.ndarray, "n 4"],
+) -> Trajectory:
+    """Camera-to-world poses in order of time, without rows that hold none.
+
+    Raises:
+        InputError: no row of the file, ``path``, holds one.
+    """
+    rows = np.column_stack([seconds, position, xyzw])
+    rows = _kept(path, rows, _has_pose(rows[:, :4], xyzw))
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     T_wc = poses_from(rows[:, 1:4], rows[:, 4:])
     return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
+
+
+def _has_pose(
+    others: Float[np.ndarray, "n 4"], xyzw: Float[np.ndarray, "n 4"]
+) -> Bool[np.ndarray, "n"]:
+    norm = np.linalg.norm(xyzw, axis=1)
+    return np.isfinite(others).all(axis=1) & (np.abs(norm - 1) < 0.1)
 
 
 def read_frame_poses(folder: Path) -> Trajectory:
@@ -90,12 +110,12 @@ def read_replica_trajectory(path: str | Path) -> Trajectory:
     Row k is frame k at k / 30 s; rows without a pose are left out.
     """
     path = Path(path)
-    rows = _read_table(path, columns=(16, 12), layout="a 4x4 matrix a row")
+    rows = read_rows(path, columns=(16, 12), layout="a 4x4 matrix a row")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3] = rows[:, :12].reshape(-1, 3, 4)
     valid = np.isfinite(rows).all(axis=1) & is_rigid(T_wc)
     seconds = np.arange(len(rows)) / FRAMES_PER_SECOND
-    return _trajectory(path, seconds, T_wc, valid)
+    return matrix_trajectory(path, seconds, T_wc, valid)
 
 
 def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
@@ -106,7 +126,7 @@ def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
         raise InputError(f"{folder} holds no frame-*.pose.txt; give the folder of one sequence.")
     T_wc = np.stack([_read_matrix(path) for _, path in numbered])
     seconds = np.array([number for number, _ in numbered]) / FRAMES_PER_SECOND
-    return _trajectory(folder, seconds, T_wc, is_rigid(T_wc))
+    return matrix_trajectory(folder, seconds, T_wc, is_rigid(T_wc))
 
 
 def read_poses(path: str | Path) -> Trajectory:
@@ -135,7 +155,12 @@ def _read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
     return np.array(numbers, dtype=np.float64).reshape(4, 4)
 
 
-def _read_table(path: Path, columns: tuple[int, ...], layout: str) -> Float[np.ndarray, "n k"]:
+def read_rows(path: Path, columns: tuple[int, ...], layout: str) -> Float[np.ndarray, "n k"]:
+    """The numbers of a file, which has one of these numbers of columns.
+
+    Raises:
+        InputError: it has not; ``layout`` says what was expected.
+    """
     rows: list[list[float]] = []
     for line, numbers in _numbers_by_line(path):
         if len(numbers) not in columns or len(numbers) != len(rows[0] if rows else numbers):
@@ -191,22 +216,27 @@ def says_pose(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
     return finite & (np.abs(np.where(finite[:, None, None], T, 0))[:, :3, :3].sum((1, 2)) > 0)
 
 
-def _trajectory(
+def matrix_trajectory(
     path: Path,
     seconds: Float[np.ndarray, "n"],
     T_wc: Float[np.ndarray, "n 4 4"],
     valid: Bool[np.ndarray, "n"],
 ) -> Trajectory:
+    """Camera-to-world poses, without those that are not valid.
+
+    Raises:
+        InputError: most matrices of the file, ``path``, are no rigid motion, or none is valid.
+    """
     if valid.sum() < 0.5 * says_pose(T_wc).sum():
         raise InputError(
             f"{path}: the matrices are no rigid motions; expected 4x4 camera-to-world matrices, "
             f"row by row."
         )
-    T_wc = _keep_poses(path, T_wc, valid)
+    T_wc = _kept(path, T_wc, valid)
     return Trajectory(seconds[valid], T_wc, np.ones(len(T_wc), dtype=bool))
 
 
-def _keep_poses(
+def _kept(
     path: Path, rows: Float[np.ndarray, "n ..."], valid: Bool[np.ndarray, "n"]
 ) -> Float[np.ndarray, "m ..."]:
     dropped = int((~valid).sum())

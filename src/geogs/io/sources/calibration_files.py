@@ -1,11 +1,14 @@
-"""Calibration files: JSON (geogs, Replica, nerfstudio), COLMAP text, OpenCV/ROS YAML, numbers.
+"""Calibration files: JSON (geogs, Replica, nerfstudio, apps), COLMAP text, OpenCV/ROS YAML, KITTI,
+numbers.
 
 COLMAP and nerfstudio put the centre of the first pixel at (1/2, 1/2); their principal points are
 moved by half a pixel to the convention used here.
 """
 
+import logging
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,13 @@ from geogs.documents import (
 from geogs.errors import InputError
 from geogs.geometry.distortion import LensModel
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.data_set_cameras import (
+    arkit_camera,
+    is_kitti,
+    kitti_camera,
+    record3d_camera,
+    scannetpp_camera,
+)
 
 Numbers = Sequence[float]
 
@@ -48,6 +58,10 @@ _OTHER_LENSES = (
     "FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT", "OMNI", "EUCM", "DOUBLE", "SPHER", "MEI", "PRISM",
 )  # fmt: skip
 """What names of camera models hold that the images have to be undistorted for."""
+_RECORD3D, _SCANNETPP = "metadata", "pose_intrinsic_imu.json"
+"""Names of files with cameras of Record3D and of ScanNet++'s phone."""
+
+_log = logging.getLogger(__name__)
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -57,23 +71,39 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: the file is missing, unreadable, of no known format, or of another lens.
     """
     path = Path(path)
-    if path.suffix == ".json":
-        document, text = read_json(path), ""
-    else:
-        document, text = None, read_text(path, LARGEST_SETTINGS)
+    is_json = path.suffix == ".json" or path.name == _RECORD3D
+    document, text = (read_json(path), "") if is_json else (None, _text_of_settings(path))
     try:
-        if path.suffix == ".json":
+        if is_json:
             return _from_json(document, path)
         if path.suffix in (".yaml", ".yml"):
-            return _from_yaml(text, path)
+            return calibration_from_document(camera_document(path), path)
         if any(model in text for model in ("PINHOLE", "RADIAL", "OPENCV", "FISHEYE", "FOV")):
             return _from_colmap(text, path)
-        return _from_numbers(text, path)
+        if is_kitti(text):
+            return kitti_camera(path, None)
+        return arkit_camera(path) if path.suffix == ".pincam" else _from_numbers(text, path)
     except UNUSABLE as error:
         raise InputError(
             f"{path} is no calibration that can be understood{_reason(error)}; "
             f"give fx fy cx cy [k1 k2 p1 p2 [k3]], or fisheye fx fy cx cy [k1 k2 k3 k4]."
         ) from None
+
+
+def camera_document(path: Path, name: str = "cam0") -> dict[str, Any]:
+    """What a YAML file says of its camera, or of the one of a name in Kalibr's chain.
+
+    Raises:
+        InputError: it cannot be read.
+        ValueError: it is no description of a camera.
+    """
+    # OpenCV writes a directive and a tag that plain YAML readers refuse.
+    text = re.sub(r"^%YAML.*$|!!opencv-matrix", "", _text_of_settings(path), flags=re.MULTILINE)
+    document = yaml_value(text, str(path))
+    if not isinstance(document, dict):
+        raise ValueError
+    camera: dict[str, Any] = document.get(name, document)
+    return camera
 
 
 def calibration_from_words(words: Sequence[str], origin: str) -> Calibration:
@@ -92,14 +122,24 @@ def calibration_from_words(words: Sequence[str], origin: str) -> Calibration:
 
 
 def calibration_from_numbers(numbers: Numbers, origin: str) -> Calibration:
-    """Build a calibration from fx, fy, cx, cy[, k1, k2, p1, p2[, k3]] in pixels."""
+    """Build a calibration from fx, fy, cx, cy[, k1, k2, p1, p2[, k3]] in pixels.
+
+    A negative fy is that of ICL-NUIM, whose y axis points up though its images are upright.
+    """
     if len(numbers) not in (4, 8, 9):
         raise InputError(
             f"The intrinsics ({origin}) hold {len(numbers)} numbers; "
             f"expected fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]."
         )
     fx, fy, cx, cy, *distortion = numbers
+    if fy < 0 < fx:
+        _log.info("fy (%s) is negative, of a y axis that points up; taken as positive.", origin)
+    fy = abs(fy) if fx > 0 else fy
     return Calibration(fx, fy, cx, cy, distortion=tuple(distortion), origin=origin)
+
+
+def _text_of_settings(path: Path) -> str:
+    return read_text(path, LARGEST_SETTINGS)
 
 
 def _reason(error: Exception) -> str:
@@ -108,6 +148,10 @@ def _reason(error: Exception) -> str:
 
 
 def _from_json(document: Any, path: Path) -> Calibration:
+    if "K" in document:
+        return replace(record3d_camera(document), origin=str(path))
+    if path.name == _SCANNETPP:
+        return scannetpp_camera(document, path)
     # "source" is the camera of the images as they came, in the intrinsics.json of a result.
     entry = document.get("source") or document.get("camera") or document
     if "fl_x" in entry:
@@ -183,11 +227,8 @@ def calibration_from_colmap(
     )  # fmt: skip
 
 
-def _from_yaml(text: str, path: Path) -> Calibration:
-    # OpenCV writes a directive and a tag that plain YAML readers refuse.
-    text = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
-    document = yaml_value(text, str(path))
-    document = document.get("cam0", document)  # the first camera of Kalibr's chain
+def calibration_from_document(document: dict[str, Any], path: Path) -> Calibration:
+    """Translate a camera of :func:`camera_document`; raises what a document may, see UNUSABLE."""
     _refuse_others(str(document.get("camera_model", "")), path)
     lens = _lens(str(document.get("distortion_model", "")), path)
     if "intrinsics" in document:  # EuRoC and Kalibr

@@ -23,6 +23,7 @@ _FILES = (
     "intrinsic/intrinsic_color.txt",
     "sensor.yaml",
     "calib.txt",
+    "calibration.txt",
 )
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
 _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405

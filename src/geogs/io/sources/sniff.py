@@ -1,56 +1,50 @@
 """Open whatever the user points at."""
 
+import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from geogs.config import InputConfig
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress, live_address
-from geogs.io.sources.formats import (
-    colmap,
-    dtu,
-    nerfstudio,
-    polycam,
-    record3d,
-    replica,
-    scannet,
-    seven_scenes,
-    tum,
+from geogs.io.sources.formats import colmap, dtu, nerfstudio, record3d
+from geogs.io.sources.formats.image_files import (
+    SUFFIXES,
+    ImageList,
+    image_folder,
+    open_image_folder,
 )
-from geogs.io.sources.formats.image_files import SUFFIXES, open_image_folder
+from geogs.io.sources.formats.layouts import found_below, found_in, what_is_missing
+from geogs.io.sources.formats.model_layouts import open_posed_photographs, place_of_model
 from geogs.io.sources.frame_source import Source
+from geogs.io.sources.known_layouts import LAYOUTS, WITH_MODEL
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import Reader
 from geogs.io.sources.ros.bag import Bag, is_bag
 from geogs.io.sources.working_images import WorkingImages
 
-# Earlier ones win.
-_FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], Reader]], ...] = (
-    (tum.is_tum, tum.open_tum),
-    (seven_scenes.is_seven_scenes, seven_scenes.open_seven_scenes),
-    (replica.is_replica, replica.open_replica),
-    (scannet.is_scannet, scannet.open_scannet),
-)
-# Data sets with an own description often carry a COLMAP model besides.
+# Data sets with an own description often carry one of these besides.
 _POSED_FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
     (dtu.is_dtu, dtu.open_dtu),
     (nerfstudio.find_transforms, nerfstudio.open_nerfstudio),
     (colmap.find_model, colmap.open_colmap),
-    (tum.is_posed_tum, tum.open_posed_tum),
-    (seven_scenes.is_posed_seven_scenes, seven_scenes.open_posed_seven_scenes),
-    (replica.is_posed_replica, replica.open_posed_replica),
-    (scannet.is_posed_scannet, scannet.open_posed_scannet),
 )
+_POSED_LAYOUTS = tuple(layout for layout in LAYOUTS if layout.posed)
+
+_log = logging.getLogger(__name__)
 
 
 def open_source(
     path: str | Path | Sequence[str | Path], config: InputConfig | None = None
 ) -> Source:
-    """Open a video, a folder of images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
+    """Open a video, a folder of images, a bag of ROS, or a sequence of a data set.
 
-    The format follows from the content. Ground truth that lies beside the images is not read.
+    The format follows from the content; of a data set (``known_layouts.py``) the folder may be that
+    of the sequence, of its images, or one that holds no other sequence. Ground truth that lies
+    beside the images is not read.
     ``camera:0``, an URL such as ``rtsp://…``, ``-`` (raw frames from standard input) and
     ``play:FILE`` (a file at its pace) do not wait: of their frames the newest is given each time.
 
@@ -110,16 +104,15 @@ def _reader(path: Path, config: InputConfig) -> Reader:
 
 
 def _folder_reader(folder: Path, wants_poses: bool) -> Reader:
-    for is_format, open_format in _FORMATS:
-        if is_format(folder):
-            return open_format(folder)
-    if (folder / "rgb.mp4").is_file():
-        from geogs.io.sources.formats.stray import StrayRecording, is_stray  # loads FFmpeg
-
-        if is_stray(folder):
-            return StrayRecording(folder)
-    if polycam.polycam_folders(folder) is not None:
-        return polycam.open_polycam(folder)
+    found = found_in(folder, LAYOUTS)
+    if found is None and image_folder(folder) is None:
+        found = found_below(folder, LAYOUTS)
+        if found is None and (sentence := what_is_missing(folder, LAYOUTS)):
+            raise InputError(sentence)
+    if found is not None:
+        layout, place = found
+        _log.info("%s is read as %s: %s.", folder, layout.name, place.pictures)
+        return layout.open(place)
     images = open_image_folder(folder)
     return nerfstudio.with_transforms(images, folder) if wants_poses else images
 
@@ -130,7 +123,7 @@ def open_posed_source(
     """Open an image set together with its known poses.
 
     The format follows from the content: a COLMAP model, nerfstudio's ``transforms.json``, DTU's
-    ``cameras.npz``, Replica, TUM RGB-D, 7-Scenes, ScanNet or ScanNet++.
+    ``cameras.npz``, or one of the data sets of ``known_layouts.py`` with its true poses.
 
     Args:
         path: the folder, or the file with the poses.
@@ -149,7 +142,10 @@ def open_posed_source(
 
 def holds_posed_images(path: Path) -> bool:
     """Whether a folder is laid out as a set of images with known poses, usable or not."""
-    return path.is_dir() and any(is_format(path) for is_format, _ in _POSED_FORMATS)
+    if not path.is_dir():
+        return False
+    is_set = any(is_format(path) for is_format, _ in _POSED_FORMATS)
+    return is_set or found_in(path, _POSED_LAYOUTS) is not None
 
 
 def _posed_set(path: Path) -> PosedSet:
@@ -157,13 +153,36 @@ def _posed_set(path: Path) -> PosedSet:
         raise InputError(f"{path} does not exist; give a folder of images with poses.")
     if path.is_file():
         if nerfstudio.find_transforms(path):
-            return nerfstudio.open_nerfstudio(path)
+            return _timed_as_read(nerfstudio.open_nerfstudio(path), path.parent)
         path = path.parent if path.suffix in (".npz", ".bin", ".txt") else path
-    for is_format, open_format in _POSED_FORMATS:
-        if path.is_dir() and is_format(path):
-            return open_format(path)
+    if path.is_dir():
+        if place := place_of_model(path):
+            return open_posed_photographs(place)
+        found = found_in(path, WITH_MODEL)
+        for is_format, open_format in _POSED_FORMATS if found is None else ():
+            if is_format(path):
+                return _timed_as_read(open_format(path), path)
+        found = found or found_in(path, _POSED_LAYOUTS) or found_below(path, _POSED_LAYOUTS)
+        if found is not None and (posed := found[0].posed):
+            return posed(found[1])
     raise InputError(
         f"{path} holds no images with known poses (COLMAP model, nerfstudio transforms.json, DTU "
-        f"cameras.npz, Replica, TUM RGB-D, 7-Scenes or ScanNet); use --poses auto for photographs, "
+        "cameras.npz, or a data set with its true poses); use --poses auto for photographs, "
         "geogs run for a video."
     )
+
+
+def _timed_as_read(posed: PosedSet, folder: Path) -> PosedSet:
+    """The images with the times that they have without their poses, so that a trajectory of
+    ``geogs run`` is compared with the right ones where some images have no pose."""
+    for place in (folder, posed.files[0].path.parent) if posed.files else ():
+        try:
+            images = _folder_reader(place, wants_poses=False)
+        except InputError:
+            continue
+        listed = images.files if isinstance(images, ImageList) else ()
+        times = {file.path.resolve(): file.timestamp for file in listed}
+        if all(file.path.resolve() in times for file in posed.files):
+            files = (replace(file, timestamp=times[file.path.resolve()]) for file in posed.files)
+            return replace(posed, files=tuple(files))
+    return posed

@@ -24,8 +24,12 @@ from geogs.io.sources.formats.image_files import natural_key
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet, SparsePoints, renumbered
 
 _MODEL_FOLDERS = ("", "0", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "iphone/colmap")
-_IMAGE_FOLDERS = ("images", "image", "rgb", "color", "frames", "input", "")
-_PROJECT_FOLDERS = ("sparse", "colmap", "0", "iphone")
+_IMAGE_FOLDERS = (
+    "images", "image", "rgb", "color", "frames", "input", "resized_images", "original_images", "",
+)  # fmt: skip
+_PROJECT_FOLDERS = (
+    "sparse", "colmap", "0", "iphone", "dslr_calibration_undistorted", "dslr_calibration_jpg",
+)  # fmt: skip
 _MODELS = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8),
     ("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4),

@@ -92,7 +92,7 @@ class ImageList:
 def open_image_folder(folder: Path) -> ImageList:
     """Read a folder of images, or its sub-folder that holds them, in order of time or name."""
     place = _folder_with_images(folder)
-    files = in_order_of_time(_images(place))
+    files = in_order_of_time(images_in(place))
     calibration = find_calibration(*dict.fromkeys(_folders_of_project(folder, place)))
     usual = usual_file(files)
     calibration = calibration or calibration_from_exif(usual.path)
@@ -158,7 +158,25 @@ def _median_rate(times: Sequence[float]) -> float:
 def image_folder(folder: Path) -> Path | None:
     """The folder itself or the sub-folder of a usual name that holds images; none if none does."""
     places = (folder, *(folder / name for name in _SUBFOLDERS))
-    return next((place for place in places if place.is_dir() and _images(place)), None)
+    return next((place for place in places if place.is_dir() and images_in(place)), None)
+
+
+def has_images(folder: Path) -> bool:
+    """Whether there is a folder with an image in it; the first is enough."""
+    try:
+        with os.scandir(folder) as entries:
+            return any(_is_image(entry.name) for entry in entries)
+    except OSError:
+        return False
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The images in a folder, in no order."""
+    return [folder / name for name in file_names(folder) if _is_image(name)]
+
+
+def _is_image(name: str) -> bool:
+    return Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
 
 
 def _folder_with_images(folder: Path) -> Path:
@@ -166,16 +184,8 @@ def _folder_with_images(folder: Path) -> Path:
         return place
     raise InputError(
         f"{folder} holds no images ({', '.join(sorted(SUFFIXES))}) and is no data set known here; "
-        f"give a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence."
+        f"give a video, a folder of images, or a sequence of a data set as it was unpacked."
     )
-
-
-def _images(folder: Path) -> list[Path]:
-    return [
-        folder / name
-        for name in file_names(folder)
-        if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
-    ]
 
 
 def numbered(folder: Path, pattern: re.Pattern[str]) -> list[tuple[int, Path]]:

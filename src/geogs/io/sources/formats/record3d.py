@@ -24,6 +24,7 @@ from geogs.errors import InputError
 from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
 from geogs.io.pose_files import OPENCV_FROM_OPENGL, poses_from
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.data_set_cameras import record3d_camera
 from geogs.io.sources.depth_files import LEAST_CONFIDENCE, DepthCamera
 from geogs.io.sources.pose_priors import measured_pose, rigid
 from geogs.io.sources.reader import RawFrame, RecordingInfo
@@ -197,11 +198,7 @@ def _calibration(metadata: dict[str, Any], width: int, height: int) -> Calibrati
     """The camera for images of a size."""
     if "K" not in metadata:
         return None
-    K = np.array(metadata["K"], dtype=np.float64).reshape(3, 3).T
-    size = _whole(metadata, "w", width), _whole(metadata, "h", height)
-    return Calibration(
-        K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=size[0], height=size[1], origin="Record3D"
-    ).fit(width, height)
+    return record3d_camera({"w": width, "h": height, **metadata}).fit(width, height)
 
 
 def _poses(rows: object) -> dict[int, MeasuredPose]:

@@ -69,11 +69,6 @@ def _units_per_metre(scene: Path) -> float:
     return _PER_METRE
 
 
-def is_posed_replica(folder: Path) -> bool:
-    """Whether ``folder`` is a scene with its poses."""
-    return is_replica(folder) and (_results(folder).parent / "traj.txt").is_file()
-
-
 def open_posed_replica(folder: Path) -> PosedSet:
     """Read a scene; images without a valid pose are left out."""
     poses = _results(folder).parent / "traj.txt"

@@ -19,8 +19,8 @@ _PER_METRE = 1000.0
 
 def is_scannet(folder: Path) -> bool:
     """Whether ``folder`` is a scene."""
-    colour, depth = folder / "color", folder / "depth"
-    return colour.is_dir() and depth.is_dir() and bool(_images(folder))
+    beside = any((folder / name).is_dir() for name in ("depth", "pose", "intrinsic"))
+    return (folder / "color").is_dir() and beside and bool(_images(folder))
 
 
 def open_scannet(folder: Path) -> ImageList:
@@ -51,6 +51,8 @@ def open_posed_scannet(folder: Path) -> PosedSet:
         for k, path in _images(folder)
         if k in poses
     )
+    if not files:
+        raise InputError(f"{folder} holds no pose of any image (pose/0.txt and so on).")
     return PosedSet("scannet", folder.resolve().name, files, scene_scale="metres")
 
 

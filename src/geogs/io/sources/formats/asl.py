@@ -1,0 +1,138 @@
+"""The ASL layout of EuRoC and TUM-VI: ``mav0/cam0/data.csv``, ``data/*.png`` and ``sensor.yaml``.
+
+Times are nanoseconds; ``T_BS`` of ``sensor.yaml`` takes the camera's axes to the body's. The truth
+is the body's: ``mav0/state_groundtruth_estimate0/data.csv`` (EuRoC) or ``mav0/mocap0/data.csv``
+(TUM-VI), rows that begin with time, position and quaternion (w first). TUM-VI has its cameras in
+``dso/camchain.yaml``, with ``T_cam_imu`` from the body to the camera.
+https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.documents import UNUSABLE, read_text
+from geogs.errors import InputError
+from geogs.io.pose_files import is_rigid, quaternion_trajectory, read_rows
+from geogs.io.sources.calibration_files import calibration_from_document, camera_document
+from geogs.io.sources.formats.image_files import (
+    ImageFile,
+    ImageList,
+    images_in,
+    in_order_of_time,
+)
+from geogs.io.sources.formats.layouts import Place, holds_pictures
+from geogs.io.sources.formats.timed_poses import with_timed_poses
+from geogs.io.sources.posed.posed_set import PosedSet
+from geogs.types import Trajectory
+
+PICTURES = tuple(f"mav0/cam{number}/data" for number in range(4))
+"""Folders of images, those of the left camera first."""
+_TRUTHS = ("state_groundtruth_estimate0", "mocap0")
+_COLUMNS = (8, 17)
+"""Time, position, quaternion; EuRoC's has velocity and biases behind them."""
+_NANOSECONDS = 1e-9
+
+
+def is_asl(folder: Path) -> bool:
+    """Whether ``folder`` is a sequence, that is, holds ``mav0``."""
+    return holds_pictures(folder, PICTURES)
+
+
+def open_asl(place: Place) -> ImageList:
+    """Read the images of one camera; times are those of its ``data.csv``."""
+    camera = place.pictures.parent
+    listing = camera / "data.csv"
+    files = _listed(listing) if listing.is_file() else in_order_of_time(images_in(place.pictures))
+    name = f"{place.folder.resolve().name}-{camera.name}"
+    found = _description(camera)
+    if found is None:
+        return ImageList("asl", name, files, None)
+    file, document = found
+    try:
+        return ImageList("asl", name, files, calibration_from_document(document, file))
+    except UNUSABLE:
+        raise InputError(f"{file} describes no camera that can be understood.") from None
+
+
+def open_posed_asl(place: Place) -> PosedSet:
+    """Read the images of one camera with its poses."""
+    above = place.pictures.parent.parent
+    files = [above / name / "data.csv" for name in _TRUTHS]
+    truth = next((file for file in files if file.is_file()), None)
+    if truth is None:
+        raise InputError(
+            f"{place.folder} holds no true poses: there is neither {files[0]} nor "
+            f"{files[1].relative_to(above)}."
+        )
+    images = open_asl(place)
+    return with_timed_poses(images, _truth_of(truth, place.pictures.parent))
+
+
+def is_asl_truth(path: Path) -> bool:
+    """Whether ``path`` is a table of poses in this layout."""
+    return path.name == "data.csv"
+
+
+def read_asl_truth(path: Path) -> Trajectory:
+    """Read the poses of the first camera beside the table; of the body where there is none."""
+    return _truth_of(path, path.absolute().parent.parent / "cam0")
+
+
+def _truth_of(path: Path, camera: Path) -> Trajectory:
+    rows = read_rows(path, _COLUMNS, "time [ns], position, quaternion (w first)")
+    trajectory = quaternion_trajectory(
+        path, rows[:, 0] * _NANOSECONDS, rows[:, 1:4], rows[:, [5, 6, 7, 4]]
+    )
+    return Trajectory(
+        trajectory.timestamps, trajectory.T_wc @ _body_from_camera(camera), trajectory.tracked
+    )
+
+
+def _body_from_camera(camera: Path) -> Float64[np.ndarray, "4 4"]:
+    """The pose of a camera in the body; the body's own where nothing describes it."""
+    found = _description(camera)
+    if found is None:
+        return np.eye(4)
+    file, document = found
+    try:
+        if "T_cam_imu" in document:
+            T = np.linalg.inv(np.array(document["T_cam_imu"], dtype=np.float64).reshape(4, 4))
+        else:
+            T = np.array(document["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+        if not is_rigid(T[None])[0]:
+            raise ValueError
+    except UNUSABLE:
+        raise InputError(
+            f"{file} does not say where the camera is (T_BS); copy it again."
+        ) from None
+    return T
+
+
+def _description(camera: Path) -> tuple[Path, dict[str, Any]] | None:
+    """The file that describes a camera, and what it says."""
+    chain = camera.parent.parent / "dso" / "camchain.yaml"
+    file = next((p for p in (camera / "sensor.yaml", chain) if p.is_file()), None)
+    if file is None:
+        return None
+    try:
+        return file, camera_document(file, camera.name)
+    except UNUSABLE:
+        raise InputError(f"{file} describes no camera that can be understood.") from None
+
+
+def _listed(listing: Path) -> list[ImageFile]:
+    """The images of rows such as ``1403636579763555584,1403636579763555584.png``."""
+    files = []
+    for number, line in enumerate(read_text(listing).splitlines(), start=1):
+        words = [word.strip() for word in line.split("#", 1)[0].split(",")]
+        if words == [""]:
+            continue
+        if len(words) != 2 or not words[0].isdecimal() or not words[1]:
+            raise InputError(f"{listing}, line {number}: expected nanoseconds and a file.")
+        files.append(ImageFile(listing.parent / "data" / words[1], int(words[0]) * _NANOSECONDS))
+    if not files:
+        raise InputError(f"{listing} lists no images.")
+    return sorted(files, key=lambda file: file.timestamp)

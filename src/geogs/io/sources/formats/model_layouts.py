@@ -1,0 +1,103 @@
+"""Photographs of a benchmark beside their COLMAP model, in metres: ScanNet++ and ETH3D.
+
+ScanNet++ (https://kaldir.vc.in.tum.de/scannetpp/documentation): ``iphone/rgb`` at 60 images a
+second with ``iphone/colmap``, and ``dslr/resized_images`` with ``dslr/colmap``. ETH3D
+(https://www.eth3d.net/documentation): ``images/dslr_images_undistorted`` with
+``dslr_calibration_undistorted``.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.calibration_files import read_calibration
+from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.formats.colmap import is_model, open_colmap
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in, in_order_of_time
+from geogs.io.sources.formats.layouts import Place, holds_pictures
+from geogs.io.sources.posed.posed_set import PosedSet
+
+_MODELS = {
+    "iphone/rgb": "iphone/colmap",
+    "dslr/resized_images": "dslr/colmap",
+    "dslr/original_images": "dslr/colmap",
+    "images/dslr_images_undistorted": "dslr_calibration_undistorted",
+    "images/dslr_images": "dslr_calibration_jpg",
+}
+"""Folders of images, and where their model lies."""
+SCANNETPP = tuple(name for name in _MODELS if name.startswith(("iphone", "dslr")))
+ETH3D = tuple(name for name in _MODELS if name.startswith("images"))
+_PHONE_CAMERA = "pose_intrinsic_imu.json"
+_PHONE_FRAMES_PER_SECOND = 60.0
+_PER_METRE = 1000.0
+_FRAME = re.compile(r"frame_(\d{1,9})")
+
+
+def is_scannetpp(folder: Path) -> bool:
+    """Whether ``folder`` is a scene of ScanNet++ with images."""
+    return holds_pictures(folder, SCANNETPP)
+
+
+def is_eth3d(folder: Path) -> bool:
+    """Whether ``folder`` is a scene of ETH3D's photographs."""
+    return holds_pictures(folder, ETH3D)
+
+
+def place_of_model(folder: Path) -> Place | None:
+    """The images that belong to a model; none where ``folder`` holds that of no such scene."""
+    folder = folder.absolute()
+    for pictures, model in _MODELS.items():
+        parts = Path(model).parts
+        root = folder.parents[len(parts) - 1] if len(parts) <= len(folder.parents) else folder
+        if folder.parts[-len(parts) :] == parts and holds_pictures(root, (pictures,)):
+            return Place(root, root / pictures)
+    return None
+
+
+def open_photographs(place: Place) -> ImageList:
+    """Read one folder of images in order of names; frames of the phone at their times."""
+    kind = "eth3d" if is_eth3d(place.folder) else "scannetpp"
+    name = f"{place.folder.resolve().name}-{place.pictures.name}"
+    return ImageList(kind, name, _files(place), _camera(place))
+
+
+def open_posed_photographs(place: Place) -> PosedSet:
+    """Read one folder of images with the poses of its model; the world is in metres."""
+    model = _model(place)
+    if not is_model(model):
+        raise InputError(f"{place.folder} holds no true poses: {model} with its model is missing.")
+    times = {file.path: file.timestamp for file in _files(place)}
+    posed = open_colmap(model, place.pictures)
+    there = posed.only([k for k, file in enumerate(posed.files) if file.path in times])
+    if not there.files:
+        raise InputError(f"{place.pictures} holds none of the images of {model}.")
+    files = tuple(replace(file, timestamp=times[file.path]) for file in there.files)
+    return replace(there, files=files, scene_scale="metres")
+
+
+def _model(place: Place) -> Path:
+    return place.folder / _MODELS[place.pictures.relative_to(place.folder).as_posix()]
+
+
+def _files(place: Place) -> list[ImageFile]:
+    paths = images_in(place.pictures)
+    numbers = {path: int(m[1]) for path in paths if (m := _FRAME.fullmatch(path.stem))}
+    if len(numbers) < len(paths):
+        return in_order_of_time(paths)
+    depths = place.pictures.parent / "depth"
+    return [
+        ImageFile(path, k / _PHONE_FRAMES_PER_SECOND, _depth(depths / f"{path.stem}.png"))
+        for path, k in sorted(numbers.items(), key=lambda item: item[1])
+    ]
+
+
+def _depth(path: Path) -> DepthFile | None:
+    return DepthFile(path, _PER_METRE) if path.is_file() else None
+
+
+def _camera(place: Place) -> Calibration | None:
+    files = (_model(place) / "cameras.txt", place.pictures.parent / _PHONE_CAMERA)
+    file = next((file for file in files if file.is_file()), None)
+    return None if file is None else read_calibration(file)
