@@ -64,6 +64,8 @@ def run(
         progress.write(f"note: {sentence}")
     base = None if settings.map is None else load_result(settings.map, device)
     opened = open_source(settings.source, config.input if base is None else seen_by(base, config))
+    for sentence in opened.depths_found if config.input.depth == "auto" else ():
+        progress.write(f"note: {sentence}")
     if isinstance(scale, SensorScale) and not opened.uses_depth:
         raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())

@@ -39,6 +39,33 @@ def test_depths_of_tum_are_those_nearest_in_time(tmp_path):
     assert all(f.depth is None for f in open_source(tmp_path, InputConfig()))
 
 
+def test_depths_that_are_listed_and_not_there_are_none(tmp_path, caplog):
+    """They were taken for there, and the run was monocular without a word."""
+    write_images(tmp_path, ["rgb/a.png", "rgb/b.png"])
+    (tmp_path / "rgb.txt").write_text("0.00 rgb/a.png\n0.10 rgb/b.png\n")
+    (tmp_path / "depth.txt").write_text("0.00 depth/a.png\n0.10 depth/b.png\n")
+    with pytest.raises(InputError, match=r"depth\.txt names 2 pictures of depth, of which none is"):
+        open_source(tmp_path, SENSOR)
+    auto = open_source(tmp_path, InputConfig(depth="auto"))
+    assert not auto.uses_depth
+    assert "names 2 pictures of depth, of which none is there" in auto.depths_found[0]
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "depth/a.png").write_bytes(b"no picture")
+    (tmp_path / "depth/b.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"none of its pictures of depth can be read, such as .*a"):
+        open_source(tmp_path, SENSOR)
+    (tmp_path / "depth/b.png").unlink()
+    write_depth(tmp_path / "depth/a.png", np.full((48, 64), 5000))
+    source = open_source(tmp_path, SENSOR)
+    assert "1 of 2 pictures of depth are missing, such as b.png" in caplog.text
+    assert source.depths_found == [
+        f"The depth of a sensor beside {tmp_path.name} is used: 1 of 2 images."
+    ]
+    (tmp_path / "depth.txt").write_text("5.00 depth/a.png\n")
+    with pytest.raises(InputError, match="is near that of an image"):
+        open_source(tmp_path, SENSOR)
+
+
 def test_depths_of_replica_have_the_scale_of_their_camera(tmp_path):
     write_images(tmp_path, ["results/frame000000.jpg", "results/frame000001.jpg"])
     write_depth(tmp_path / "results/depth000001.png", ramp(2000))

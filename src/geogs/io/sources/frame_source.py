@@ -125,6 +125,11 @@ class Source:
         return any(images.uses_depth for images in self._recordings)
 
     @property
+    def depths_found(self) -> list[str]:
+        """What there is of the depth of a sensor, a sentence for each recording."""
+        return [images.depth_found for images in self._recordings]
+
+    @property
     def uses_poses(self) -> bool:
         """Whether frames of any recording come with poses of another tracker, as priors."""
         return any(images.poses.is_used for images in self._recordings)

@@ -70,7 +70,11 @@ class RecordingInfo:
     quarter_turns: int = 0
     """Clockwise quarter turns from the stored to the upright images."""
     has_depth: bool = False
-    """Whether a sensor's depth comes with any of the images."""
+    """Whether a sensor's depth comes with any of the images, and can be read."""
+    depths: int = 0
+    """Images with such a depth."""
+    depth_fault: str = ""
+    """Why there is none though files speak of it, as a clause."""
     poses_by: str | None = None
     """Who said the poses that come with images and are no truth; none where there are none."""
     is_capture: bool = False

@@ -63,9 +63,10 @@ class WorkingImages:
         info = reader.info
         _check_selection(config, info.length)
         if config.depth == "sensor" and not info.has_depth:
+            why = f": {info.depth_fault}" if info.depth_fault else ""
             raise InputError(
-                f"{info.name} has no depth of a sensor beside its images that can be read here; "
-                "leave out --depth."
+                f"{info.name} has no depth of a sensor beside its images that can be read here"
+                f"{why}; leave out --depth, or give that of the images."
             )
         self.poses = chosen_poses(config.poses, info)
         """Of another tracker, beside the images."""
@@ -107,6 +108,16 @@ class WorkingImages:
     def uses_depth(self) -> bool:
         """Whether images come with the depth that a sensor measured."""
         return self._config.depth != "none" and self.reader.info.has_depth
+
+    @property
+    def depth_found(self) -> str:
+        """What there is of the depth of a sensor, as a sentence."""
+        info = self.reader.info
+        if info.has_depth:
+            of = "" if info.length is None else f" of {info.length}"
+            return f"The depth of a sensor beside {info.name} is used: {info.depths}{of} images."
+        why = info.depth_fault or "none lies beside the images, or none that can be read here"
+        return f"No depth of a sensor is used for {info.name}: {why}."
 
     @property
     def is_calibration_open(self) -> bool:

@@ -16,7 +16,7 @@ from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import ImageFile, ImageList
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.formats.tum import PER_METRE, known_camera
 from geogs.io.sources.known_intrinsics import find_calibration
@@ -40,7 +40,7 @@ def is_associated(folder: Path) -> bool:
 
 def open_associated(folder: Path) -> ImageList:
     """Read a sequence; frames that are counted are a thirtieth of a second apart."""
-    files = _read_list(folder / LISTING)
+    files, fault = depths_there(_read_list(folder / LISTING), folder / LISTING)
     name = folder.resolve().name
     counted = all(f.timestamp == int(f.timestamp) for f in files) and _is_counted(files)
     if counted:
@@ -48,9 +48,9 @@ def open_associated(folder: Path) -> ImageList:
     known = known_camera(name)
     if counted and (_truth_beside(folder) or any(word in name.lower() for word in _NAMES)):
         known = _CAMERA
-    return ImageList(
-        "icl-nuim" if counted else "tum", name, files, find_calibration(folder) or known
-    )
+    camera = find_calibration(folder) or known
+    kind = "icl-nuim" if counted else "tum"
+    return ImageList(kind, name, files, camera, depth_fault=fault)
 
 
 def open_posed_associated(folder: Path) -> PosedSet:

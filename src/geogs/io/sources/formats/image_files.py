@@ -1,11 +1,12 @@
 """Images as files: a folder of photographs or frames, and the list that the data sets share."""
 
+import logging
 import os
 import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -26,7 +27,8 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp",
 # Where other tools put the images of a project.
 _SUBFOLDERS = ("images", "image", "rgb", "color", "frames", "data", "mav0/cam0/data")
 _ASKED = 24
-"""Images that are asked for their size, about."""
+"""Images that are asked for their size, about, or pictures of depth whether they can be read."""
+_log = logging.getLogger(__name__)
 _SECONDS_BY_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
 
 
@@ -54,10 +56,16 @@ class ImageList:
         poses_by: str | None = None,
         is_capture: bool = False,
         usual: ImageFile | None = None,
+        depth_fault: str = "",
     ) -> None:
         """What it says of itself is described in :class:`RecordingInfo`; ``usual`` is what
         :func:`usual_file` gives, where that is known."""
         self.files = files
+        depths = [file.depth for file in files if file.depth is not None]
+        asked = depths[:: max(1, len(depths) // _ASKED)]
+        has_depth = any(depth.metres() is not None for depth in asked)
+        if depths and not has_depth:
+            depth_fault = f"none of its pictures of depth can be read, such as {depths[0].path}"
         usual = usual or usual_file(files)
         candidates = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in (usual, *files))
         image = next((image for image in candidates if image is not None), None)
@@ -69,7 +77,9 @@ class ImageList:
             fps=_median_rate([file.timestamp for file in files]),
             length=len(files),
             calibration=calibration,
-            has_depth=any(file.depth is not None for file in files),
+            has_depth=has_depth,
+            depths=len(depths) if has_depth else 0,
+            depth_fault=depth_fault,
             poses_by=poses_by,
             is_capture=is_capture,
         )  # fmt: skip
@@ -97,6 +107,30 @@ def open_image_folder(folder: Path) -> ImageList:
     usual = usual_file(files)
     calibration = calibration or calibration_from_exif(usual.path)
     return ImageList("images", folder.resolve().name, files, calibration, usual=usual)
+
+
+def depths_there(files: Sequence[ImageFile], listing: Path) -> tuple[list[ImageFile], str]:
+    """Images without the depths that a list names but are not there, and what is wrong if all are.
+
+    Folders are asked once for all their files. The log says how many of several are missing.
+    """
+    paths = [file.depth.path for file in files if file.depth is not None]
+    folders = {path.parent for path in paths}
+    there = {folder / name for folder in folders if folder.is_dir() for name in file_names(folder)}
+    missing = [path for path in paths if path not in there]
+    if not missing:
+        return list(files), ""
+    kept = [
+        file if file.depth is None or file.depth.path in there else replace(file, depth=None)
+        for file in files
+    ]
+    if len(missing) == len(paths):
+        return kept, f"{listing} names {len(paths)} pictures of depth, of which none is there"
+    _log.warning(
+        "%s: %d of %d pictures of depth are missing, such as %s.",
+        listing, len(missing), len(paths), missing[0].name,
+    )  # fmt: skip
+    return kept, ""
 
 
 def usual_file(files: Sequence[ImageFile]) -> ImageFile:

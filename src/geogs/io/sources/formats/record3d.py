@@ -7,7 +7,6 @@ and ``poses`` ``qx qy qz qw tx ty tz`` (camera to world, axes of OpenGL); ``rgbd
 
 import importlib
 import json
-import logging
 import re
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -30,7 +29,6 @@ from geogs.io.sources.pose_priors import measured_pose, rigid
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 from geogs.types import MeasuredPose
 
-_log = logging.getLogger(__name__)
 _NUMBER = re.compile(r"\d{1,18}")
 _LIDAR = (192, 256)
 """Rows and columns of a depth whose size is not given."""
@@ -158,13 +156,13 @@ class Record3dRecording:
             raise InputError(f"{path}: its metadata cannot be understood; copy it again.") from None
         if not (0 < fps < 1e4):
             raise InputError(f"{path}: its metadata says {fps} frames a second.")
-        depths = any(name.endswith(".depth") for name in names)
-        has_depth = depths and _lzfse() is not None
-        if depths and not has_depth:
-            _log.info("Record3D's depth needs pip install 'geogs[record3d]'.")
+        depths = sum(name.endswith(".depth") for name in names)
+        has_depth = depths > 0 and _lzfse() is not None
+        fault = "Record3D's depth needs pip install 'geogs[record3d]'" if depths else ""
         self.info = RecordingInfo(
             "record3d", path.resolve().stem, width, height, fps, len(self._images), calibration,
-            has_depth=has_depth, poses_by="Record3D" if self._poses else None, is_capture=True,
+            has_depth=has_depth, depths=depths, depth_fault="" if has_depth else fault,
+            poses_by="Record3D" if self._poses else None, is_capture=True,
         )  # fmt: skip
 
     @property

@@ -49,6 +49,7 @@ class StrayRecording(VideoFile):
             name=folder.resolve().name,
             calibration=_calibration(matrix, *stored) if matrix.is_file() else None,
             has_depth=bool(self._depths),
+            depths=len(self._depths),
             poses_by="Stray Scanner" if self._poses else None,
             is_capture=True,
         )

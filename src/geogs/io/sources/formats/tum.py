@@ -15,7 +15,7 @@ from geogs.errors import InputError
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import ImageFile, ImageList
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.known_intrinsics import find_calibration
 from geogs.io.sources.posed.posed_set import PosedSet
@@ -56,8 +56,9 @@ def is_tum(folder: Path) -> bool:
 def open_tum(folder: Path) -> ImageList:
     """Read a sequence; times are those of ``rgb.txt``."""
     name = folder.resolve().name
-    files = _with_depths(folder, _read_list(folder / "rgb.txt"))
-    return ImageList("tum", name, files, find_calibration(folder) or known_camera(name))
+    files, fault = _with_depths(folder, _read_list(folder / "rgb.txt"))
+    camera = find_calibration(folder) or known_camera(name)
+    return ImageList("tum", name, files, camera, depth_fault=fault)
 
 
 def known_camera(name: str) -> Calibration | None:
@@ -69,11 +70,11 @@ def known_camera(name: str) -> Calibration | None:
     return _BONN if name.lower().startswith("rgbd_bonn") else None
 
 
-def _with_depths(folder: Path, files: list[ImageFile]) -> list[ImageFile]:
-    """Images with the depth that is nearest in time, where one is near."""
+def _with_depths(folder: Path, files: list[ImageFile]) -> tuple[list[ImageFile], str]:
+    """Images with the depth that is nearest in time, where one is near; why none has any."""
     listing = folder / "depth.txt"
     if not listing.is_file():
-        return files
+        return files, ""
     depths = _read_list(listing)
     times = np.array([depth.timestamp for depth in depths])
     found = []
@@ -81,7 +82,9 @@ def _with_depths(folder: Path, files: list[ImageFile]) -> list[ImageFile]:
         n = int(np.abs(times - file.timestamp).argmin())
         is_near = abs(times[n] - file.timestamp) <= ASSOCIATED
         found.append(replace(file, depth=DepthFile(depths[n].path, PER_METRE) if is_near else None))
-    return found
+    if not any(file.depth is not None for file in found):
+        return found, f"no time in {listing} is near that of an image"
+    return depths_there(found, listing)
 
 
 def _read_list(listing: Path) -> list[ImageFile]:
