@@ -59,6 +59,26 @@ def test_a_signal_in_an_import_waits_for_its_end(tmp_path, count, number):
     assert end_at_import(count, number, command(tmp_path)) == (130, "error: interrupted.")
 
 
+def test_two_signals_in_an_import_leave_no_empty_folder(tmp_path):
+    """The second one ended the process at once, before the folder was taken away again."""
+    presses = (
+        "import os, time\nfor _ in range(3):\n    os.kill(os.getpid(), 2)\n    time.sleep(0.01)\n"
+    )
+    (tmp_path / "pressed.py").write_text(presses)
+    code = (
+        "import signal; from geogs.application.interrupt import interrupt; "
+        "from geogs.application.results.output_folder import claimed; from pathlib import Path\n"
+        "signal.signal(signal.SIGINT, interrupt)\n"
+        "with claimed(Path('out')):\n    import pressed\n    signal.pause()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=ENVIRONMENT, cwd=tmp_path, timeout=60,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stderr.splitlines()[-1] == "KeyboardInterrupt"
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_signal_before_geogs_is_imported_ends_it_without_a_word():
     at_first = "event == 'import' and arguments[0] == 'geogs' and os.kill(os.getpid(), 2)"
     hook = f"sys.addaudithook(lambda event, arguments: {at_first} and None)"

@@ -11,6 +11,8 @@ SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name
 """Those that ask to stop: of a terminal, of systems and schedulers, of a terminal that is gone."""
 _AGAIN = 0.02
 """Seconds until it is looked again whether modules are still being imported."""
+_PATIENCE = 5.0
+"""Seconds after which an import that was asked to end counts as hanging."""
 
 
 def asking() -> list[signal.Signals]:
@@ -21,15 +23,22 @@ def asking() -> list[signal.Signals]:
 def interrupt(number: int, frame: FrameType | None) -> None:
     """Handler of a signal: raises KeyboardInterrupt, in an import as soon as that is done.
 
-    A module of which an exception has left one half makes others fail with anything. The second
-    signal in an import, which may hang, ends the process.
+    A module of which an exception has left one half makes others fail with anything. Another signal
+    in an import ends the process where that seems to hang, and changes nothing before: an end at
+    once would leave behind what was begun, such as an empty folder.
     """
-    if not (_is_importing(frame) and hasattr(signal, "setitimer")):
+    if not hasattr(signal, "setitimer"):
         raise KeyboardInterrupt
-    if number in SIGNALS and signal.getitimer(signal.ITIMER_REAL)[0]:
+    is_waiting, left = signal.getitimer(signal.ITIMER_REAL)
+    if not _is_importing(frame):
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        raise KeyboardInterrupt
+    # The timer's interval, which is never reached, is what is left of the patience.
+    left = max(left - _AGAIN, _AGAIN) if is_waiting or left else _PATIENCE
+    if number in SIGNALS and left <= _AGAIN:
         os._exit(128 + number)
     signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN, left)
 
 
 def _is_importing(frame: FrameType | None) -> bool:

@@ -170,6 +170,9 @@ def read_mask(
         path: the mask, or the picture with an alpha channel.
         shape: height and width of the picture; a mask of another size is scaled to it.
         of_alpha: whether the alpha channel counts; without one all pixels are used.
+
+    Raises:
+        InputError: there is no mask, or it is not as wide for its height as the picture.
     """
     mask = decoded(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION).picture
     if mask is None:
@@ -182,5 +185,16 @@ def read_mask(
     # Masks of zeros and ones are common, too.
     used = mask > (half if mask.max() > 1 else 0)
     if used.shape != shape:
+        _check_shape(path, used.shape, shape)
         used = cv2.resize(used.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     return used
+
+
+def _check_shape(path: Path, mask: tuple[int, ...], picture: tuple[int, int]) -> None:
+    """Raises InputError where one is not the other scaled, up to rounding to whole pixels."""
+    (h, w), (height, width) = mask, picture
+    if abs(w * height - h * width) > 0.5 * (height + width) + 0.005 * w * height:
+        raise InputError(
+            f"The mask {path} has {w}x{h} pixels, and the image {width}x{height}; give one of the "
+            "same shape, upright."
+        )

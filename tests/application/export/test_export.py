@@ -155,6 +155,16 @@ def test_meshes_are_read_by_trimesh_with_y_up(result, tmp_path):
     assert across[2] > 0.9 * np.linalg.norm(across)  # towards the viewer, who looks along -z
 
 
+def test_a_textured_mesh_lies_beside_the_plain_one(result, tmp_path):
+    plain = exported(result, "glb", output=tmp_path)
+    before = plain.read_bytes()
+    textured = exported(result, "glb", output=tmp_path, textured=True, texture_size=64)
+    assert (plain.name, textured.name) == ("mesh.glb", "mesh_textured.glb")
+    assert plain.read_bytes() == before
+    assert b"image/jpeg" in textured.read_bytes()
+    assert b"image/jpeg" not in before
+
+
 def test_colours_are_made_linear_as_the_standard_says():
     levels = np.array([[0, 10, 11], [128, 188, 255]], np.uint8)
     expected = [[0, 0.0030353, 0.0033465], [0.2158605, 0.5028865, 1]]

@@ -42,6 +42,21 @@ def test_without_a_mask_there_is_none_and_a_missing_one_is_told(folder):
         open_source(images, InputConfig(mask=mask.with_name("none.png")))
 
 
+def test_a_mask_may_be_smaller_but_not_of_another_shape(folder):
+    images, mask = folder
+    cv2.imwrite(str(mask), np.full((48, 64), 255, np.uint8))
+    assert open_source(images, InputConfig(mask=mask)).mask.all()
+    for height, width in ((128, 96), (48, 128), (95, 128 // 2)):
+        cv2.imwrite(str(mask), np.full((height, width), 255, np.uint8))
+        with pytest.raises(InputError, match=f"has {width}x{height} pixels, and the image 128x96"):
+            open_source(images, InputConfig(mask=mask))
+    masks = mask.with_suffix("")
+    masks.mkdir()
+    cv2.imwrite(str(masks / "1.png"), np.full((128, 96), 255, np.uint8))
+    with pytest.raises(InputError, match="has 96x128 pixels"):
+        list(open_source(images, InputConfig(mask=masks, readout=0.0)))
+
+
 def test_masks_of_a_folder_are_found_by_name_and_paint_what_they_hide(folder):
     images, mask = folder
     masks = mask.with_suffix("")

@@ -56,7 +56,10 @@ def export(settings: ExportSettings) -> Path:
     """
     result = load_result(settings.result, require_device(settings.device))
     to, place = settings.to, settings.output or result.folder / "export" / settings.to
-    path = _file(place, *_FILES[to]) if to in _FILES else place
+    name, *suffixes = _FILES.get(to, (to,))
+    if to == "glb" and settings.textured:  # beside the plain one
+        name = "mesh_textured.glb"
+    path = _file(place, name, *suffixes) if to in _FILES else place
     if path == settings.output and to in _FILES and to not in _WITH_OTHERS:
         _write(path, result, settings)
         return path
