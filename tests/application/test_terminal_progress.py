@@ -44,6 +44,17 @@ def test_without_a_terminal_every_phase_is_a_line(capsys):
     ]
 
 
+def test_dropped_frames_are_said_once_and_counted(capsys):
+    with TerminalProgress() as progress:
+        progress.expect(None)
+        for number, dropped in ((1, 3), (2, 17)):
+            progress.dropped(dropped)
+            progress.frame(status(number))
+    warning, line = capsys.readouterr().err.splitlines()
+    assert warning.startswith("warning: frames come faster than they are tracked")
+    assert "1 keyframes  1.5k disks  17 dropped" in line
+
+
 def test_quiet_leaves_warnings(capsys):
     with TerminalProgress(Verbosity(quiet=True)) as progress:
         a_run(progress)

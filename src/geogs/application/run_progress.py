@@ -18,5 +18,8 @@ class RunProgress:
     def frame(self, status: "PoseEstimate") -> None:
         """After each frame."""
 
+    def dropped(self, frames: int) -> None:
+        """When more frames of a live source came too fast to be used; so many so far."""
+
     def stage(self, name: str, fraction: float) -> None:
         """After each part of another stage; ``fraction`` in [0, 1]."""

@@ -51,6 +51,7 @@ class TerminalProgress(RunProgress):
         )
         self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
         self._frames: int | None = None
+        self._dropped = 0
         self._printed = self._phase_began = time.perf_counter()
         self._phase = self._stage = self._last = ""
         self._memory, self._measured = "", -math.inf
@@ -94,12 +95,23 @@ class TerminalProgress(RunProgress):
         self._frames = frames
         self._enter("frames")
 
+    def dropped(self, frames: int) -> None:
+        """Say so at the first of them; then they are counted in the line."""
+        if not self._dropped:
+            self.write(
+                "warning: frames come faster than they are tracked, and some are dropped; a "
+                "smaller --long-edge or --preset fast takes less time for each."
+            )
+        self._dropped = frames
+
     def frame(self, status: "PoseEstimate") -> None:
         """Move the line, with what there is to say beside it."""
         done = None if self._frames is None else status.frames / max(self._frames, status.frames)
         parts = [f"{status.keyframes} keyframes"]
         if status.disks:  # else the map is made at the end
             parts.append(f"{status.disks / 1000:.1f}k disks")
+        if self._dropped:
+            parts.append(f"{self._dropped} dropped")
         info = "  ".join([*parts, self._memory_used()])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"

@@ -104,8 +104,11 @@ class TrackedVideo:
         return Outcome.STOPPED
 
     def _track_each(self, driver: Driver, checkpoint: Checkpoint) -> None:
-        slam = self.scene
+        slam, dropped = self.scene, 0
         for frame in _timed(self.frames, slam.stopwatch):
+            if self.source.dropped > dropped:
+                dropped = self.source.dropped
+                driver.progress.dropped(dropped)
             status = slam.process(frame)
             driver.progress.frame(status)
             if driver.observer is not None:
