@@ -42,6 +42,9 @@ def test_few_poses_that_match_in_time():
     """50 frames at 5 Hz, and true poses that count 30 a second."""
     sentences = said(noisy(path(seconds=0.2), 0.01), path(seconds=1 / 30))
     assert any("Only 9 of 50 poses match in time" in s for s in sentences)
+    some = Trajectory(*(x[::7] for x in (path().timestamps, path().T_wc, path().tracked)))
+    [sentence] = said(noisy(path(), 0.01), some)
+    assert "Only 8 of 50 estimated poses are compared" in sentence
     few = path(n=5)
     assert "5 poses are so few" in said(noisy(few, 0.01), few)[0]
 

@@ -8,6 +8,8 @@ from geogs.types import Trajectory
 
 FEWEST_MATCHED = 0.5
 """Part of the shorter trajectory whose poses have to match in time."""
+FEWEST_OF_ESTIMATE = 0.2
+"""Part of the estimate that has to be compared, where the truth has fewer poses."""
 FEWEST_PAIRS = 8
 """Poses below which a similarity fits nearly anything."""
 MAX_ERROR = 0.5
@@ -45,7 +47,13 @@ def _of_times(
 ) -> str:
     fewer = min(errors.estimated, errors.reference)
     if errors.pairs >= FEWEST_MATCHED * fewer:
-        return ""
+        if errors.pairs >= FEWEST_OF_ESTIMATE * errors.estimated:
+            return ""
+        return (
+            f"Only {errors.pairs} of {errors.estimated} estimated poses are compared, since the "
+            f"truth has no more than {errors.reference}, from {_span(reference)}; the estimate is "
+            f"from {_span(estimate)}. Of the other poses the errors say nothing."
+        )
     return (
         f"Only {errors.pairs} of {fewer} poses match in time, and nothing else is compared: the "
         f"estimate is from {_span(estimate)}, the truth from {_span(reference)}. Give true poses "
