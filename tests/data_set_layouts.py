@@ -109,12 +109,17 @@ def kitti_raw(root: Path) -> Sample:
     return Sample("kitti-raw", given, times, K, [], calibrations=[calib])
 
 
-def sensor_yaml(model: str, numbers: str) -> str:
+def sensor_yaml(
+    model: str,
+    numbers: str,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    K: tuple[float, ...] = (50.0, 51.0, 31.0, 23.0),
+) -> str:
     data = ", ".join(repr(float(x)) for x in BODY_FROM_CAMERA.ravel())
     return (
         "# General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam0\n"
-        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\nrate_hz: 20\nresolution: [64, 48]\n"
-        "camera_model: pinhole\nintrinsics: [50.0, 51.0, 31.0, 23.0]\n"
+        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\nrate_hz: 20\nresolution: {list(size)}\n"
+        f"camera_model: pinhole\nintrinsics: {list(K)}\n"
         f"distortion_model: {model}\ndistortion_coefficients: [{numbers}]\n"
     )
 
@@ -130,11 +135,11 @@ def asl_images(folder: Path) -> np.ndarray:
     return stamps
 
 
-def asl_truth(file: Path, stamps: np.ndarray, columns: int) -> None:
+def asl_truth(file: Path, stamps: np.ndarray, columns: int, T_wc: np.ndarray) -> None:
     """Poses of the body at the images."""
-    T = walk() @ np.linalg.inv(BODY_FROM_CAMERA)
+    T = T_wc @ np.linalg.inv(BODY_FROM_CAMERA)
     file.parent.mkdir()
-    table = np.column_stack([T[:, :3, 3], xyzw(T)[:, [3, 0, 1, 2]], np.zeros((COUNT, columns))])
+    table = np.column_stack([T[:, :3, 3], xyzw(T)[:, [3, 0, 1, 2]], np.zeros((len(T), columns))])
     lines = [
         f"{t}," + ",".join(repr(float(x)) for x in r) for t, r in zip(stamps, table, strict=True)
     ]
@@ -148,7 +153,7 @@ def euroc(root: Path) -> Sample:
         text = sensor_yaml("radial-tangential", "-0.28, 0.07, 0.0002, 0.00002")
         (folder / "mav0" / name / "sensor.yaml").write_text(text)
     truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    asl_truth(truth, stamps, 9)
+    asl_truth(truth, stamps, 9, walk())
     cam0 = folder / "mav0" / "cam0"
     return Sample(
         "asl", [folder, folder / "mav0", cam0, cam0 / "data", root], 1e-9 * stamps,
@@ -161,7 +166,7 @@ def tum_vi(root: Path) -> Sample:
     folder = root / "dataset-room1_512_16"
     stamps = asl_images(folder)
     truth = folder / "mav0" / "mocap0" / "data.csv"
-    asl_truth(truth, stamps, 0)
+    asl_truth(truth, stamps, 0, walk())
     matrix = [[float(x) for x in row] for row in np.linalg.inv(BODY_FROM_CAMERA)]
     camera = (
         f"  T_cam_imu: {json.dumps(matrix)}\n  camera_model: pinhole\n"

@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 import torch
 
+from data_set_layouts import asl_truth, sensor_yaml
 from geogs.application.result_settings import RemeshSettings
 from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.application.results.saved_result import load_result
 from geogs.cli import main as cli
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.evaluation.trajectory_errors import evaluate_trajectory
-from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.pose_files import read_poses, read_tum_trajectory
+from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.writers.map_file import load_map
 from geogs.mesh.mesh_file import read_mesh
 from geogs.slam import Slam
@@ -116,6 +118,33 @@ def test_a_small_run_is_near_the_truth(small_room, small_result, tmp_path):
     assert said["is_reliable"]
     assert said["lost"] == 0
     assert said["position"] < 0.05
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_sequence_of_euroc_runs_as_it_lies_on_disk(small_room, tmp_path):
+    """The truth is the body's, brought to the camera; the result is compared by the clock."""
+    mav0 = tmp_path / "euroc" / "V1_01_easy" / "mav0"
+    (mav0 / "cam0" / "data").mkdir(parents=True)
+    stamps = 1403715273262142976 + 50_000_000 * np.arange(SMALL_FRAMES)
+    for k, stamp in enumerate(stamps):
+        image = cv2.imread(str(small_room / "results" / f"frame{k:06d}.jpg"))
+        cv2.imwrite(str(mav0 / "cam0" / "data" / f"{stamp}.png"), image)
+    listing = "".join(f"{t},{t}.png\n" for t in stamps)
+    (mav0 / "cam0" / "data.csv").write_text("#timestamp [ns],filename\n" + listing)
+    camera = read_calibration(small_room / "cam_params.json").fit(128, 96)
+    K = camera.fx, camera.fy, camera.cx, camera.cy
+    sensor = sensor_yaml("radial-tangential", "0.0, 0.0, 0.0, 0.0", (128, 96), K)
+    (mav0 / "cam0" / "sensor.yaml").write_text(sensor)
+    poses = read_poses(small_room / "traj.txt").T_wc[:SMALL_FRAMES]
+    asl_truth(mav0 / "state_groundtruth_estimate0" / "data.csv", stamps, 9, poses)
+    out = tmp_path / "out"
+    assert cli.main(["run", str(mav0.parent), "-o", str(out), *SMALL]) == 0
+    assert cli.main(["eval", str(out), "--gt", str(tmp_path / "euroc"), "--no-plots"]) == 0
+    scores = json.loads((out / "eval.json").read_text())
+    assert scores["trajectory"]["pairs"] == SMALL_FRAMES
+    assert scores["trajectory"]["ate_rmse_cm"] < 0.6
+    assert scores["trajectory"]["rotation_rmse_deg"] < 4.0  # the body is turned by some 70
+    assert scores["doubts"] == []
 
 
 def test_a_run_leaves_every_file(small_result):
