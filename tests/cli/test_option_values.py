@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from geogs.cli import demo, doctor, eval, export, mesh, reconstruct, run, scale, view
+from geogs.cli import demo, doctor, download, eval, export, mesh, reconstruct, run, scale, view
 from geogs.cli.options import parse_options
 from geogs.config.leaves import Leaf, leaves
 from geogs.config.setting import Positional
@@ -36,6 +36,7 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
     "scale": (scale.RescaleSettings, plain(scale.RescaleSettings, "scale"), ["out"]),
     "synth": (synth.SynthOptions, lambda argv: parse_options(
         synth.SynthOptions, argv, "synth", synth._defaults), ["out"]),
+    "download": (download.DownloadOptions, plain(download.DownloadOptions, "download"), []),
     "demo": (demo.DemoOptions, plain(demo.DemoOptions, "demo"), []),
     "doctor": (doctor.DoctorOptions, plain(doctor.DoctorOptions, "doctor"), []),
     "fleet": (FleetOptions, fleet.parse, ["v.mp4"]),

@@ -36,6 +36,7 @@ COMMANDS = {
     "export": Command("geogs.cli.export", "write a result in the formats of other programs"),
     "view": Command("geogs.cli.view", "look at a result in the browser"),
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
+    "download": Command("geogs.cli.download", "fetch a public sequence, or list those known"),
     "demo": Command("geogs.cli.demo", "make a small room, reconstruct it and show the errors"),
     "weights": Command("geogs.cli.weights", "list the networks' weights, or verify a file"),
     "doctor": Command(

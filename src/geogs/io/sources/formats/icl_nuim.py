@@ -28,8 +28,8 @@ _TRUTH = "*.gt.freiburg"
 _CAMERA = Calibration(
     481.2, 480.0, 319.5, 239.5, width=640, height=480, origin="the ICL-NUIM data set"
 )  # fmt: skip
-_NAMES = ("living_room_traj", "office_room_traj", "livingroom", "icl")
-"""What folders are called that have the data set's camera."""
+_NAMES = ("frei_png", "living_room", "livingroom", "office_room", "icl-nuim", "icl_nuim")
+"""What is in the names of folders that have the data set's camera."""
 _Y_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
 
 

@@ -1,0 +1,1 @@
+"""Public sequences: which are known, fetched with resumption, unpacked safely."""

@@ -1,0 +1,50 @@
+"""``geogs download NAME DIR``: a public sequence, fetched and unpacked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from geogs.application.download.sequences import SEQUENCES, find_sequence
+from geogs.application.run_settings import Verbosity
+from geogs.cli.options import parse_options
+from geogs.config.setting import Positional
+
+
+@dataclass(frozen=True)
+class DownloadOptions(Verbosity):
+    """Fetch a public sequence with its true poses; without a name, list those that are known.
+
+    What was cut off is gone on with by the same command. The licence is that of the data set's
+    makers, who also say what to cite.
+    """
+
+    name: Annotated[str, Positional(required=False)] = ""
+    """The sequence, such as tum/fr1_desk."""
+    into: Annotated[Path, Positional(required=False)] = Path()
+    """Folder into which its folder comes."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    options = parse_options(DownloadOptions, argv, "download")
+    if not options.name:
+        print(listing())
+        return 0
+    sequence = find_sequence(options.name)
+
+    from geogs.application.download.download import download
+    from geogs.application.terminal_progress import TerminalProgress
+
+    with TerminalProgress(options) as progress:
+        progress.write(f"{sequence.name}: licence {sequence.licence}, see {sequence.page}")
+        place = download(sequence, options.into, progress)
+    print(f"geogs run {place} reads it, and geogs eval RESULT --gt {place} its true poses.")
+    return 0
+
+
+def listing() -> str:
+    """The sequences that are known, with their licences."""
+    width = max(len(sequence.name) for sequence in SEQUENCES)
+    lines = [f"  {s.name:<{width}}  {s.licence:<16} {s.page}" for s in SEQUENCES]
+    return "\n".join(["geogs download NAME DIR, of", *lines])
