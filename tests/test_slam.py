@@ -343,6 +343,7 @@ CASES = {
 }
 TURNING = {
     "static video": ([noise()] * 20, "hardly moves"),
+    "two frames": ([turned(0), turned(4)], "hardly moves"),
     "pure rotation": ([turned(1.4 * i - 14) for i in range(20)], "show no parallax"),
 }
 

@@ -97,7 +97,8 @@ def _read_list(listing: Path) -> list[ImageFile]:
             raise InputError(
                 f"{listing}, line {number}: expected a time and a file, twice."
             ) from None
-        time, image, depth = (second, b, a) if a.startswith("depth") else (first, a, b)
+        is_depth_first = "depth" in Path(a).parts
+        time, image, depth = (second, b, a) if is_depth_first else (first, a, b)
         beside = DepthFile(listing.parent / depth, PER_METRE)
         files.append(ImageFile(listing.parent / image, time, beside))
     if not files:

@@ -85,7 +85,7 @@ def found_below(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place]
         found = [(child, one) for child in below if (one := _whole(child, layouts))]
         if len(found) > 1:
             names = ", ".join(str(child.relative_to(folder)) for child, _ in found[:_NAMED])
-            more = ", ..." if len(found) > _NAMED else ""
+            more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
             raise InputError(f"{folder} holds several sequences; give one of {names}{more}.")
         if found:
             return found[0][1]
