@@ -17,7 +17,8 @@ from geogs.io.sources.formats import (
     tartanair,
     tum,
 )
-from geogs.io.sources.formats.layouts import Layout, Place
+from geogs.io.sources.formats.image_files import Place
+from geogs.io.sources.layouts import Layout
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.reader import Reader
 

@@ -16,10 +16,10 @@ from geogs.io.sources.formats.image_files import (
     image_folder,
     open_image_folder,
 )
-from geogs.io.sources.formats.layouts import found_below, found_in, what_is_missing
 from geogs.io.sources.formats.model_layouts import open_posed_photographs, place_of_model
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.known_layouts import LAYOUTS, WITH_MODEL
+from geogs.io.sources.layouts import found_below, found_in, what_is_missing
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import Reader

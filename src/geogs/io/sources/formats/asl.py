@@ -20,10 +20,11 @@ from geogs.io.sources.calibration_files import calibration_from_document, camera
 from geogs.io.sources.formats.image_files import (
     ImageFile,
     ImageList,
+    Place,
+    holds_pictures,
     images_in,
     in_order_of_time,
 )
-from geogs.io.sources.formats.layouts import Place, holds_pictures
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory

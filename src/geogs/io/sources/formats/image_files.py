@@ -44,6 +44,16 @@ class ImageFile:
     """By another tracker."""
 
 
+@dataclass(frozen=True)
+class Place:
+    """A sequence of a data set on disk."""
+
+    folder: Path
+    """The sequence's own."""
+    pictures: Path
+    """That of its images which are read; its own where the layout does not say."""
+
+
 class ImageList:
     """Reader of image files; the size that most have is that of the recording."""
 
@@ -202,6 +212,11 @@ def has_images(folder: Path) -> bool:
             return any(_is_image(entry.name) for entry in entries)
     except OSError:
         return False
+
+
+def holds_pictures(folder: Path, names: Sequence[str]) -> bool:
+    """Whether there are images in one of the named folders below."""
+    return any(has_images(folder / name) for name in names)
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -18,8 +18,13 @@ from geogs.errors import InputError
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_camera, kitti_offset
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in
-from geogs.io.sources.formats.layouts import Place, holds_pictures
+from geogs.io.sources.formats.image_files import (
+    ImageFile,
+    ImageList,
+    Place,
+    holds_pictures,
+    images_in,
+)
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory

@@ -15,8 +15,14 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.colmap import is_model, open_colmap
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in, in_order_of_time
-from geogs.io.sources.formats.layouts import Place, holds_pictures
+from geogs.io.sources.formats.image_files import (
+    ImageFile,
+    ImageList,
+    Place,
+    holds_pictures,
+    images_in,
+    in_order_of_time,
+)
 from geogs.io.sources.posed.posed_set import PosedSet
 
 _MODELS = {

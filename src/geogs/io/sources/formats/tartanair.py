@@ -14,8 +14,13 @@ import numpy as np
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, quaternion_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in
-from geogs.io.sources.formats.layouts import Place, holds_pictures
+from geogs.io.sources.formats.image_files import (
+    ImageFile,
+    ImageList,
+    Place,
+    holds_pictures,
+    images_in,
+)
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory
