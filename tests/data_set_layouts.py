@@ -88,25 +88,65 @@ def kitti_odometry(root: Path) -> Sample:
     )  # fmt: skip
 
 
+def oxts_rows(T_wi: np.ndarray) -> list[str]:
+    """Rows of the inertial unit at poses whose world is x east, y north, z up, in metres."""
+    start, radius = np.radians([49.015, 8.434]), 6378137.0
+    scale = radius * np.cos(start[0])
+    north = scale * np.log(np.tan(np.pi / 4 + start[0] / 2)) + T_wi[:, 1, 3] - T_wi[0, 1, 3]
+    latitude = 2 * np.arctan(np.exp(north / scale)) - np.pi / 2
+    longitude = start[1] + (T_wi[:, 0, 3] - T_wi[0, 0, 3]) / scale
+    turns = Rotation.from_matrix(T_wi[:, :3, :3]).as_euler("ZYX")[:, ::-1]
+    table = np.column_stack([
+        np.degrees(latitude), np.degrees(longitude), T_wi[:, 2, 3], turns, np.zeros((len(T_wi), 24))
+    ])  # fmt: skip
+    return [rows(row[None]) for row in table]
+
+
+def kitti_truth(day: Path, drive: Path, stamps: str) -> None:
+    """What the inertial unit says where the rectified camera 2 goes along the walk."""
+    velo_imu, cam_velo, rect, shift = (np.eye(4) for _ in range(4))
+    velo_imu[:3, :3] = Rotation.from_euler("xyz", [0.01, -0.02, 0.03]).as_matrix()
+    velo_imu[:3, 3] = -0.81, 0.32, -0.80
+    cam_velo[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    cam_velo[:3, 3] = -0.004, -0.076, -0.27
+    rect[:3, :3] = Rotation.from_euler("xyz", [-0.01, 0.005, 0.002]).as_matrix()
+    shift[0, 3] = 0.06
+    camera_imu = shift @ rect @ cam_velo @ velo_imu
+    upright = np.eye(4)
+    upright[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # z forward, y down to x forward, z up
+    (drive / "oxts" / "data").mkdir(parents=True)
+    for k, row in enumerate(oxts_rows(upright @ walk() @ camera_imu)):
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(row)
+    (drive / "oxts" / "timestamps.txt").write_text(stamps)
+    for name, T in (("imu_to_velo", velo_imu), ("velo_to_cam", cam_velo)):
+        R, t = rows(T[:3, :3].reshape(1, 9)), rows(T[None, :3, 3])
+        (day / f"calib_{name}.txt").write_text(f"calib_time: 25-May-2012 16:47:16\nR: {R}T: {t}")
+    with (day / "calib_cam_to_cam.txt").open("a") as file:
+        file.write("R_rect_00: " + rows(rect[:3, :3].reshape(1, 9)))
+
+
 def kitti_raw(root: Path) -> Sample:
     day, K = root / "2011_09_26", (50.0, 51.0, 31.0, 23.0)
     folder = day / "2011_09_26_drive_0001_sync"
+    seconds = 25.964389445 + 0.1037 * np.arange(COUNT)
+    stamps = "".join(f"2011-09-26 13:02:{s:.9f}\n" for s in seconds)
     lines = ["calib_time: 09-Jan-2012 13:57:47"]
-    for n in range(4):
+    for n, shift in enumerate((0.0, -0.54, 0.06, -0.48)):
         camera = folder / f"image_{n:02d}"
         write_images(camera / "data", [f"{k:010d}.png" for k in range(COUNT)], WIDTH, HEIGHT)
-        stamps = "".join(f"2011-09-26 13:02:{25 + k:02d}.964389445\n" for k in range(COUNT))
         (camera / "timestamps.txt").write_text(stamps)
         lines += [
             f"S_{n:02d}: 7.0e+01 5.0e+01", f"K_{n:02d}: 70 0 35 0 70 25 0 0 1",
             f"D_{n:02d}: -0.3 0.1 0.0 0.0 0.0", f"S_rect_{n:02d}: 6.4e+01 4.8e+01",
-            f"P_rect_{n:02d}: {projection(K, -0.5 * n)}",
+            f"P_rect_{n:02d}: {projection(K, shift)}",
         ]  # fmt: skip
     calib = day / "calib_cam_to_cam.txt"
     calib.write_text("\n".join(lines) + "\n")
-    times = 1317042145.964389445 + np.arange(COUNT)
-    given = [folder, folder / "image_02", folder / "image_02/data", day]
-    return Sample("kitti-raw", given, times, K, [], calibrations=[calib])
+    kitti_truth(day, folder, stamps)
+    return Sample(
+        "kitti-raw", [folder, folder / "image_02", folder / "image_02/data", day],
+        1317042120 + seconds, K, [folder, folder / "image_02"], calibrations=[calib],
+    )  # fmt: skip
 
 
 def sensor_yaml(

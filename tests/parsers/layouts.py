@@ -20,7 +20,9 @@ def layouts() -> dict[str, Parser]:
         ),
         "kitti-raw": (
             "2011_09_26/2011_09_26_drive_0001_sync",
-            ("2011_09_26/calib_cam_to_cam.txt",
+            ("2011_09_26/calib_cam_to_cam.txt", "2011_09_26/calib_imu_to_velo.txt",
+             "2011_09_26/2011_09_26_drive_0001_sync/oxts/data/0000000003.txt",
+             "2011_09_26/2011_09_26_drive_0001_sync/oxts/timestamps.txt",
              "2011_09_26/2011_09_26_drive_0001_sync/image_02/timestamps.txt"), mutations.text,
         ),
         "euroc": (
@@ -53,9 +55,7 @@ def layouts() -> dict[str, Parser]:
 
     def use(below: str) -> Callable[[Path], object]:
         def read(folder: Path) -> object:
-            opened = list(open_source(folder / below))
-            has_truth = below not in files["kitti-raw"][0]
-            return opened, read_true_scene(folder / below) if has_truth else None
+            return list(open_source(folder / below)), read_true_scene(folder / below)
 
         return read
 

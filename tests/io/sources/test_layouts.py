@@ -59,10 +59,6 @@ def test_the_true_poses_are_those_of_the_camera_that_is_read(sample, tmp_path):
 
 def test_images_are_read_with_their_poses(sample):
     for folder in {sample.given[0], *(t for t in sample.truths if t.is_dir())}:
-        if not sample.truths:
-            with pytest.raises(InputError, match="no images with known poses"):
-                open_posed_source(folder)
-            continue
         source = open_posed_source(folder, WHOLE)
         assert len(source) == len(walk())
         assert source.scene_scale == "metres"
@@ -96,6 +92,8 @@ def test_unrectified_images_of_kitti_have_the_unrectified_camera(tmp_path):
     write_images(folder / "image_02/data", ["0000000000.png"], 70, 50)
     camera = open_source(folder, WHOLE).calibration
     assert (camera.fx, camera.cx, camera.distortion) == (70, 35, (-0.3, 0.1, 0, 0, 0))
+    with pytest.raises(InputError, match="are those of rectified images"):
+        open_posed_source(folder)
 
 
 def test_what_apps_export_is_found_in_the_folder_above(tmp_path):
@@ -147,6 +145,10 @@ def test_missing_truth_is_named(tmp_path):
     (tmp_path / "dataset" / "poses" / "07.txt").unlink()
     with pytest.raises(InputError, match=r"without true poses: 07\.txt is in none of"):
         read_true_scene(folder)
+    drive = LAYOUTS["kitti-raw"](tmp_path).given[0]
+    (drive.parent / "calib_imu_to_velo.txt").unlink()
+    with pytest.raises(InputError, match=r"calib_imu_to_velo\.txt is missing"):
+        read_true_scene(drive)
 
 
 def test_times_of_images_that_colmap_left_out_are_no_others(tmp_path):

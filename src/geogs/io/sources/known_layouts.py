@@ -8,6 +8,7 @@ from geogs.io.sources.formats import (
     asl,
     icl_nuim,
     kitti,
+    kitti_raw,
     model_layouts,
     polycam,
     record3d,
@@ -81,9 +82,10 @@ LAYOUTS: tuple[Layout, ...] = (
         ("times.txt",), "image_2 or image_0 with the images", kitti.open_posed_kitti_odometry,
     ),
     Layout(
-        "KITTI raw", kitti.is_kitti_raw, kitti.open_kitti_raw, kitti.RAW,
+        "KITTI raw", kitti_raw.is_kitti_raw, kitti_raw.open_kitti_raw, kitti_raw.RAW,
         ("oxts", "image_0*/timestamps.txt", "calib_cam_to_cam.txt"),
         "image_02/data with the images of a drive",
+        kitti_raw.open_posed_kitti_raw,
     ),
     Layout(
         "ScanNet++", model_layouts.is_scannetpp, model_layouts.open_photographs,

@@ -1,19 +1,15 @@
-"""KITTI: odometry (``sequences/00/image_0 ... image_3``) and raw (``image_02/data``).
+"""KITTI's odometry benchmark: ``sequences/00/image_0 ... image_3``, ``calib.txt``, ``times.txt``.
 
-Odometry: ``calib.txt`` and ``times.txt`` lie beside the images, the pose of camera 0 at each image
-in a row of ``poses/00.txt``, one or two levels up. Raw: ``timestamps.txt`` beside ``data``, and
-``calib_cam_to_cam.txt`` above. https://www.cvlibs.net/datasets/kitti
+The pose of camera 0 at each image is a row of ``poses/00.txt``, one or two levels up.
+https://www.cvlibs.net/datasets/kitti/eval_odometry.php
 """
 
 import re
-from collections.abc import Iterable
-from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import UNUSABLE, read_text
+from geogs.documents import UNUSABLE
 from geogs.errors import InputError
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
@@ -31,7 +27,6 @@ from geogs.types import Trajectory
 
 ODOMETRY = ("image_2", "image_0", "image_3", "image_1")
 """Folders of images, those of the left colour camera first."""
-RAW = tuple(f"image_{number:02d}/data" for number in (2, 0, 3, 1))
 _FRAMES_PER_SECOND = 10.0
 """Of the data set, where the file of times is missing."""
 
@@ -41,33 +36,14 @@ def is_kitti_odometry(folder: Path) -> bool:
     return holds_pictures(folder, ODOMETRY)
 
 
-def is_kitti_raw(folder: Path) -> bool:
-    """Whether ``folder`` is a drive of the raw data."""
-    return holds_pictures(folder, RAW)
-
-
 def open_kitti_odometry(place: Place) -> ImageList:
     """Read the images of one camera; times are those of ``times.txt``."""
     number = int(place.pictures.name[-1])
     listing, calib = place.folder / "times.txt", place.folder / "calib.txt"
     times = _seconds(listing) if listing.is_file() else None
-    camera = _camera(calib, number) if calib.is_file() else None
+    camera = camera_of(calib, number) if calib.is_file() else None
     name = f"{place.folder.resolve().name}-{place.pictures.name}"
-    return ImageList("kitti", name, _timed(place.pictures, times, listing), camera)
-
-
-def open_kitti_raw(place: Place) -> ImageList:
-    """Read the images of one camera; times are those of ``timestamps.txt``, by the epoch."""
-    number = int(place.pictures.parent.name[-2:])
-    listing = place.pictures.parent / "timestamps.txt"
-    times = _dates(listing) if listing.is_file() else None
-    name = f"{place.folder.resolve().name}-{place.pictures.parent.name}"
-    images = ImageList("kitti-raw", name, _timed(place.pictures, times, listing), None)
-    above = (place.folder, place.folder.resolve().parent)
-    calib = next((p for f in above if (p := f / "calib_cam_to_cam.txt").is_file()), None)
-    if calib is not None:
-        images.info = replace(images.info, calibration=_raw_camera(calib, number, images))
-    return images
+    return ImageList("kitti", name, timed(place.pictures, times, listing), camera)
 
 
 def open_posed_kitti_odometry(place: Place) -> PosedSet:
@@ -124,8 +100,12 @@ def _poses(file: Path, folder: Path) -> Trajectory:
     return matrix_trajectory(file, seconds[: len(rows)], T_wc, is_rigid(T_wc))
 
 
-def _timed(pictures: Path, times: np.ndarray | None, listing: Path) -> list[ImageFile]:
-    """Images with the time in the row of their number."""
+def timed(pictures: Path, times: np.ndarray | None, listing: Path) -> list[ImageFile]:
+    """Images with the time in the row of their number; ten a second where there are no times.
+
+    Raises:
+        InputError: there are no numbered images, or more than times.
+    """
     numbered = sorted((int(p.stem), p) for p in images_in(pictures) if _is_number(p.stem))
     if not numbered:
         raise InputError(f"{pictures} holds no images that are numbered, such as 000000.png.")
@@ -150,32 +130,9 @@ def _seconds(listing: Path) -> np.ndarray:
     return seconds
 
 
-def _dates(listing: Path) -> np.ndarray:
-    """Seconds since 1970 of rows such as ``2011-09-26 13:02:25.964389445``."""
-    return np.array(list(_epochs(read_text(listing).splitlines(), listing)))
-
-
-def _epochs(lines: Iterable[str], listing: Path) -> Iterable[float]:
-    for number, line in enumerate(lines, start=1):
-        try:
-            whole, _, fraction = line.strip().partition(".")
-            date = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            yield date.timestamp() + float(f"0.{fraction or 0}")
-        except ValueError:
-            raise InputError(f"{listing}, line {number}: expected a date and a time.") from None
-
-
-def _camera(path: Path, number: int, rectified: bool = True) -> Calibration:
+def camera_of(path: Path, number: int, rectified: bool = True) -> Calibration:
+    """The camera ``number`` of a file of KITTI. Raises InputError where it is none."""
     try:
         return kitti_camera(path, number, rectified)
     except UNUSABLE:
         raise InputError(f"{path} is no calibration of KITTI; copy it again.") from None
-
-
-def _raw_camera(path: Path, number: int, images: ImageList) -> Calibration:
-    """The rectified camera, or where the images have another size, as they have before, that."""
-    rectified = _camera(path, number)
-    size = (images.info.width, images.info.height)
-    if (rectified.width, rectified.height) in (size, (None, None)):
-        return rectified
-    return _camera(path, number, rectified=False)

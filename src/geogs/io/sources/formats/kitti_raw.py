@@ -1,0 +1,164 @@
+"""KITTI's raw data: ``image_00/data ... image_03/data`` of a drive, with ``timestamps.txt`` beside.
+
+``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt`` and ``calib_imu_to_velo.txt`` lie in the folder
+of the day, above. The truth is that of the GPS and inertial unit, ``oxts/data``: latitude,
+longitude, altitude, roll, pitch and yaw, brought to metres by a Mercator projection and to the
+rectified camera by the calibrations (Geiger et al., "Vision meets robotics", IJRR 2013).
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.documents import read_text
+from geogs.errors import InputError
+from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.data_set_cameras import kitti_offset, kitti_rows
+from geogs.io.sources.formats.image_files import ImageList, Place, file_names, holds_pictures
+from geogs.io.sources.formats.kitti import camera_of, timed
+from geogs.io.sources.formats.timed_poses import with_timed_poses
+from geogs.io.sources.posed.posed_set import PosedSet
+from geogs.types import Trajectory
+
+RAW = tuple(f"image_{number:02d}/data" for number in (2, 0, 3, 1))
+"""Folders of images, those of the left colour camera first."""
+_EARTH = 6378137.0
+"""Metres of its radius."""
+_MAX_GAP = 0.25
+"""Seconds between two poses across which one is interpolated: there are ten a second."""
+
+
+def is_kitti_raw(folder: Path) -> bool:
+    """Whether ``folder`` is a drive of the raw data."""
+    return holds_pictures(folder, RAW)
+
+
+def open_kitti_raw(place: Place) -> ImageList:
+    """Read the images of one camera; times are those of ``timestamps.txt``, by the epoch."""
+    number = int(place.pictures.parent.name[-2:])
+    listing = place.pictures.parent / "timestamps.txt"
+    times = _dates(listing) if listing.is_file() else None
+    name = f"{place.folder.resolve().name}-{place.pictures.parent.name}"
+    images = ImageList("kitti-raw", name, timed(place.pictures, times, listing), None)
+    calib = _above(place.folder, "calib_cam_to_cam.txt")
+    if calib is not None:
+        images.info = replace(images.info, calibration=_raw_camera(calib, number, images))
+    return images
+
+
+def open_posed_kitti_raw(place: Place) -> PosedSet:
+    """Read the rectified images of one camera with the poses of the inertial unit at their times.
+
+    Raises:
+        InputError: a file is missing, or the images are not rectified.
+    """
+    images = open_kitti_raw(place)
+    oxts = place.folder / "oxts"
+    if not (oxts / "timestamps.txt").is_file() or not (oxts / "data").is_dir():
+        raise InputError(f"{place.folder} holds no true poses: oxts with its data is missing.")
+    if images.info.calibration is not None and images.info.calibration.distortion:
+        raise InputError(
+            f"The true poses of {place.folder} are those of rectified images; give these (_sync)."
+        )
+    camera_imu = _camera_from_imu(place.folder, int(place.pictures.parent.name[-2:]))
+    trajectory = _imu_trajectory(oxts)
+    T_wc = trajectory.T_wc @ np.linalg.inv(camera_imu)
+    return with_timed_poses(
+        images, Trajectory(trajectory.timestamps, T_wc, trajectory.tracked), _MAX_GAP
+    )
+
+
+def _imu_trajectory(oxts: Path) -> Trajectory:
+    """Poses of the unit (x forward, y left, z up) from its axes to east, north and up."""
+    times = _dates(oxts / "timestamps.txt")
+    names = sorted(name for name in file_names(oxts / "data") if name.endswith(".txt"))
+    if len(names) != len(times):
+        raise InputError(f"{oxts} holds {len(names)} rows for {len(times)} times; copy it again.")
+    rows = np.array([_six(oxts / "data" / name) for name in names]).reshape(-1, 6)
+    latitude, longitude, altitude = np.radians(rows[:, 0]), np.radians(rows[:, 1]), rows[:, 2]
+    scale = np.cos(latitude[0]) * _EARTH if len(rows) else _EARTH
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, 0, 3] = scale * longitude
+    T[:, 1, 3] = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
+    T[:, 2, 3] = altitude
+    T[:, :3, 3] -= T[:1, :3, 3]  # near the origin, where digits are left
+    T[:, :3, :3] = _turned(rows[:, 3:])
+    return matrix_trajectory(oxts, times, T, is_rigid(T))
+
+
+def _turned(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
+    """Rotations about x by the roll, then y by the pitch, then z by the yaw, radians."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles).T, np.sin(angles).T
+    return np.stack([
+        np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], 1),
+        np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], 1),
+        np.stack([-sp, cp * sr, cp * cr], 1),
+    ], 1)  # fmt: skip
+
+
+def _six(file: Path) -> Float64[np.ndarray, "6"]:
+    """Latitude and longitude in degrees, altitude in metres, roll, pitch and yaw in radians."""
+    return read_rows(file, (30,), "30 numbers of the inertial unit")[0, :6]
+
+
+def _camera_from_imu(folder: Path, number: int) -> Float64[np.ndarray, "4 4"]:
+    """From the unit's axes to those of a rectified camera, by the three calibrations."""
+    T = np.eye(4)
+    for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt"):
+        rows, file = _rows(folder, name)
+        T = _motion(rows.get("R", []), rows.get("T", []), file) @ T
+    rows, file = _rows(folder, "calib_cam_to_cam.txt")
+    T = _motion(rows.get("R_rect_00", []), [0.0, 0.0, 0.0], file) @ T
+    T[:3, 3] += kitti_offset(file, number)
+    return T
+
+
+def _rows(folder: Path, name: str) -> tuple[dict[str, list[float]], Path]:
+    file = _above(folder, name)
+    if file is None:
+        raise InputError(f"{name} is missing beside or above {folder}; the true poses need it.")
+    return kitti_rows(read_text(file)), file
+
+
+def _motion(R: list[float], t: list[float], file: Path) -> Float64[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    if len(R) == 9 and len(t) == 3:
+        T[:3, :3], T[:3, 3] = np.reshape(R, (3, 3)), t
+    if len(R) != 9 or len(t) != 3 or not is_rigid(T[None])[0]:
+        raise InputError(f"{file} holds no rotation with its translation; copy it again.")
+    return T
+
+
+def _above(folder: Path, name: str) -> Path | None:
+    """A file of a drive or of its day; none if neither has it."""
+    places = (folder, folder.resolve().parent)
+    return next((place / name for place in places if (place / name).is_file()), None)
+
+
+def _dates(listing: Path) -> np.ndarray:
+    """Seconds since 1970 of rows such as ``2011-09-26 13:02:25.964389445``."""
+    return np.array(list(_epochs(read_text(listing).splitlines(), listing)))
+
+
+def _epochs(lines: Iterable[str], listing: Path) -> Iterable[float]:
+    for number, line in enumerate(lines, start=1):
+        try:
+            whole, _, fraction = line.strip().partition(".")
+            date = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            yield date.timestamp() + float(f"0.{fraction or 0}")
+        except ValueError:
+            raise InputError(f"{listing}, line {number}: expected a date and a time.") from None
+
+
+def _raw_camera(path: Path, number: int, images: ImageList) -> Calibration:
+    """The rectified camera, or where the images have another size, as they have before, that."""
+    rectified = camera_of(path, number)
+    size = (images.info.width, images.info.height)
+    if (rectified.width, rectified.height) in (size, (None, None)):
+        return rectified
+    return camera_of(path, number, rectified=False)

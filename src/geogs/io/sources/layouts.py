@@ -1,0 +1,104 @@
+"""Where data sets keep the images of a sequence: found by content, one level up or down too."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs.io.sources.formats.image_files import Place, has_images
+from geogs.io.sources.posed.posed_set import PosedSet
+from geogs.io.sources.reader import Reader
+
+_MOST_FOLDERS = 200
+"""Folders in a folder that are looked into for a sequence."""
+_NAMED = 5
+"""Sequences that a sentence names."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a data set lies on disk."""
+
+    name: str
+    """Name of the data set, for sentences."""
+    holds: Callable[[Path], object]
+    """Whether a folder is a sequence."""
+    open: Callable[[Place], Reader]
+    pictures: tuple[str, ...] = ()
+    """Folders of images in that of a sequence, of one camera each; the first that there is counts,
+    unless another is given."""
+    signs: tuple[str, ...] = ()
+    """Patterns of files that lie beside the images and tell of the data set without them."""
+    needs: str = ""
+    """What has to lie beside these signs, in words."""
+    posed: Callable[[Place], PosedSet] | None = None
+    """Reads the images with their true poses; raises InputError where these are missing."""
+
+    def place_in(self, folder: Path) -> Place | None:
+        """The sequence that a folder is, or of which it is a folder of images; none if neither."""
+        if self.holds(folder):
+            found = (folder / name for name in self.pictures)
+            return Place(folder, next((p for p in found if has_images(p)), folder))
+        folder = folder.absolute()
+        for name in self.pictures:
+            parts = Path(name).parts
+            for depth in range(len(parts), 0, -1):
+                root = folder.parents[depth - 1] if depth <= len(folder.parents) else folder
+                is_part = folder.parts[-depth:] == parts[:depth]
+                if is_part and has_images(root / name) and self.holds(root):
+                    return Place(root, root / name)
+        return None
+
+
+def found_in(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
+    """The first layout of a folder as it is given, or of a sequence that it is a part of."""
+    for layout in layouts:
+        if place := layout.place_in(folder):
+            return layout, place
+    return None
+
+
+def found_below(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
+    """The only sequence one or two levels below a folder; none if there is none.
+
+    Raises:
+        InputError: there are several.
+    """
+    below = [folder]
+    for _ in range(2):
+        below = [child for parent in below for child in _folders(parent)][:_MOST_FOLDERS]
+        found = [(child, one) for child in below if (one := _whole(child, layouts))]
+        if len(found) > 1:
+            names = ", ".join(str(child.relative_to(folder)) for child, _ in found[:_NAMED])
+            more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+            raise InputError(f"{folder} holds several sequences; give one of {names}{more}.")
+        if found:
+            return found[0][1]
+    return None
+
+
+def what_is_missing(folder: Path, layouts: Sequence[Layout]) -> str | None:
+    """What a folder lacks that is near a layout, as a sentence; none where it is near none."""
+    for layout in layouts:
+        for sign in layout.signs:
+            found = next(iter(folder.glob(sign)), None)
+            if found is not None:
+                return (
+                    f"{folder} looks like {layout.name}, for it holds {found.relative_to(folder)}, "
+                    f"but {layout.needs} is missing; unpack all of the sequence."
+                )
+    return None
+
+
+def _whole(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place] | None:
+    """The layout of a folder that is a sequence itself."""
+    found = ((layout, layout.place_in(folder)) for layout in layouts if layout.holds(folder))
+    return next(((layout, place) for layout, place in found if place), None)
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    """Folders in a folder, in order of names; what may not be looked into has none."""
+    try:
+        yield from sorted(p for p in folder.iterdir() if p.is_dir() and p.name[0] != ".")
+    except OSError:
+        return
