@@ -7,6 +7,7 @@ is the body's: ``mav0/state_groundtruth_estimate0/data.csv`` (EuRoC) or ``mav0/m
 https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,7 @@ def _listed(listing: Path) -> list[ImageFile]:
         words = [word.strip() for word in line.split("#", 1)[0].split(",")]
         if words == [""]:
             continue
-        if len(words) != 2 or not words[0].isdecimal() or not words[1]:
+        if len(words) != 2 or not re.fullmatch(r"[0-9]{1,20}", words[0]) or not words[1]:
             raise InputError(f"{listing}, line {number}: expected nanoseconds and a file.")
         files.append(ImageFile(listing.parent / "data" / words[1], int(words[0]) * _NANOSECONDS))
     if not files:

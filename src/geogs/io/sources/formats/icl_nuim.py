@@ -79,7 +79,7 @@ def _truth_beside(folder: Path) -> Path | None:
 
 def _is_counted(files: list[ImageFile]) -> bool:
     """Whether the times are the numbers that the images are called by."""
-    return all(f.path.stem.isdecimal() and int(f.path.stem) == int(f.timestamp) for f in files)
+    return all(f.path.stem == str(int(f.timestamp)) for f in files)
 
 
 def _read_list(listing: Path) -> list[ImageFile]:
