@@ -9,8 +9,9 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import EvaluatedPhoto
 from geogs.evaluation.surfaces.silhouettes import Silhouette
+from geogs.io.pose_files import POSE_FILES
 from geogs.io.sources.posed.posed_source import PosedSource
-from geogs.io.sources.sniff import holds_posed_images, open_posed_source
+from geogs.io.sources.sniff import open_posed_source
 from geogs.io.sources.truth_files import read_truth
 from geogs.types import Trajectory
 
@@ -57,7 +58,8 @@ def read_true_scene(path: Path) -> TrueScene:
         try:
             source = open_posed_source(path)
         except InputError as why:
-            raise (why if is_model or holds_posed_images(path) else error) from None
+            is_named = any((path / name).is_file() for name in POSE_FILES)
+            raise (why if is_model or (path.is_dir() and not is_named) else error) from None
     metres = _METRES.get(source.scene_scale, 1.0)
     T_wc = np.linalg.inv(source.T_cw)
     T_wc[:, :3, 3] *= metres

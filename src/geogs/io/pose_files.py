@@ -23,6 +23,8 @@ FRAMES_PER_SECOND = 30.0
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes x right, y down, z forward from x right, y up, z backward; it is its own inverse."""
 
+POSE_FILES = ("groundtruth.txt", "traj.txt")
+"""What files with the poses of a sequence are called in its folder."""
 ORIENTATIONS = "orientations.tum"
 """The file of a result with the frames of which no more than the orientation is known."""
 _log = logging.getLogger(__name__)
@@ -133,7 +135,7 @@ def read_poses(path: str | Path) -> Trajectory:
     """Read poses in whichever of the formats above ``path`` is: a folder, or rows of 8, 12, 16."""
     path = Path(path)
     if path.is_dir():
-        for name in ("groundtruth.txt", "traj.txt"):
+        for name in POSE_FILES:
             if (path / name).is_file():
                 return read_poses(path / name)
         return read_seven_scenes_poses(path)

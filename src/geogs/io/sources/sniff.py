@@ -140,14 +140,6 @@ def open_posed_source(
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
-def holds_posed_images(path: Path) -> bool:
-    """Whether a folder is laid out as a set of images with known poses, usable or not."""
-    if not path.is_dir():
-        return False
-    is_set = any(is_format(path) for is_format, _ in _POSED_FORMATS)
-    return is_set or found_in(path, _POSED_LAYOUTS) is not None
-
-
 def _posed_set(path: Path) -> PosedSet:
     if not path.exists():
         raise InputError(f"{path} does not exist; give a folder of images with poses.")

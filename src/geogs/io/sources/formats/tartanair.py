@@ -47,7 +47,7 @@ def open_tartanair(place: Place) -> ImageList:
     if not numbered:
         raise InputError(f"{place.pictures} holds no images such as 000000_left.png.")
     files = [ImageFile(path, k / FRAMES_PER_SECOND) for k, path in numbered]
-    name = "-".join(place.folder.resolve().parts[-3:]).lstrip("/")
+    name = "-".join(place.folder.resolve().parts[1:][-3:])  # the place, the level, the path
     images = ImageList("tartanair", name, files, None)
     width, height = images.info.width, images.info.height
     calibration = Calibration(
