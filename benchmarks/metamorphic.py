@@ -105,7 +105,7 @@ RELATIONS = (
 
 def shape_of(frames: Sequence[Frame], camera: Camera, config: Config) -> Shape:
     """Run everything on frames, whose index is only remembered."""
-    slam = Slam(camera, config)
+    slam = Slam(camera, config, device="cpu")
     for index, frame in enumerate(frames):
         slam.process(replace(frame, index=index))
     slam.finish()

@@ -164,7 +164,7 @@ def compare_maps(walk: Walk, kind: DepthKind, config: PriorConfig) -> None:
             mapping = dataclasses.replace(mapping, loss=loss)
         prior = None if errors is None else DegradedPrior(walk.views, errors, kind)
         start = time.perf_counter()
-        slam = Slam(walk.camera, Config(prior=config, mapping=mapping), prior=prior)
+        slam = Slam(walk.camera, Config(prior=config, mapping=mapping), prior=prior, device="cpu")
         for n, view in enumerate(walk.views):
             slam.process(Frame(n, n / 30, view.image))
         slam.finish()

@@ -20,7 +20,7 @@ def main(video: str, trajectory: Path = Path("trajectory.tum")) -> None:
         if pose.T_wc is None:
             print(f"{pose.timestamp:8.3f} s  {pose.state.value}")
         else:
-            x, y, z = pose.T_wc[:3, 3].tolist()
+            x, y, z = pose.T_wc[:3, 3]
             at = f"{x:7.3f} {y:7.3f} {z:7.3f} ± {pose.sigma_position:.4f}"
             print(f"{pose.timestamp:8.3f} s  {at}")
     slam.finish()

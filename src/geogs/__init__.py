@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
     from geogs.application.results.saved_result import load_result
+    from geogs.application.run_in_python import run
     from geogs.application.slam_in_python import load_slam, save_slam, slam_mesh, track
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
@@ -38,6 +39,7 @@ __all__ = [
     "open_source",
     "reconstruct",
     "render",
+    "run",
     "save_slam",
     "slam_mesh",
     "track",
@@ -58,6 +60,7 @@ _HOMES = {
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
+    "run": "geogs.application.run_in_python",
     "save_slam": "geogs.application.slam_in_python",
     "slam_mesh": "geogs.application.slam_in_python",
     "track": "geogs.application.slam_in_python",
@@ -73,3 +76,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module geogs has no attribute {name}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,14 +1,18 @@
 """Images as programs give them, checked before anything changes."""
 
+from dataclasses import replace
+
 import numpy as np
+import torch
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.types import Frame
+from geogs.geometry.given_pose import as_pose
+from geogs.types import Frame, MeasuredPose
 
 
 def input_frame(
-    image: Frame | np.ndarray,
+    image: Frame | np.ndarray | torch.Tensor,
     timestamp: float | None,
     camera: Camera,
     index: int,
@@ -26,7 +30,9 @@ def input_frame(
     Raises InputError if the image cannot be used.
     """
     if isinstance(image, Frame):
-        return image
+        return image if image.pose is None else _with_pose_checked(image, image.pose)
+    if isinstance(image, torch.Tensor):
+        image = image.cpu().numpy()
     if timestamp is None:
         seconds = 0.0 if previous is None else previous + 1 / 30
     else:
@@ -42,10 +48,14 @@ def input_frame(
     return Frame(index, seconds, image)
 
 
+def _with_pose_checked(frame: Frame, pose: MeasuredPose) -> Frame:
+    return replace(frame, pose=MeasuredPose(as_pose(pose.T_cw), pose.world))
+
+
 def check_image(image: object, camera: Camera) -> None:
     """Raise InputError if something is no RGB image of a camera's size."""
     if not isinstance(image, np.ndarray):
-        raise InputError("An image is a NumPy array, uint8 of height x width x 3 (RGB).")
+        raise InputError("An image is an array, uint8 of height x width x 3 (RGB).")
     if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
         raise InputError(
             "The image is grey; give RGB, as of cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)."

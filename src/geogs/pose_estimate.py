@@ -4,10 +4,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, nan
 
+import numpy as np
 from jaxtyping import Float64
-from torch import Tensor
 
-from geogs.geometry.lie import se3_inverse
 from geogs.tracking.locate.pose_deviation import DeviationOf, PoseDeviation
 from geogs.world.segments import TrackState
 
@@ -26,15 +25,15 @@ class PoseEstimate:
     disks: int
     timestamp: float = nan
     """Seconds."""
-    T_cw: Float64[Tensor, "4 4"] | None = field(default=None, compare=False)
+    T_cw: Float64[np.ndarray, "4 4"] | None = field(default=None, compare=False)
     """World to camera; none unless the camera is tracked in the main map."""
     deviation: DeviationOf | None = field(default=None, repr=False, compare=False)
     """Computes the deviation of the pose; none where nothing is known of it."""
 
     @property
-    def T_wc(self) -> Float64[Tensor, "4 4"] | None:
+    def T_wc(self) -> Float64[np.ndarray, "4 4"] | None:
         """Camera to world."""
-        return None if self.T_cw is None else se3_inverse(self.T_cw)
+        return None if self.T_cw is None else np.linalg.inv(self.T_cw)
 
     @property
     def is_tracked(self) -> bool:

@@ -45,7 +45,7 @@ class Slam(SlamOutput):
         self,
         camera: Camera,
         config: Config | None = None,
-        device: str = "cpu",
+        device: str = "auto",
         prior: MonocularPrior | None = None,
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
@@ -57,7 +57,7 @@ class Slam(SlamOutput):
 
         Args:
             camera: pinhole of all images, which are undistorted.
-            device: cpu, cuda, cuda:1 or auto.
+            device: auto (a GPU where there is one), cpu, cuda or cuda:1.
             prior: sees every keyframe.
             live: return from :meth:`process` when the pose is known, and do the rest in threads;
                 else results are the same each time on a CPU.
@@ -95,7 +95,9 @@ class Slam(SlamOutput):
         """After the last frame; none before the first."""
 
     @on_one_torch_thread
-    def process(self, image: Frame | np.ndarray, timestamp: float | None = None) -> PoseEstimate:
+    def process(
+        self, image: Frame | np.ndarray | torch.Tensor, timestamp: float | None = None
+    ) -> PoseEstimate:
         """Take the next image, as :func:`input_frame` does; returns where the camera is."""
         world = self.world
         if world.is_ended:

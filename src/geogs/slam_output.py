@@ -12,9 +12,10 @@ from geogs.config import Config
 from geogs.errors import InputError
 from geogs.executors.in_order import InOrder
 from geogs.geometry.camera import Camera
+from geogs.geometry.given_pose import GivenPose
 from geogs.loop.closer import LoopCloser
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.rendered import MapRenderer, SurfaceMaps
+from geogs.mapping.rendered import MapRenderer, RenderedView
 from geogs.pose_estimate import PoseEstimate
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
@@ -162,17 +163,17 @@ class SlamOutput:
         return self.executor.ask(Mapper.renderer)
 
     @on_one_torch_thread
-    def render(
-        self, T_cw: Float64[Tensor, "4 4"] | np.ndarray, camera: Camera | None = None
-    ) -> SurfaceMaps:
-        """Depth, normal and weight of the map as it is now, seen from a pose, world to camera.
+    def render(self, T_cw: GivenPose, camera: Camera | None = None) -> RenderedView:
+        """The map as it is now, seen from a pose; as :meth:`MapRenderer.render`.
 
-        ``camera`` is that of the keyframes' depth maps if none is given.
+        Raises InputError before there is a map.
         """
-        pose = torch.as_tensor(T_cw, dtype=torch.float64)
-        if pose.shape != (4, 4) or not bool(torch.isfinite(pose).all()):
-            raise InputError("A pose to render from is a 4x4 matrix of finite numbers.")
-        return self.renderer().surface(pose, camera)
+        if not self.executor.disks:
+            raise InputError(
+                "There is no map to render yet; it begins some frames after the first, or with "
+                "finish() where it is made at the end."
+            )
+        return self.renderer().render(T_cw, camera)
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """Depth and confidence of every mapped keyframe as searched, without the disks.
@@ -188,5 +189,5 @@ class SlamOutput:
         T_cw = self.T_cw if in_main else None
         if T_cw is None:
             return PoseEstimate(state, *counts, timestamp)
-        T_cw, deviation = T_cw.detach().double().cpu().clone(), self.executor.deviation()
-        return PoseEstimate(state, *counts, timestamp, T_cw, deviation)
+        pose, deviation = T_cw.detach().double().cpu().clone(), self.executor.deviation()
+        return PoseEstimate(state, *counts, timestamp, pose.numpy(), deviation)

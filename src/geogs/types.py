@@ -12,6 +12,7 @@ from geogs.config.setting import Range
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.limits import UNBOUNDED, AtLeast0, Pose, Positive
+from geogs.short_repr import ShortRepr
 
 
 @runtime_checkable
@@ -23,8 +24,8 @@ class MeasuredDepth(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredPose:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MeasuredPose(ShortRepr):
     """Where something else than the images says that the camera was."""
 
     T_cw: Pose
@@ -33,8 +34,8 @@ class MeasuredPose:
     """Poses of different worlds say nothing of each other."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SeenRows:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SeenRows(ShortRepr):
     """Where and when a rolling shutter saw what an image shows whose rows were rectified.
 
     The nodes lie in the middle of each eight pixels, and a step beyond the border; the image was
@@ -76,8 +77,8 @@ class FlowMatch:
         return (weight > 0) & (weight > 0.01 * best)
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+@dataclass(frozen=True, slots=True, repr=False)
+class Frame(ShortRepr):
     """One undistorted image of the source at working resolution."""
 
     index: int
@@ -125,8 +126,8 @@ FrameState = Literal["tracked", "orientation only", "lost"]
 """What is known of a frame: its pose, its orientation alone, or nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class Trajectory:
+@dataclass(frozen=True, slots=True, repr=False)
+class Trajectory(ShortRepr):
     """Camera poses over time."""
 
     timestamps: Float[np.ndarray, "n"]
@@ -153,8 +154,8 @@ class Trajectory:
         return Trajectory(self.timestamps[keep], self.T_wc[keep], self.tracked[keep])
 
 
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
+@dataclass(frozen=True, slots=True, repr=False)
+class Uncertainty(ShortRepr):
     """Standard deviations of frames, earliest first; infinite where nothing is known."""
 
     timestamps: Float[np.ndarray, "n"]
@@ -175,8 +176,8 @@ class Uncertainty:
         return Uncertainty(timestamps, *(np.interp(timestamps, self.timestamps, c) for c in known))
 
 
-@dataclass(frozen=True, slots=True)
-class MapSnapshot:
+@dataclass(frozen=True, slots=True, repr=False)
+class MapSnapshot(ShortRepr):
     """The disks of a map as plain numbers, detached from training."""
 
     position: Float[Tensor, "n 3"]
@@ -201,8 +202,8 @@ class MapSnapshot:
         return all(bool(torch.isfinite(p).all()) for p in parts)
 
 
-@dataclass(frozen=True, slots=True)
-class RenderedKeyframe:
+@dataclass(frozen=True, slots=True, repr=False)
+class RenderedKeyframe(ShortRepr):
     """The map seen from a keyframe: what a surface is made from."""
 
     keyframe_id: int

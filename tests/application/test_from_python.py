@@ -72,7 +72,7 @@ def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd
     source = geogs.open_source(small_room, run_config().input)
     source = geogs.application.self_calibrated(source)
     source = geogs.application.with_shutter_found(source)
-    slam = geogs.Slam(source.camera, run_config())
+    slam = geogs.Slam(source.camera, run_config(), device="cpu")
     for frame in source:
         slam.process(frame)
     slam.finish()
@@ -161,6 +161,18 @@ def test_a_reconstruction_is_that_of_the_command_and_writes_nothing(
     require_same(tmp_path / "own", tmp_path / "out")
 
 
+def test_a_run_in_one_call_is_that_of_the_command_too(small_room, tmp_path, capfd, no_report):
+    result = geogs.run(small_room, run_config(), tmp_path / "out", "cpu")
+    assert capfd.readouterr() == ("", "")
+    assert result.folder == tmp_path / "out"
+    assert repr(result) == f"Result('{tmp_path}/out': {FRAMES} frames, {len(result.map)} disks)"
+    saved = geogs.load_result(result.folder)
+    assert np.array_equal(saved.mesh.vertices, result.mesh.vertices)
+    T_cw = np.linalg.inv(result.keyframes.T_wc[1])
+    assert np.array_equal(result.render(T_cw).depth, saved.render(T_cw).depth)
+    assert (saved.render(T_cw).depth > 0).mean() > 0.5
+
+
 LIGHT = """
 import sys
 import geogs
@@ -174,5 +186,6 @@ def test_the_package_loads_nothing_before_it_is_used():
     done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True)
     assert done.stdout == "[]\nTrue\n", done.stderr
     for module in (geogs, geogs.application):
+        assert set(dir(module)) == set(module.__all__)
         with pytest.raises(AttributeError, match="no attribute nothing"):
             _ = module.nothing

@@ -19,6 +19,12 @@ def test_project_inverts_back_projection():
     assert (z - depth).abs().max() < 1e-14
 
 
+def test_k_takes_points_to_pixels():
+    x, y, z = CAMERA.K @ [0.2, -0.1, 2.0]
+    u, v = CAMERA.project(torch.tensor([0.2, -0.1, 2.0], dtype=F64))[0]
+    assert (x / z, y / z) == (pytest.approx(float(u)), pytest.approx(float(v)))
+
+
 def test_resizing_an_image_moves_its_content_as_the_camera_says():
     """A blob's centroid after an area resize lies where the resized camera projects it."""
     point = torch.tensor([0.11, -0.07, 1.9], dtype=F64)

@@ -36,7 +36,7 @@ def frames(small_room):
 def followed(frames, defers_map: bool, count: int = FRAMES) -> Slam:
     """A system that has seen so many frames."""
     camera, images = frames
-    slam = Slam(camera, quick(), defers_map=defers_map)
+    slam = Slam(camera, quick(), defers_map=defers_map, device="cpu")
     for frame in images[:count]:
         slam.process(frame)
     return slam
@@ -78,7 +78,7 @@ def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path, seen: 
         slam.end_stream()
     write_checkpoint(checkpoint_folder(tmp_path), Work(slam.settled()))
     world = SavedState(tmp_path, Work).work("world")
-    other = Slam(slam.camera, slam.config, world=world)
+    other = Slam(slam.camera, slam.config, world=world, device="cpu")
     for frame in frames[1][seen:]:
         other.process(frame)
     other.end_stream()
@@ -116,14 +116,14 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
 
 
 def test_without_a_keyframe_there_is_no_map(frames):
-    slam = Slam(frames[0], quick(), defers_map=True)
+    slam = Slam(frames[0], quick(), defers_map=True, device="cpu")
     slam.refine()
     assert len(slam.snapshot()) == 0
     assert not slam.stopwatch.seconds
 
 
 def test_what_is_not_refined_takes_no_time(frames):
-    slam = Slam(frames[0], quick())
+    slam = Slam(frames[0], quick(), device="cpu")
     slam.refine(seconds=1.0)
     assert not slam.stopwatch.seconds
 
@@ -136,7 +136,7 @@ def test_what_needs_the_map_on_the_way_has_it(frames):
         replace(config.mapping, final_depth=False),
     ):
         assert not Slam(
-            frames[0], replace(config, mapping=other), defers_map=True
+            frames[0], replace(config, mapping=other), defers_map=True, device="cpu"
         ).world.maps_at_end
-    assert not Slam(frames[0], config).world.maps_at_end
-    assert Slam(frames[0], config, defers_map=True).world.maps_at_end
+    assert not Slam(frames[0], config, device="cpu").world.maps_at_end
+    assert Slam(frames[0], config, defers_map=True, device="cpu").world.maps_at_end

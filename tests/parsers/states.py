@@ -55,7 +55,7 @@ def states() -> dict[str, Parser]:
 
 
 def system() -> Slam:
-    return Slam(CAMERA, Config())
+    return Slam(CAMERA, Config(), device="cpu")
 
 
 def begun(folder: Path) -> None:
@@ -73,7 +73,7 @@ def resumed(folder: Path) -> object:
     if not has_checkpoint(folder):
         return None
     with SavedRun(folder).world(torch.device("cpu")) as world:
-        return Slam(CAMERA, Config(), world=world)
+        return Slam(CAMERA, Config(), world=world, device="cpu")
 
 
 def resealed_and_resumed(folder: Path) -> object:

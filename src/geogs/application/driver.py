@@ -129,7 +129,7 @@ class Driver:
                 with replaced(output, "result") as new:
                     outcome = work.complete(self, checkpoint, new)
                     finished, scene = outcome is Outcome.FINISHED, work.scene
-                    result = Result(scene, work.source, not finished, progress)
+                    result = Result(scene, work.source, not finished, progress, output)
                     write_more = partial(self._write_more, work, new)
                     write_files(new, result, write_more, settings.keyframe_images)
             except OutputError as error:

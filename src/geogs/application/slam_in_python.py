@@ -95,7 +95,7 @@ def go_on_in(slam: Slam, saved: SavedResult) -> None:
 def load_slam(
     folder: str | Path,
     config: Config | None = None,
-    device: str = "cpu",
+    device: str = "auto",
     live: bool = False,
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Slam:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,6 +24,11 @@ class Camera:
     def long_edge(self) -> int:
         """Pixels along the longer side of the image."""
         return max(self.width, self.height)
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        """Pixels of points at depth 1, float64."""
+        return self.matrix().numpy()
 
     def matrix(self) -> Float[Tensor, "3 3"]:
         """K in float64."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -11,9 +12,11 @@ from geogs.config import MappingConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth_maps import averaged_over_planes, normals_from_depth
+from geogs.geometry.given_pose import GivenPose, as_pose
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.map_frame import MapFrame
+from geogs.short_repr import ShortRepr
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, RenderedKeyframe
 from geogs.world.disks import DiskParameters
@@ -30,6 +33,18 @@ class SurfaceMaps(NamedTuple):
     normal: Float[Tensor, "h w 3"]
     """Camera frame, unit and facing the camera; zero where there is no depth."""
     weight: Float[Tensor, "h w"]
+    """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class RenderedView(ShortRepr):
+    """A map seen from one place, for programs."""
+
+    depth: Float[np.ndarray, "h w"]
+    """z in map units; 0 where the map is too thin to say."""
+    normal: Float[np.ndarray, "h w 3"]
+    """Camera frame, unit and facing the camera; zero where there is no depth."""
+    weight: Float[np.ndarray, "h w"]
     """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
 
 
@@ -74,6 +89,15 @@ class MapRenderer:
         pose = self.frame.pose(T_cw)
         maps = rendered_surface(disks, camera or self.camera, pose, self.rules, mask)
         return maps._replace(depth=maps.depth * self.frame.unit)
+
+    def render(self, T_cw: GivenPose, camera: Camera | None = None) -> RenderedView:
+        """What a camera sees from any pose, world to camera, as NumPy arrays.
+
+        ``camera`` is that of the keyframes' depth maps if none is given. Raises InputError if the
+        pose is no 4x4 matrix of finite numbers.
+        """
+        maps = self.surface(as_pose(T_cw), camera)
+        return RenderedView(*(values.cpu().numpy() for values in maps))
 
 
 def rendered_surface(

@@ -1,13 +1,21 @@
 """The records of mesh extraction: what goes in and what comes out."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
+from geogs.documents import expanded
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.short_repr import ShortRepr
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +43,8 @@ class DepthMapView:
         return torch.isfinite(self.depth) & (self.depth > 0) & (self.weight > 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Mesh:
+@dataclass(frozen=True, slots=True, repr=False)
+class Mesh(ShortRepr):
     """Triangles in the world frame; faces turn counter-clockwise seen from free space."""
 
     vertices: Float[np.ndarray, "n 3"]
@@ -53,6 +61,38 @@ class Mesh:
         vertices = np.asarray(vertices, np.float32)
         faces = np.asarray(faces, np.int32).reshape(-1, 3)
         return Mesh(vertices, faces, vertex_normals(vertices, faces))
+
+    def save(self, path: str | Path) -> None:
+        """Write a file that ends in .ply, .glb or .obj; the latter two have y up.
+
+        Raises:
+            InputError: it ends otherwise.
+            OutputError: it cannot be written.
+        """
+        from geogs.io.writers.exports.mesh_writers import write_glb, write_obj
+        from geogs.io.writers.ply_writer import write_mesh
+
+        path = expanded(path)
+        match path.suffix.lower():
+            case ".ply":
+                write_mesh(path, self.vertices, self.faces, self.colours, self.normals)
+            case ".glb":
+                write_glb(path, self.vertices, self.faces, self.normals, self.colours)
+            case ".obj":
+                write_obj(path, self.vertices, self.faces, self.normals, self.colours)
+            case _:
+                raise InputError(f"{path} should end in .ply, .glb or .obj.")
+
+    def to_trimesh(self) -> "trimesh.Trimesh":
+        """The same for trimesh. Raises InputError if that is not installed."""
+        try:
+            import trimesh
+        except ImportError:
+            raise InputError("trimesh is missing; pip install trimesh brings it.") from None
+        return trimesh.Trimesh(
+            self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=self.colours,
+            process=False,
+        )  # fmt: skip
 
 
 def vertex_normals(

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.geometry.given_pose import GivenPose
 from geogs.splat.reference import render_reference
 from geogs.threads import worker_count
 from geogs.types import MapSnapshot
@@ -50,7 +51,7 @@ class RenderOutput:
 def render(
     disks: GaussianMap | DiskParameters | MapSnapshot,
     camera: Camera,
-    T_cw: Float[Tensor, "4 4"],
+    T_cw: GivenPose,
     backend: Backend = "auto",
     near: float = NEAR,
 ) -> RenderOutput:
@@ -70,6 +71,7 @@ def render(
     """
     if isinstance(disks, MapSnapshot):
         disks = DiskParameters.of(disks)
+    T_cw = torch.as_tensor(T_cw)
     parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
     if backend == "auto":
         position = parameters.position

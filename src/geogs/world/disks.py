@@ -34,7 +34,7 @@ class DiskParameters(NamedTuple):
         return DiskParameters(disks.position, disks.quaternion, disks.scale.log(), opacity_logit)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class GaussianMap:
     """Disks, what is remembered of each, and the moments of the optimiser that trains them.
 
@@ -64,6 +64,9 @@ class GaussianMap:
         self._moments = [GrowingRows(m) for m in (*self.first, *self.second)]
         self._counts = [GrowingRows(c) for c in (self.keyframe_id, self.steps, self.seen)]
         self._expose()
+
+    def __repr__(self) -> str:
+        return f"GaussianMap({len(self)} disks, {self.device})"
 
     @classmethod
     def of(cls, parameters: DiskParameters, keyframe_id: Int[Tensor, "n"]) -> "GaussianMap":

@@ -45,7 +45,7 @@ def move_disks(
 
     def covisible() -> Iterator[tuple[CovisibleKeyframe, int]]:
         for n, T_cw in enumerate(torch.from_numpy(views.T_cw)):
-            maps = result.render(T_cw)
+            maps = result.renderer.surface(T_cw)
             keyframe = CovisibleKeyframe(n, result.depth_camera, T_cw, maps.depth, maps.weight)
             yield keyframe, n
 

@@ -122,7 +122,7 @@ def _on_grid(
 
     long_edge = max(result.depth_camera.width, result.depth_camera.height)
     camera = grid.camera.with_long_edge(long_edge)
-    maps = result.render(T_cw, camera)
+    maps = result.renderer.surface(T_cw, camera)
     scale = grid.pixels.new_tensor(
         [camera.width / grid.camera.width, camera.height / grid.camera.height]
     )

@@ -52,7 +52,7 @@ def render_views(
     result, made = load_result(written, device), []
     for n in places:
         T_cw = result.views.T_cw[n]
-        maps = result.render(torch.from_numpy(T_cw))
+        maps = result.renderer.surface(torch.from_numpy(T_cw))
         file = folder / f"{n:06d}.npz"
         # 0, a half and 1 are the same in half precision.
         np.savez(file, depth=maps.depth.cpu().numpy(), weight=maps.weight.cpu().half().numpy())

@@ -85,7 +85,7 @@ def resumed(output: Path, frames) -> Slam:
 
 def system(camera: Camera, world: World | None = None) -> Slam:
     config = replace(quick_config(pose_iterations=1), resident_keyframes=2)
-    return Slam(camera, config, prior=FlatPrior(), world=world)
+    return Slam(camera, config, prior=FlatPrior(), world=world, device="cpu")
 
 
 def array(name: str, value: float) -> Callable[[Any, dict[str, Tensor]], None]:

@@ -45,7 +45,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 def begun(output: Path, settings: RunSettings) -> None:
     """A run of a few frames with these settings."""
-    slam = Slam(CAMERA, Config())
+    slam = Slam(CAMERA, Config(), device="cpu")
     for k in range(3):
         slam.process(Frame(k, k / 30, np.roll(gradient_image(0), 2 * k, axis=1)))
     facts = RunMetadata(settings, "cpu", "0123456789abcdef", None)

@@ -44,7 +44,7 @@ def frames(small_room):
 def tracked(frames) -> Slam:
     """A system that has seen frames, with few keyframes in memory."""
     camera, images = frames
-    slam = Slam(camera, quick(3))
+    slam = Slam(camera, quick(3), device="cpu")
     for frame in images[:AT]:
         slam.process(frame)
     return slam
@@ -55,7 +55,7 @@ def again(slam: Slam, output: Path, copy: Path) -> Slam:
     write_checkpoint(checkpoint_folder(output), Work(slam.settled()))
     shutil.copytree(output, copy)
     world = SavedState(copy, Work).work("world")
-    other = Slam(slam.camera, slam.config, world=world)
+    other = Slam(slam.camera, slam.config, world=world, device="cpu")
     return other
 
 
@@ -77,7 +77,7 @@ def assert_same(a: Slam, b: Slam) -> None:
 def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
     """Bit for bit, with most keyframes in archives; also while a second segment starts."""
     camera, images = frames
-    slam = Slam(camera, quick(4))
+    slam = Slam(camera, quick(4), device="cpu")
     if cut is not None:  # to another place: the same in a mirror
         other_place = [replace(f, image=np.ascontiguousarray(f.image[:, ::-1])) for f in images]
         images = [replace(f, follows_cut=f.index == cut) for f in images[:cut] + other_place[cut:]]
@@ -180,7 +180,7 @@ def test_the_maps_in_memory_are_those_that_were(tracked, tmp_path):
 def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked):
     camera, state = tracked.camera, tracked.settled()
     with pytest.raises(InputError, match="of another camera"):
-        Slam(camera.resized(64, 48), quick(3), world=copied(state))
+        Slam(camera.resized(64, 48), quick(3), world=copied(state), device="cpu")
     first, *rest = state.segments.segments[0].keyframes.members
     wrong = [
         replace(state, unmapped=[99]),
@@ -190,7 +190,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked
     ]
     for changed in wrong:
         with pytest.raises(InputError, match=r"is missing|has no place|not in its place"):
-            Slam(camera, quick(3), world=copied(changed))
+            Slam(camera, quick(3), world=copied(changed), device="cpu")
 
 
 def with_keyframes(state: World, keyframes: list[int]) -> World:

@@ -294,7 +294,7 @@ def test_where_no_checkpoint_can_be_written_that_is_said_once(small_room, tmp_pa
     said: list[str] = []
     monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
     source = open_source([small_room])
-    slam = Slam(source.camera)
+    slam = Slam(source.camera, device="cpu")
     metadata = RunMetadata(RunSettings(), "cpu", source.fingerprint(), None, source.place)
     (tmp_path / "checkpoint").touch()
     checkpoint = Checkpoint(

@@ -51,7 +51,7 @@ def test_frames_are_numbered_and_timed_through(tmp_path):
         assert times == sorted(times)
         assert times[3] == pytest.approx(times[2] + PAUSE)
         assert [int(f.image[0, 0, 0]) for f in read] == [0, 10, 20, 0, 10, 20, 30]
-    assert source.length == 7
+    assert source.length == len(source) == len(list(source)) == 7
     assert open_source(paths, replace(config, stride=3)).fps == pytest.approx(10)
     assert [(s.name, s.first_frame) for s in source.spans] == [("a", 0), ("b", 3)]
 
@@ -97,7 +97,7 @@ def test_all_keyframes_are_adjusted_on_the_way_where_asked_for():
     reference = Trajectory(np.arange(30) / 30, np.stack(path), np.ones(30, dtype=bool))
 
     def run(every: int) -> tuple[int, float]:
-        slam = Slam(CAMERA, replace(QUICK, loop=LoopConfig(global_ba_every=every)))
+        slam = Slam(CAMERA, replace(QUICK, loop=LoopConfig(global_ba_every=every)), device="cpu")
         for frame in frames(path):
             slam.process(frame)
         slam.end_stream()
@@ -117,7 +117,7 @@ def test_the_map_shows_the_largest_of_videos_that_have_nothing_in_common():
         Frame(10 + k, f.timestamp + 2, np.ascontiguousarray(f.image[::-1]), k == 0)
         for k, f in enumerate(second)
     ]
-    slam = Slam(CAMERA, QUICK)
+    slam = Slam(CAMERA, QUICK, device="cpu")
     for frame in stream:
         slam.process(frame)
     slam.end_stream()

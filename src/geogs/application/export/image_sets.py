@@ -111,7 +111,7 @@ def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:
 
 def _maps(number: int, result: SavedResult) -> tuple[np.ndarray, np.ndarray]:
     """Depth and normals of a keyframe inside its mask, at the size of its image."""
-    maps = result.render(torch.from_numpy(result.views.T_cw[number]), result.camera)
+    maps = result.renderer.surface(torch.from_numpy(result.views.T_cw[number]), result.camera)
     depth, normal = maps.depth.cpu().numpy(), maps.normal.cpu().numpy()
     mask = result.image_mask(number)
     if mask is not None:

@@ -9,13 +9,17 @@ from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.application.run_progress import RunProgress
+from geogs.geometry.camera import Camera
+from geogs.geometry.given_pose import GivenPose
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.mapping.rendered import RenderedView
 from geogs.mesh.triangle_mesh import Mesh
+from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """What there is of a scene; each part is made when it is first asked for, then kept."""
 
@@ -27,6 +31,23 @@ class Result:
     """Whether the final stages were left out, or cut short."""
     progress: RunProgress = field(default_factory=RunProgress)
     """Follows the extraction of the mesh."""
+    folder: Path | None = None
+    """Where it was written; none where it was not."""
+
+    def __repr__(self) -> str:
+        where = "not written" if self.folder is None else repr(str(self.folder))
+        counts = f"{self.scene.frames} frames, {len(self.map)} disks"
+        return f"Result({where}: {counts})"
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the frames."""
+        return self.source.camera
+
+    @on_one_torch_thread
+    def render(self, T_cw: GivenPose, camera: Camera | None = None) -> RenderedView:
+        """The map seen from a pose; as :meth:`MapRenderer.render`."""
+        return self.scene.renderer().render(T_cw, camera)
 
     @cached_property
     def trajectory(self) -> Trajectory:

@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
+from jaxtyping import Bool, UInt8
 
 from geogs.application.results.output_folder import claimed
 from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.given_pose import GivenPose
 from geogs.geometry.lie import se3_inverse
 from geogs.io.pose_files import read_frame_poses
 from geogs.io.writers.keyframe_folder import (
@@ -30,7 +30,7 @@ from geogs.io.writers.map_file import MapViews, load_map_views
 from geogs.io.writers.replacement import is_half_done
 from geogs.io.writers.uncertainty import read_states
 from geogs.mapping.map_frame import MapFrame
-from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
+from geogs.mapping.rendered import MapRenderer, RenderedView, SurfaceRules
 from geogs.mesh.mesh_file import read_mesh
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.on_demand import OnDemand
@@ -40,7 +40,7 @@ from geogs.tracking.frames.interpolation import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SavedResult:
     """What ``geogs run`` or ``geogs reconstruct`` left in a folder; files are read when asked for.
 
@@ -51,6 +51,10 @@ class SavedResult:
     disks: MapSnapshot
     """In the world, on the device asked for."""
     views: MapViews
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.views.keyframe_id)} keyframes, {len(self.disks)} disks"
+        return f"SavedResult({str(self.folder)!r}: {counts})"
 
     @property
     def name(self) -> str:
@@ -116,12 +120,9 @@ class SavedResult:
         return MapRenderer(views.disks, frame, views.render_camera, rules)
 
     @on_one_torch_thread
-    def render(self, T_cw: Float[Tensor, "4 4"], camera: Camera | None = None) -> SurfaceMaps:
-        """Depth, normal and weight of the map seen from a pose, float64.
-
-        ``camera`` is that of the keyframes' depth maps if none is given.
-        """
-        return self.renderer.surface(T_cw, camera)
+    def render(self, T_cw: GivenPose, camera: Camera | None = None) -> RenderedView:
+        """The map seen from a pose; as :meth:`MapRenderer.render`."""
+        return self.renderer.render(T_cw, camera)
 
     def rows(self) -> dict[int, SeenRows]:
         """Where and when a rolling shutter saw what keyframes show, by their place among them.

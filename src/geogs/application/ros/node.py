@@ -7,6 +7,7 @@ from array import array
 from typing import Any
 
 import numpy as np
+import torch
 
 from geogs.application.ros.node_settings import NodeSettings
 from geogs.application.ros.published_messages import Messages
@@ -115,7 +116,7 @@ class CameraNode:
             _log.warning("%s", why)
             return
         if found.T_wc is not None:
-            pose = self._messages.pose(seconds, found.T_wc)
+            pose = self._messages.pose(seconds, torch.as_tensor(found.T_wc))
             self._poses = [*self._poses, pose][-MOST_POSES:]
             self._publish["pose"](pose)
             self._publish["path"](self._messages.path(seconds, self._poses))

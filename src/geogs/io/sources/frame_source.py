@@ -114,6 +114,21 @@ class Source:
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
 
+    def __len__(self) -> int:
+        """``length``. Raises TypeError where it is not known."""
+        if self.length is None:
+            raise TypeError(f"It is not known beforehand how many frames {self.name} has.")
+        return self.length
+
+    def __bool__(self) -> bool:
+        """True, however many frames there are."""
+        return True
+
+    def __repr__(self) -> str:
+        frames = "?" if self.length is None else self.length
+        size = f"{self.camera.width}×{self.camera.height}"
+        return f"Source({self.name!r}: {self.kind}, {frames} frames of {size})"
+
     @property
     def black_is_masked(self) -> bool:
         """Whether pixels of frames that are quite black are masked out."""

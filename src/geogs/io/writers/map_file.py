@@ -19,6 +19,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.intrinsics_file import camera_of
 from geogs.limits import POSITIVE, RIGID, holds
+from geogs.short_repr import ShortRepr
 from geogs.types import MapSnapshot
 
 FORMAT_VERSION = 1
@@ -125,8 +126,8 @@ def _open(path: str | Path) -> "safe_open":
     return file
 
 
-@dataclass(frozen=True)
-class MapViews:
+@dataclass(frozen=True, repr=False)
+class MapViews(ShortRepr):
     """The keyframes that a map's depth maps are made for, and all that those depend on."""
 
     camera: Camera

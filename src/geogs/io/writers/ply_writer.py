@@ -34,7 +34,7 @@ def write_mesh(
     path: str | Path,
     vertices: Float[np.ndarray, "n 3"],
     faces: Int[np.ndarray, "m 3"],
-    colors: UInt8[np.ndarray, "n 3"] | None = None,
+    colours: UInt8[np.ndarray, "n 3"] | None = None,
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> None:
     """Write a triangle mesh as binary PLY, with RGB and normals at the vertices where given."""
@@ -43,7 +43,7 @@ def write_mesh(
     _write(
         path,
         [
-            _element("vertex", _points(vertices, colors, normals)),
+            _element("vertex", _points(vertices, colours, normals)),
             Element("face", triangles, ["list uchar int vertex_indices"]),
         ],
     )
@@ -52,11 +52,11 @@ def write_mesh(
 def write_points(
     path: str | Path,
     positions: Float[np.ndarray, "n 3"],
-    colors: UInt8[np.ndarray, "n 3"] | None = None,
+    colours: UInt8[np.ndarray, "n 3"] | None = None,
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> None:
     """Write a point cloud as binary PLY, with RGB and normals where given."""
-    _write(path, [_element("vertex", _points(positions, colors, normals))])
+    _write(path, [_element("vertex", _points(positions, colours, normals))])
 
 
 def splat_scales(disks: MapSnapshot) -> Float[np.ndarray, "n 3"]:
@@ -69,7 +69,7 @@ def splat_scales(disks: MapSnapshot) -> Float[np.ndarray, "n 3"]:
 def write_splats(
     path: str | Path,
     disks: MapSnapshot,
-    colors: Float[np.ndarray, "n 3"],
+    colours: Float[np.ndarray, "n 3"],
     is_flat: bool = False,
     degree: int = 0,
 ) -> None:
@@ -81,7 +81,7 @@ def write_splats(
     Args:
         path: the file.
         disks: the map.
-        colors: RGB of every disk in [0, 1]; the map itself has none.
+        colours: RGB of every disk in [0, 1]; the map itself has none.
         is_flat: whether there are two scales, as in 2D Gaussian splatting (Huang et al. 2024).
         degree: of the spherical harmonics, for readers that want more than the constant one; their
             coefficients are zero.
@@ -95,7 +95,7 @@ def write_splats(
     columns = {
         **_columns(position, ("x", "y", "z")),
         **_columns(normal, ("nx", "ny", "nz")),
-        **_columns((colors - 0.5) / SH_DEGREE_0, ("f_dc_0", "f_dc_1", "f_dc_2")),
+        **_columns((colours - 0.5) / SH_DEGREE_0, ("f_dc_0", "f_dc_1", "f_dc_2")),
         **_columns(np.zeros((len(position), len(rest))), tuple(rest)),
         "opacity": np.log(opacity / (1 - opacity)).astype("<f4"),
         **_columns(log_scale, scales),
@@ -106,14 +106,14 @@ def write_splats(
 
 def _points(
     positions: Float[np.ndarray, "n 3"],
-    colors: UInt8[np.ndarray, "n 3"] | None,
+    colours: UInt8[np.ndarray, "n 3"] | None,
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> dict[str, np.ndarray]:
     columns = _columns(positions, ("x", "y", "z"))
     if normals is not None:
         columns |= _columns(normals, ("nx", "ny", "nz"))
-    if colors is not None:
-        columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    if colours is not None:
+        columns |= {name: colours[:, i] for i, name in enumerate(("red", "green", "blue"))}
     return columns
 
 

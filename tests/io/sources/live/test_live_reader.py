@@ -43,6 +43,9 @@ def test_a_file_plays_at_its_pace_and_nothing_waits_for_who_is_late():
     assert source.is_live
     assert not source.is_shutter_open
     assert source.length is None
+    assert source
+    with pytest.raises(TypeError, match="not known beforehand"):
+        len(source)
     began, seen = time.monotonic(), []
     for frame in source:
         seen.append((frame.index, round(frame.image.mean() / 10), frame.timestamp))

@@ -1,0 +1,39 @@
+"""A whole run as one call of a Python program."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from geogs.application.results.result import Result
+from geogs.application.run import run as run_to_folder
+from geogs.application.run_progress import RunProgress
+from geogs.application.run_settings import RunSettings
+from geogs.config import Config
+
+
+def run(
+    source: str | Path | Sequence[str | Path],
+    config: Config | None = None,
+    output: str | Path | None = None,
+    device: str = "auto",
+    *,
+    progress: RunProgress | None = None,
+) -> Result:
+    """All that ``geogs run`` does, files included; its result, without a word.
+
+    Args:
+        source: a video, a folder, a data set, a bag, or several of one place.
+        config: all settings; the defaults if none.
+        output: folder of the result; out/NAME if none is given, as ``Result.folder`` says.
+        device: auto (a GPU where there is one), cpu, cuda or cuda:1.
+        progress: follows the work.
+
+    Raises:
+        InputError: the source or a setting cannot be used.
+        TrackingLost: no frame could be tracked.
+        OutputError: a file cannot be written.
+        DeviceError: the device cannot be used, or its memory was full.
+    """
+    several = (source,) if isinstance(source, str | Path) else source
+    folder = None if output is None else Path(output)
+    settings = RunSettings(tuple(map(Path, several)), config or Config(), folder, device)
+    return run_to_folder(settings, progress).result
