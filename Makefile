@@ -46,7 +46,7 @@ lint: $(STAMP)
 
 # Compiled where nothing is yet: on the core that lint leaves, and once instead of by each process.
 kernels: $(STAMP)
-	-find src -name '*.nbi' | grep -q . || $(PYTEST) -n 0 tests/application/scale/test_metric_run.py
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m geogs.application.machine.compilation
 
 fuzz: $(STAMP)
 	GEOGS_FUZZ=$(FUZZ) $(PYTEST) tests/fuzz tests/cli/test_option_values.py
@@ -55,7 +55,7 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-setup: $(STAMP)
+setup: kernels
 
 # constraints.txt pins every version that was tested, requirements.lock the SHA-256 of all their files but
 # torch's: where there is no NVIDIA driver its CPU build is taken (from where pip already looks, else from

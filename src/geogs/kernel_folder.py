@@ -17,13 +17,21 @@ def find_kernel_folder() -> None:
 
     It has to be called before numba is imported.
     """
+    if VARIABLE not in os.environ and not any(map(can_be_written, _usual())):
+        os.environ[VARIABLE] = str(temporary_folder())
+
+
+def kernel_folder() -> Path:
+    """Where numba keeps kernels, or one of the folders in it."""
     if VARIABLE in os.environ:
-        return
+        return Path(os.environ[VARIABLE])
+    return next(filter(can_be_written, _usual()), _usual()[-1])
+
+
+def _usual() -> tuple[Path, Path]:
     home = os.path.expanduser("~")
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(home, ".cache")
-    usual = (Path(__file__).parent, Path(cache) / "numba")
-    if not any(can_be_written(folder) for folder in usual):
-        os.environ[VARIABLE] = str(temporary_folder())
+    return Path(__file__).parent / "__pycache__", Path(cache) / "numba"
 
 
 def can_be_written(folder: Path) -> bool:

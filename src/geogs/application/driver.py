@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ import torch
 
 from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
 from geogs.application.interrupt import Stop
+from geogs.application.machine.compilation import Compilation
 from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
 from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result, Written
@@ -84,6 +85,8 @@ class Driver:
     progress: RunProgress
     stop: Stop
     observer: RunObserver | None = None
+    kernels: Compilation = field(default_factory=Compilation)
+    """For the CPU, compiled meanwhile."""
 
     def report(self, stage: str, fraction: float) -> None:
         """Tell how far a stage is; raises KeyboardInterrupt after a request to stop."""
@@ -101,7 +104,12 @@ class Driver:
 
         Raises KeyboardInterrupt where it is stopped before there is any.
         """
-        if self.stop.lets_finish(work):
+
+        def compiled() -> None:
+            self.kernels.wait(self.report)
+            work()
+
+        if self.stop.lets_finish(compiled):
             return Outcome.FINISHED
         if not len(scene.snapshot()):
             raise KeyboardInterrupt
@@ -129,6 +137,7 @@ class Driver:
                 with replaced(output, "result") as new:
                     outcome = work.complete(self, checkpoint, new)
                     finished, scene = outcome is Outcome.FINISHED, work.scene
+                    self.kernels.wait(progress.stage)
                     result = Result(scene, work.source, not finished, progress, output)
                     write_more = partial(self._write_more, work, new)
                     write_files(new, result, write_more, settings.keyframe_images)

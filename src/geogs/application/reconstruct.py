@@ -11,6 +11,7 @@ from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
+from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.photos import open_photographs
@@ -76,13 +77,15 @@ def reconstruct(
     begin = time.perf_counter()
     config, progress = config or ReconstructConfig(), progress or RunProgress()
     used = require_device(device)
-    if not isinstance(source, PosedSource):
-        if poses == "auto":
-            with tempfile.TemporaryDirectory(prefix="geogs-photos-") as kept:
-                source = open_photographs(Path(source), config, Path(kept), progress=progress)
-        else:
-            source = open_posed_source(source, config.input)
-    begin += compiled_kernels(used)  # once per machine: in no budget
+    with compiling(used) as kernels:
+        if not isinstance(source, PosedSource):
+            if poses == "auto":
+                with tempfile.TemporaryDirectory(prefix="geogs-photos-") as kept:
+                    source = open_photographs(Path(source), config, Path(kept), progress=progress)
+            else:
+                source = open_posed_source(source, config.input)
+        # Once per machine: in no budget.
+        begin += compiled_kernels(used) + kernels.wait(progress.stage)
     checks = progress if check and poses == "given" else None
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), left_of(budget, begin))
@@ -118,14 +121,15 @@ def reconstruct_to_folder(
         wanted = Path("out") / source.name
         if not settings.resume:
             wanted = free_folder(wanted, source.fingerprint())
-    with claimed(settings.output or wanted) as output:
+    with claimed(settings.output or wanted) as output, compiling(device) as kernels:
         if finds_poses:
             with stop:
                 source = open_photographs(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
                     stop,
                 )  # fmt: skip
-        begin += compiled_kernels(device)  # once per machine: in no budget
+        # Once per machine: in no budget.
+        begin += compiled_kernels(device) + kernels.wait(progress.stage)
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)

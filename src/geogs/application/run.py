@@ -13,6 +13,7 @@ from geogs.application.checkpoints.run_state import (
 from geogs.application.driver import Driver
 from geogs.application.fallback import TrackedOrPlaced
 from geogs.application.interrupt import Stop
+from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
@@ -71,9 +72,9 @@ def run(
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
-    with claimed(wanted) as output:
+    with claimed(wanted) as output, compiling(device) as kernels:
         compiled_kernels(device)
-        driver = Driver(settings, output, device, progress, stop, observer)
+        driver = Driver(settings, output, device, progress, stop, observer, kernels)
         if settings.offline:
             from geogs.application.offline import PlacedOffline, beginning_with
 
@@ -152,7 +153,7 @@ def resume(
     config, device = settings.config, require_device(settings.device)
     opened = open_source(settings.source, config.input)
     source = saved.calibrated(opened)
-    with claimed(output) as folder:
+    with claimed(output) as folder, compiling(device) as kernels:
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
         with saved.world(device) as world:
@@ -164,7 +165,7 @@ def resume(
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, metadata, folder)
-        driver = Driver(settings, folder, device, progress, stop, observer)
+        driver = Driver(settings, folder, device, progress, stop, observer, kernels)
         return driver.complete(TrackedOrPlaced(work, opened))
 
 

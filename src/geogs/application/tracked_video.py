@@ -11,10 +11,12 @@ import torch
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
+from geogs.application.machine.compilation import OF_MAP, OF_SEARCH
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
 from geogs.io.sources.frame_source import Source
+from geogs.mapping.mapper import SEARCHED
 from geogs.slam import Slam
 from geogs.stopwatch import Stopwatch
 from geogs.types import Frame
@@ -53,6 +55,8 @@ class TrackedVideo:
         Raises TrackingLost if no frame could be tracked.
         """
         slam, source, progress = self.scene, self.source, driver.progress
+        if not slam.world.maps_at_end:
+            driver.kernels.wait(progress.stage)
         progress.expect(source.length, slam.frames)
         with closing(self.frames):
             outcome = self._track(driver, checkpoint)
@@ -75,7 +79,7 @@ class TrackedVideo:
         slam, is_mapped = self.scene, False
         with _full_memory_said(driver):
             is_mapped = outcome is Outcome.FINISHED and driver.stop.lets_finish(
-                lambda: slam.refine(driver.report)
+                lambda: self._refine(driver)
             )
             if not is_mapped:
                 slam.refine(driver.progress.stage, BRIEFLY)
@@ -116,6 +120,18 @@ class TrackedVideo:
             if driver.stop.requested:
                 return
             checkpoint.write_if_due()
+
+    def _refine(self, driver: Driver) -> None:
+        """The map; compiled is first what its depths need."""
+        kernels = driver.kernels
+        kernels.wait(driver.report, OF_SEARCH)
+
+        def report(stage: str, fraction: float) -> None:
+            driver.report(stage, fraction)
+            if fraction >= SEARCHED:
+                kernels.wait(driver.report, OF_MAP)
+
+        self.scene.refine(report)
 
     def _adjust(self, driver: Driver, new: Path) -> None:
         self.scene.adjust(driver.report)

@@ -9,6 +9,7 @@ import cv2
 import numba
 import torch
 
+from geogs.application.machine import compilation
 from geogs.application.machine.self_test import check_renderer, time_renderer
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
@@ -46,6 +47,7 @@ def examine(device_name: str = "auto") -> Iterator[Finding]:
         yield kernels
         if kernels.is_fatal:
             return
+    yield _cpu_kernels()
     yield from _self_test(device)
 
 
@@ -126,6 +128,15 @@ def _kernels(device: torch.device) -> Finding:
     seconds, new = time.perf_counter() - start, cache.cache_state().kernels - before
     how = f"{new} files compiled now" if new else "none to compile"
     return Finding("kernels", f"{count}, {how}, {seconds:.1f} s")
+
+
+def _cpu_kernels() -> Finding:
+    """What is compiled for the CPU, by numba, from its cache or now."""
+    start = time.perf_counter()
+    new = 0 if compilation.is_compiled() else compilation.compile_now()
+    how = f"{new} compiled now" if new else "none to compile"
+    seconds = time.perf_counter() - start
+    return Finding("for the CPU", f"{compilation.KERNELS} kernels, {how}, {seconds:.1f} s")
 
 
 def _self_test(device: torch.device) -> Iterator[Finding]:

@@ -1,0 +1,63 @@
+"""All that is compiled for the CPU at first use, used once: a map and its mesh of a tiny wall."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from geogs.config import MeshConfig, ReconstructConfig
+from geogs.geometry.camera import Camera
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.reconstruction import Reconstruction
+from geogs.threads import on_one_torch_thread
+
+CAMERA = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
+VIEWS, SHIFT = 6, 8
+"""Pictures of the wall, and pixels from one to the next."""
+BASELINE = 0.3
+"""Between neighbouring cameras, of which each looks straight at the wall."""
+DEPTH = CAMERA.fx * BASELINE / SHIFT
+
+
+@on_one_torch_thread
+def rehearse(with_map: bool = True) -> None:
+    """Map the wall on the CPU and extract its mesh, or only the latter; leaves nothing."""
+    views = _mapped() if with_map else [_seen(number) for number in range(VIEWS)]
+    extract_mesh(views, MeshConfig(triangle_budget=500))
+
+
+def _mapped() -> list[DepthMapView]:
+    config = ReconstructConfig()
+    mapping = replace(config.mapping, render_long_edge=48)
+    search = replace(config.search, least_steps=4, steps_per_view=1)
+    scene = Reconstruction(CAMERA, replace(config, mapping=mapping, search=search), "cpu")
+    for number, picture in enumerate(_pictures()):
+        scene.add(picture, _pose(number))
+    points = DEPTH * CAMERA.rays(torch.float64).numpy()[::4, ::4].reshape(-1, 3)
+    scene.finish(points)
+    return [DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image) for r in scene.renders()]
+
+
+def _seen(number: int) -> DepthMapView:
+    """The wall as it is."""
+    depth = torch.full((CAMERA.height, CAMERA.width), DEPTH)
+    pose, picture = torch.from_numpy(_pose(number)), _pictures()[number]
+    return DepthMapView(depth, torch.ones_like(depth), CAMERA, pose, picture)
+
+
+def _pose(number: int) -> Float[np.ndarray, "4 4"]:
+    T_cw = np.eye(4)
+    T_cw[0, 3] = -BASELINE * number
+    return T_cw
+
+
+def _pictures() -> list[UInt8[np.ndarray, "h w 3"]]:
+    """The wall is parallel to all images, so each shows the next part of one texture."""
+    import cv2
+
+    random = np.random.default_rng(0)
+    wall = random.integers(0, 256, (CAMERA.height, CAMERA.width + VIEWS * SHIFT, 3), np.uint8)
+    wall = cv2.GaussianBlur(wall, (5, 5), 0)
+    return [wall[:, SHIFT * n : SHIFT * n + CAMERA.width].copy() for n in range(VIEWS)]
