@@ -20,6 +20,7 @@ from geogs.application.prior_choice import open_prior
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
+from geogs.application.run_forecast import RunPlan
 from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
@@ -75,6 +76,8 @@ def run(
     with claimed(wanted) as output, compiling(device) as kernels:
         compiled_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
+        if (plan := _plan(driver, opened)) is not None:
+            progress.plan(plan)
         if settings.offline:
             from geogs.application.offline import PlacedOffline, beginning_with
 
@@ -88,6 +91,19 @@ def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool
     is_shown = observer is not None or settings.online_results or settings.map is not None
     when = settings.config.mapping.when
     return when == "after" or (when == "auto" and not is_shown)
+
+
+def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> RunPlan | None:
+    """What is going to be done, where that is known."""
+    settings = driver.settings
+    if not isinstance(settings, RunSettings) or settings.offline or source.length is None:
+        return None
+    if maps_at_end is None:
+        may_follow = settings.config.mapping.may_follow
+        maps_at_end = may_follow and maps_at_the_end(settings, driver.observer)
+    calibrates = settings.config.calibration.refine and source.is_calibration_open
+    on_gpu = driver.device.type == "cuda"
+    return RunPlan(settings.config, source.length, on_gpu, calibrates, maps_at_end)
 
 
 def seen_by(base: SavedResult, config: Config) -> InputConfig:
@@ -166,6 +182,8 @@ def resume(
         frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, metadata, folder)
         driver = Driver(settings, folder, device, progress, stop, observer, kernels)
+        if (plan := _plan(driver, source, slam.world.maps_at_end)) is not None:
+            progress.plan(plan)
         return driver.complete(TrackedOrPlaced(work, opened))
 
 

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from geogs.application.run_forecast import RunPlan
     from geogs.pose_estimate import PoseEstimate
 
 
@@ -11,6 +12,9 @@ class RunProgress:
 
     def write(self, text: str) -> None:
         """A sentence for the user; nothing if it is empty."""
+
+    def plan(self, plan: "RunPlan") -> None:
+        """Before the work of which so much is known."""
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
         """Before the first frame of so many, if known, of which ``begun`` were done before."""
