@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geogs.application import fallback, offline
+from geogs.application import fallback, offline, remedy
 from geogs.application.fallback import impossible, is_better, is_wanted
 from geogs.application.offline import PlacedOffline
 from geogs.application.results.verdict import Verdict
@@ -135,11 +135,13 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     def fails(*_: object) -> None:
         raise RuntimeError("Of 14 sharp frames no three tell where they were taken.")
 
-    monkeypatch.setattr(fallback, "has_pycolmap", lambda: False)
+    for module in (fallback, remedy):
+        monkeypatch.setattr(module, "has_pycolmap", lambda: False)
+    monkeypatch.setattr(remedy, "is_wanted", lambda _: True)
     plain = run(video, tmp_path / "plain")
-    said = " ".join(capfd.readouterr().err.split())
-    assert "pip install 'geogs[photos]'" in said
-    assert f"geogs run {video[0]} --offline" in said
+    last = capfd.readouterr().out.splitlines()[-1]
+    assert "pip install 'geogs[photos]' && geogs run" in last
+    assert "--offline places the frames by structure from motion, in about " in last
     monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
     monkeypatch.setattr(PlacedOffline, "place", fails)
     summary = run(video, tmp_path / "out")

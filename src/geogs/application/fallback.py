@@ -1,6 +1,5 @@
 """A tracked video; where tracking lost much of it, its frames placed by structure from motion."""
 
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -87,6 +86,8 @@ class TrackedOrPlaced(Work):
         if why_not:
             say(f"note: Structure from motion, which may place more frames, is left out: {why_not}")
             return None
+        if not has_pycolmap():
+            return None
         from geogs.application.offline import PlacedOffline, beginning_with
 
         video = beginning_with(self._opened, self._tracked.source)
@@ -94,13 +95,6 @@ class TrackedOrPlaced(Work):
         if not self._succeeds(driver, lambda: placed.choose(driver)):
             return None
         seconds = placed.seconds_to_place
-        if not has_pycolmap():
-            say(
-                "warning: structure from motion may place more frames: pip install 'geogs[photos]' "
-                f"brings it, and geogs run {_command(settings)} --offline does it in about "
-                f"{duration(seconds)} and the time of the map."
-            )
-            return None
         say(
             f"{_in_words(tracked)} Trying structure from motion, about {duration(seconds)}; Ctrl-C "
             "keeps what was tracked."
@@ -175,7 +169,3 @@ def _placed_part(judged: Verdict | None) -> float:
 
 def _in_words(tracked: Verdict | None) -> str:
     return "No frame could be tracked." if tracked is None else tracked.sentence
-
-
-def _command(settings: RunSettings) -> str:
-    return shlex.join(str(path) for path in settings.source)

@@ -17,6 +17,7 @@ from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
+from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
@@ -29,7 +30,7 @@ from geogs.application.tracked_video import TrackedVideo
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
-from geogs.errors import InputError
+from geogs.errors import InputError, TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.address import live_address
 from geogs.io.sources.frame_source import Source
@@ -83,7 +84,17 @@ def run(
 
             told = self_calibrated(opened, config, device, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
-        return driver.complete(TrackedOrPlaced(_begun(settings, driver, opened, base), opened))
+        work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened)
+        return _completed(driver, settings, work)
+
+
+def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Written:
+    """Raises TrackingLost, with what may help, if no frame could be tracked, nor placed."""
+    try:
+        return driver.complete(work)
+    except TrackingLost as lost:
+        help = remedy(settings, work.source, None)
+        raise TrackingLost(f"{lost} {help}") from lost
 
 
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
@@ -184,7 +195,7 @@ def resume(
         driver = Driver(settings, folder, device, progress, stop, observer, kernels)
         if (plan := _plan(driver, source, slam.world.maps_at_end)) is not None:
             progress.plan(plan)
-        return driver.complete(TrackedOrPlaced(work, opened))
+        return _completed(driver, settings, TrackedOrPlaced(work, opened))
 
 
 def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from geogs.application.run_settings import Verbosity
+from geogs.application.run_settings import RunSettings, Verbosity
 from geogs.errors import TrackingLost
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
         written = work(progress)
         progress.end_phase()
         words = closing_message(written, time.perf_counter() - begin)
+        words += _remedy(options, written)
         progress.note("\n".join(words))
     if not options.quiet:
         print("\n".join(words))
@@ -47,6 +48,17 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
         why = result.why_no_map or "Of what was seen no surface is known."
         raise TrackingLost(f"There is no mesh; the rest is in {written.output}/. {why}")
     return written
+
+
+def _remedy(options: Verbosity, written: "Written") -> list[str]:
+    """The command that may help where a run came to its end and is not to be relied on."""
+    from geogs.application.remedy import remedy
+
+    result = written.result
+    if not isinstance(options, RunSettings) or result.is_interrupted:
+        return []
+    said = remedy(options, result.source, result.verdict, result.scene.stopwatch.total)
+    return [f"What may help: {said}"] if said else []
 
 
 def closing_message(written: "Written", seconds: float) -> list[str]:

@@ -74,10 +74,7 @@ def write_files(
     write_more()
     lost = result.trajectory.states.count("lost")
     if lost > 0.2 * scene.frames:
-        progress.write(
-            f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "
-            "or the right --intrinsics may help."
-        )
+        progress.write(f"warning: {lost} of {scene.frames} frames were not tracked.")
     summary = summarise(result)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     progress.stage("report", 0.0)

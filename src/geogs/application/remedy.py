@@ -1,0 +1,78 @@
+"""What to do where a run lost its camera, or is not to be relied on: the command that may help."""
+
+import math
+import shlex
+
+from geogs.application.chosen_frames import stretch_length
+from geogs.application.fallback import impossible, is_wanted
+from geogs.application.photos import has_pycolmap, seconds_to_place
+from geogs.application.results.verdict import Verdict
+from geogs.application.run_forecast import RunPlan
+from geogs.application.run_settings import RunSettings
+from geogs.config import InputConfig, preset_of
+from geogs.evaluation.duration import duration
+from geogs.io.sources.frame_source import Source
+from geogs.io.sources.posed.posed_source import PosedSource
+
+RECORD_AGAIN = (
+    "No setting is likely to help. Record it again: slowly, moving sideways instead of turning on "
+    "the spot, in good light, and geogs run it."
+)
+
+
+def remedy(
+    settings: RunSettings,
+    source: Source | PosedSource,
+    judged: Verdict | None,
+    took: float = 0.0,
+) -> str:
+    """The one command that most likely helps, with about the time it takes, in a sentence.
+
+    Empty where the result needs none. ``judged`` is none where no frame was tracked; ``took`` are
+    the seconds of this run, if it came to an end.
+    """
+    if not is_wanted(judged) or isinstance(source, PosedSource):
+        return ""
+    if source.is_live:
+        return "Record it: geogs run RECORDING waits for no camera, and tries more."
+    command = f"geogs run {arguments(settings)}"
+    again = f", in about {duration(took)}" if took else ""
+    if not _was_placed(settings, source):
+        install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
+        return (
+            f"{install}{command} --offline places the frames by structure from motion, in about "
+            f"{duration(seconds_offline(settings, source))}."
+        )
+    if settings.map is not None:
+        return f"{command} makes a map of its own{again}."
+    if source.calibration.is_guess:
+        return f"{command} --intrinsics fx,fy,cx,cy takes the focal length that you know{again}."
+    if settings.config.input.stride > 1:
+        every = duration(settings.config.input.stride * took)
+        return f"{command} --stride 1 takes every frame, in about {every}."
+    return RECORD_AGAIN
+
+
+def arguments(settings: RunSettings) -> str:
+    """Sources and what decides most, as typed behind ``geogs run``."""
+    words = [str(path) for path in settings.source]
+    name, given, usual = preset_of(settings.config), settings.config.input, InputConfig()
+    words += [] if name == "default" else ["--preset", name]
+    for option in ("intrinsics", "start", "stop", "stride"):
+        if (value := getattr(given, option)) != getattr(usual, option):
+            words += [f"--{option}", str(value)]
+    return shlex.join(words)
+
+
+def seconds_offline(settings: RunSettings, source: Source) -> float:
+    """About how long a run takes that places frames by structure from motion."""
+    length = source.length or 0
+    chosen = math.ceil(length / stretch_length(source.fps, length))
+    plan = RunPlan(settings.config, length, False, False, True).seconds(chosen)
+    return seconds_to_place(chosen, length) + plan["mapping"] + plan["mesh"]
+
+
+def _was_placed(settings: RunSettings, source: Source) -> bool:
+    """Whether structure from motion has been tried, or cannot be."""
+    tried = settings.fallback and not impossible(settings, source) and has_pycolmap()
+    return settings.offline or settings.map is not None or tried

@@ -1,0 +1,82 @@
+"""What a run that lost its camera ends with: one command, that can be typed as it stands."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from geogs.application import remedy as module
+from geogs.application.remedy import RECORD_AGAIN, remedy
+from geogs.application.results.verdict import Verdict
+from geogs.application.run_settings import RunSettings
+from geogs.cli.run import parse
+from geogs.config import Config, InputConfig, preset
+from geogs.io.sources.frame_source import Source
+
+GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
+LOST = replace(GOOD, is_reliable=False, lost=0.3)
+VIDEO = RunSettings((Path("my video.mp4"),))
+
+
+def source(is_live: bool = False, is_guess: bool = False) -> Source:
+    names = {"is_live": is_live, "uses_depth": False, "uses_poses": False}
+    made = type("Some", (Source,), names)
+    one = made.__new__(made)
+    one.length, one.fps, one.calibration = 150, 30.0, SimpleNamespace(is_guess=is_guess)
+    return one
+
+
+@pytest.fixture
+def photos(monkeypatch):
+    return lambda there: monkeypatch.setattr(module, "has_pycolmap", lambda: there)
+
+
+def test_a_good_result_needs_none(photos):
+    photos(False)
+    assert remedy(VIDEO, source(), GOOD, 90.0) == ""
+
+
+def test_where_structure_from_motion_was_not_tried_it_is_named_with_its_time(photos):
+    photos(False)
+    said = remedy(VIDEO, source(), LOST, 90.0)
+    assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --offline ")
+    assert "in about 1 min" in said or "in about 2 min" in said or "in about 3 min" in said
+    photos(True)
+    said = remedy(replace(VIDEO, fallback=False), source(), LOST, 90.0)
+    assert said.startswith("geogs run 'my video.mp4' --offline places")
+    metric = replace(VIDEO, scale_from="height:1.6")
+    assert remedy(metric, source(), None).startswith("geogs run 'my video.mp4' --offline")
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_guess", "said"),
+    [
+        (VIDEO, True, " --intrinsics fx,fy,cx,cy takes the focal length that you know, in a"),
+        (VIDEO, False, RECORD_AGAIN),
+        (replace(VIDEO, offline=True), False, RECORD_AGAIN),
+        (replace(VIDEO, map=Path("old")), False, " makes a map of its own, in about 1 min 30"),
+    ],
+)
+def test_where_it_was_tried_the_next_is(photos, settings, is_guess, said):
+    photos(True)
+    assert said in remedy(settings, source(is_guess=is_guess), LOST, 90.0)
+
+
+def test_of_a_camera_the_recording_helps(photos):
+    photos(True)
+    assert "geogs run RECORDING" in remedy(VIDEO, source(is_live=True), LOST, 90.0)
+
+
+def test_the_command_keeps_what_was_given(photos):
+    photos(True)
+    given = InputConfig(intrinsics="500,500,320,240", start=5, stop=90, stride=3)
+    settings = replace(VIDEO, config=replace(preset("fast"), input=given))
+    command, _, rest = remedy(settings, source(), LOST, 90.0).partition(" takes every")
+    assert rest.startswith(" frame, in about 4 min 30 s")
+    options = parse(shlex.split(command)[2:])
+    assert options.source == VIDEO.source
+    assert options.config.mapping == preset("fast").mapping
+    assert options.config.input.intrinsics == given.intrinsics
+    assert Config().input.stride == 1
