@@ -39,9 +39,11 @@ class PhotoFeatures:
 
 
 def find_features(
-    picture: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
+    picture: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"] | None = None,
+    most: int = MAX_FEATURES,
 ) -> PhotoFeatures:
-    """Features of an RGB picture, where its mask, if there is one, is true."""
+    """Features of an RGB picture, where its mask, if there is one, is true; at most so many."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     reduction = max(1.0, max(width, height) / MAX_EDGE)
@@ -53,9 +55,7 @@ def find_features(
         size = (grey.shape[1], grey.shape[0])
         used = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     # Without the precise enlargement features lie a quarter of a pixel too far right and down.
-    sift = cv2.SIFT.create(
-        nfeatures=MAX_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True
-    )
+    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
     found, raw = sift.detectAndCompute(grey, used)
     if not found:
         return PhotoFeatures.none()

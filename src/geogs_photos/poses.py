@@ -16,7 +16,7 @@ from geogs.io.sources.posed.stored_pictures import read_picture
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.incremental_mapping import put_together, refine
-from geogs_photos.photo_features import PhotoFeatures, find_features
+from geogs_photos.photo_features import MAX_FEATURES, PhotoFeatures, find_features
 from geogs_photos.photo_pairs import Pairs, choose_pairs
 from geogs_photos.photograph import Lens, PhotoFolder, Photograph
 from geogs_photos.pycolmap_library import load_colmap
@@ -52,7 +52,12 @@ class FoundPoses:
 
 
 def find_poses(
-    folder: PhotoFolder, model: Path, intrinsics: str, seed: int, progress: Progress
+    folder: PhotoFolder,
+    model: Path,
+    intrinsics: str,
+    seed: int,
+    progress: Progress,
+    most_features: int = MAX_FEATURES,
 ) -> FoundPoses:
     """Find where photographs were taken, and write it as a COLMAP model.
 
@@ -64,6 +69,7 @@ def find_poses(
         intrinsics: as ``InputConfig.intrinsics``; other than auto, they are kept as they are.
         seed: of the random choices.
         progress: follows the work.
+        most_features: of a photograph; fewer take less time.
 
     Raises:
         InputError: pycolmap is missing, the intrinsics do not fit, or fewer than three photographs
@@ -78,8 +84,9 @@ def find_poses(
         )
     cameras, camera_of = shared_cameras(photographs, intrinsics)
     features = thread_map(
-        lambda p: _features(p, folder.root), photographs, lambda f: progress("features", f)
-    )
+        lambda p: _features(p, folder.root, most_features), photographs,
+        lambda f: progress("features", f),
+    )  # fmt: skip
     pairs = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
     names = [photograph.name for photograph in photographs]
     entries = [Entry(*e) for e in zip(names, camera_of, features, strict=True)]
@@ -160,14 +167,15 @@ def reasons(entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]
     return left_out
 
 
-def _features(photograph: Photograph, root: Path) -> PhotoFeatures:
+def _features(photograph: Photograph, root: Path, most: int) -> PhotoFeatures:
     """Features of a photograph, inside its mask where there is one; none where it is damaged."""
     try:
         picture = read_picture(photograph.path)
     except InputError:
         return PhotoFeatures.none()
     mask = mask_beside(root, photograph.name)
-    return find_features(picture, None if mask is None else read_mask(mask, picture.shape[:2]))
+    inside = None if mask is None else read_mask(mask, picture.shape[:2])
+    return find_features(picture, inside, most)
 
 
 def _names(model: Any) -> set[str]:

@@ -14,6 +14,7 @@ from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.replacement import replaced
+from geogs_photos.effort import features_for, what_does_not_fit
 from geogs_photos.photograph import PhotoFolder, find_photographs
 from geogs_photos.poses import FoundPoses, LeftOut, find_poses
 
@@ -29,6 +30,7 @@ def open_photographs(
     again: bool = False,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
+    seconds: float | None = None,
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
@@ -48,9 +50,12 @@ def open_photographs(
             progress.stage(stage, fraction)
             stop.check()
 
+        count = len(some)
+        progress.write(what_does_not_fit(count, seconds))
+        most = features_for(count, seconds)
         with replaced(kept, "beside") as new:
             model_new = new / model.relative_to(kept)
-            found = find_poses(chosen, model_new, selection.intrinsics, config.seed, report)
+            found = find_poses(chosen, model_new, selection.intrinsics, config.seed, report, most)
             write_text(new / note.name, json.dumps(asdict(found), indent=2))
     source = _source(folder, chosen, model, found, config, hold_out)
     count = len(chosen.photographs) + len(chosen.damaged)

@@ -126,6 +126,7 @@ def open_photographs(
     again: bool = False,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
+    seconds: float | None = None,
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
@@ -139,6 +140,8 @@ def open_photographs(
         again: whether to take the poses that were kept there before.
         progress: follows the work.
         stop: ends it.
+        seconds: for poses and map together; where they are few the poses take less effort, and
+            ``progress`` hears at once what does not fit. None is no limit.
 
     Raises:
         InputError: pycolmap is missing, or the photographs do not tell where they were taken.
@@ -146,7 +149,9 @@ def open_photographs(
         KeyboardInterrupt: it was stopped.
     """
     open_them = _registered("open_photographs")
-    source: PosedSource = open_them(folder, config, kept, hold_out, again, progress, stop)
+    source: PosedSource = open_them(
+        folder, config, kept, hold_out, again, progress, stop, seconds
+    )  # fmt: skip
     return source
 
 

@@ -81,7 +81,9 @@ def reconstruct(
         if not isinstance(source, PosedSource):
             if poses == "auto":
                 with tempfile.TemporaryDirectory(prefix="geogs-photos-") as kept:
-                    source = open_photographs(Path(source), config, Path(kept), progress=progress)
+                    source = open_photographs(
+                        Path(source), config, Path(kept), progress=progress, seconds=budget
+                    )
             else:
                 source = open_posed_source(source, config.input)
         # Once per machine: in no budget.
@@ -126,7 +128,7 @@ def reconstruct_to_folder(
             with stop:
                 source = open_photographs(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
-                    stop,
+                    stop, settings.budget,
                 )  # fmt: skip
         # Once per machine: in no budget.
         begin += compiled_kernels(device) + kernels.wait(progress.stage)

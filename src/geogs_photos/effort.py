@@ -1,0 +1,54 @@
+"""How many features of a photograph are matched where the time for their poses is limited."""
+
+import math
+
+from geogs.evaluation.duration import duration
+from geogs.threads import worker_count
+from geogs_photos.photo_features import MAX_FEATURES
+
+FEATURES = (MAX_FEATURES, 2896, 2048, 1448, 1024)
+"""Of a photograph, at most: from one to the next matching takes half as long."""
+POSES = 0.5
+"""Fraction of the time that the poses may take; the map is made in the rest."""
+LEAST_MAP = 15.0
+"""Seconds that the smallest map takes with mesh and files."""
+_A_PHOTOGRAPH, _A_PAIR, _TO_PLACE = 0.4, 0.13, 0.3
+"""Seconds to read a photograph, find its features and who shows the same, and to match a pair, on
+one core; and to place one, on any number. With all features."""
+_PAIRS = 20.0
+"""That are matched for each photograph, where there are many."""
+
+
+def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
+    """About how long it takes to find the poses of so many photographs."""
+    part = features / MAX_FEATURES
+    pairs = min(0.5 * count * (count - 1), _PAIRS * count)
+    on_all_cores = _A_PHOTOGRAPH * count + _A_PAIR * part**2 * pairs
+    return on_all_cores / worker_count() + _TO_PLACE * part * count
+
+
+def features_for(count: int, seconds: float | None) -> int:
+    """The most features with which poses take their part of ``seconds``; the fewest if none do."""
+    if seconds is None:
+        return MAX_FEATURES
+    fit = (n for n in FEATURES if seconds_to_find_poses(count, n) <= POSES * seconds)
+    return next(fit, FEATURES[-1])
+
+
+def what_does_not_fit(count: int, seconds: float | None) -> str:
+    """What to say at once of a time that is too short for so many photographs, or that is only
+    enough with less effort; empty where it is enough."""
+    if seconds is None or (features := features_for(count, seconds)) == MAX_FEATURES:
+        return ""
+    least = seconds_to_find_poses(count, features)
+    if least + LEAST_MAP <= seconds:
+        return (
+            f"note: For the --budget the poses are found from {features} features a photograph "
+            f"instead of {MAX_FEATURES}, in about {duration(least)}."
+        )
+    return (
+        f"warning: The --budget will not do: the poses of {count} photographs take about "
+        f"{duration(least)} here, and the smallest map {duration(LEAST_MAP)}. --budget "
+        f"{math.ceil((least + LEAST_MAP) / 10) * 10}s would do, or --input.stride 2, which takes "
+        "half of the photographs."
+    )
