@@ -27,4 +27,4 @@ def test_what_will_not_do_is_said_at_once():
     said = what_does_not_fit(200, 30.0)
     assert said.startswith("warning: The --budget will not do: the poses of 200 photographs")
     assert f"take about {duration(seconds_to_find_poses(200, FEATURES[-1]))} here" in said
-    assert "--budget 100s would do, or --input.stride 2" in said
+    assert "--budget 90s would do, or --input.stride 2" in said
