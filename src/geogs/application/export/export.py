@@ -131,6 +131,7 @@ def _write_mesh(path: Path, result: SavedResult, settings: ExportSettings) -> No
     if settings.to == "obj":
         write_obj(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
     elif not settings.textured:
+        mesh = mesh.creased()
         write_glb(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
     else:
         result.require_images()

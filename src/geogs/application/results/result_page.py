@@ -150,8 +150,11 @@ def shown_model(
         shown = with_at_most(mesh, MOST_FACES)
         if shown is not mesh:
             notes.append(f"Shown with {len(shown.faces):,} of {len(mesh.faces):,} triangles.")
+        shown = shown.creased()
         own = [] if shown.colours is None else [Colouring("Colour", shown.colours)]
-        surface = SurfaceModel(shown.vertices, shown.faces, [*own, *more_colourings(shown)])
+        surface = SurfaceModel(
+            shown.vertices, shown.faces, shown.normals, [*own, *more_colourings(shown)]
+        )
     disk_model = None
     if disks is not None and len(disks):
         disk_model = _disks(disks)

@@ -5,6 +5,7 @@ import html
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from typing import Any
 
@@ -126,12 +127,9 @@ class Window:
 
     def show_mesh(self, mesh: Mesh) -> None:
         """A surface in its colours."""
-        import trimesh
-
-        colours = mesh.colours
-        if colours is None:
-            colours = np.full((len(mesh.vertices), 3), 200, np.uint8)
-        shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+        if mesh.colours is None:
+            mesh = replace(mesh, colours=np.full((len(mesh.vertices), 3), 200, np.uint8))
+        shape = mesh.creased().to_trimesh()
         self._put("Mesh", self._server.scene.add_mesh_trimesh("/mesh", shape))
 
     def show_disks(self, disks: MapSnapshot) -> None:

@@ -19,7 +19,7 @@ from geogs.geometry.morton import morton_codes
 
 STEPS = 65_535
 """Steps of a quantised coordinate."""
-_QUATERNION = 127
+_BYTE = 127
 _SCALE_STEPS = 255
 _STATES = ("tracked", "orientation only", "lost")
 
@@ -76,6 +76,7 @@ def _surface(surface: SurfaceModel, R: np.ndarray, arrays: "_Arrays") -> dict[st
         "box": box,
         "vertices": arrays.add(steps[order]),
         "faces": arrays.add(_face_differences(rank[surface.faces])),
+        "normals": arrays.add(in_bytes(surface.normals @ R.T)[order]),
         "colourings": [
             {
                 "name": colouring.name,
@@ -100,10 +101,15 @@ def _disks(disks: DiskModel, R: np.ndarray, arrays: "_Arrays") -> dict[str, Any]
     return {
         "box": box,
         "position": arrays.add(steps[order]),
-        "quaternion": arrays.add(np.rint(rotation * _QUATERNION + 128).astype(np.uint8)[order]),
+        "quaternion": arrays.add(in_bytes(rotation)[order]),
         "scale": arrays.add(scale.astype(np.uint8)[order]),
         "logs": [low, high],
     }
+
+
+def in_bytes(units: Float[np.ndarray, "n k"]) -> UInt[np.ndarray, "n k"]:
+    """Numbers from -1 to 1 as bytes, of which 128 is zero."""
+    return np.rint(units * _BYTE + 128).astype(np.uint8)
 
 
 def quantised(

@@ -41,6 +41,8 @@ class SurfaceModel:
     vertices: Float[np.ndarray, "n 3"]
     """Map units."""
     faces: Int[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "n 3"]
+    """Unit, towards free space."""
     colourings: Sequence[Colouring] = ()
     """The first is shown first; without any the surface is plain."""
 

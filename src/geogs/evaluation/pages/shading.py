@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.geometry.camera import Camera
+from geogs.geometry.creases import creased
 
 _BACKGROUND = 255.0
 _GREY = 190.0
@@ -38,7 +39,7 @@ class Sight:
     """Brightness there, in [0, 1]."""
 
     def paint(self, colours: UInt8[np.ndarray, "n 3"] | None = None) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture (RGB): faces flat, grey or in the mean colour of their vertices."""
+        """The picture (RGB): faces grey, or in the mean colour of their vertices."""
         picture = np.full((*self.hit.shape, 3), _BACKGROUND)
         colour = np.full((1, 3), _GREY)
         if colours is not None:
@@ -51,7 +52,8 @@ class Sight:
 def look(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], view: Viewpoint
 ) -> Sight:
-    """A mesh with a lamp at the camera: brightness is the cosine to the face's normal.
+    """A mesh with a lamp at the camera: brightness is the cosine to its normal, which is smooth but
+    for edges.
 
     Both sides of a face are seen, as meshes of truth often have no orientation.
     """
@@ -64,16 +66,30 @@ def look(
     if not len(faces):
         hit = np.zeros((fine.height, fine.width), bool)
         return Sight(hit, np.zeros((0, 3), np.int64), np.zeros((0, 1)))
-    _, face = render_mesh(vertices, faces, fine, view.T_cw)
+    depth, face = render_mesh(vertices, faces, fine, view.T_cw)
     hit = face >= 0
-    corners = faces[face[hit]]
-    a, b, c = (vertices[corners[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a) @ view.T_cw[:3, :3].T
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-300
+    corners, smooth = faces[face[hit]], creased(vertices, faces)
+    points = vertices @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
     ray = fine.rays().numpy()[hit].astype(np.float64)
+    share = _shares(points[corners], depth[hit][:, None] * ray)
+    normal = (share[:, :, None] * smooth.normals[smooth.faces[face[hit]]]).sum(1)
+    normal = normal @ view.T_cw[:3, :3].T
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-300
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     light = _AMBIENT + (1 - _AMBIENT) * np.abs((normal * ray).sum(1, keepdims=True))
     return Sight(hit, corners, light)
+
+
+def _shares(
+    corners: Float[np.ndarray, "k 3 3"], points: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Of the corners of triangles in points of these: their barycentric coordinates."""
+    a, b, c = (corners[:, i] for i in range(3))
+    area = np.cross(b - a, c - a)
+    whole = (area * area).sum(1) + 1e-300
+    second = (np.cross(points - a, c - a) * area).sum(1) / whole
+    third = (np.cross(b - a, points - a) * area).sum(1) / whole
+    return np.stack([1 - second - third, second, third], 1).clip(0, 1)
 
 
 def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:

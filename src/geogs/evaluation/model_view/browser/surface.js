@@ -11,7 +11,8 @@ function makeSurface(packed, content) {
   }
   geometry.setAttribute('position', new THREE.BufferAttribute(vertices, 3));
   geometry.setIndex(new THREE.BufferAttribute(faces, 1));
-  geometry.computeVertexNormals();
+  const normals = Int8Array.from(unpacked(content, packed.normals), (byte) => byte - 128);
+  geometry.setAttribute('normal', new THREE.BufferAttribute(normals, 3, true));
   geometry.computeBoundingSphere();
 
   const looks = new Map();
