@@ -79,6 +79,25 @@ def test_what_was_not_planned_counts_for_itself_and_not_for_the_pace():
     assert forecast.left() == pytest.approx(expected, rel=0.1)
 
 
+def test_a_stage_that_was_held_up_goes_on_where_it_was():
+    now = [0.0]
+    plan = RunPlan(Config(), 100, False, False, True)
+    forecast = RunForecast(plan, lambda: now[0])
+    forecast.frame(100, 30)
+    now[0] = 20.0
+    forecast.stage("mapping", 0.0)
+    for name, begin, end, seconds in (
+        ("mapping", 0.0, 0.4, 20), ("compiling, once", 0.0, 1.0, 30), ("mapping", 0.4, 0.5, 5),
+    ):  # fmt: skip
+        for part in np.linspace(begin, end, 21):
+            now[0] += seconds / 21
+            forecast.stage(name, float(part))
+            forecast.left()
+        if name == "compiling, once":
+            assert forecast.left() == pytest.approx(30 + 6, abs=6)  # of mapping, and the mesh
+    assert forecast.left() == pytest.approx(25 + 6, abs=6)
+
+
 def test_a_run_that_goes_on_expects_only_what_is_left():
     now = [0.0]
     plan = RunPlan(Config(), 1000, False, False, True)

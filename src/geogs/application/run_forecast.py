@@ -96,15 +96,28 @@ class RunPlan:
         }
 
 
+@dataclass
+class _Stage:
+    """How far a stage is; mutable."""
+
+    name: str
+    began: float
+    """By the clock, later by what was done aside since."""
+    part: float = 0.0
+
+
 class RunForecast:
     """Seconds left of a run by what it has reported: one steady figure for all of it."""
 
     def __init__(self, plan: RunPlan, clock: Clock = time.perf_counter) -> None:
         self._plan, self._clock = plan, clock
-        self._began = self._stage_began = self._said_at = clock()
-        self._stage, self._fraction, self._said = "", 0.0, math.nan
-        self._last, self._is_planned, self._aside = "", True, 0.0
-        """The last stage that was planned, whether the present one was, and the time of others."""
+        self._began = self._said_at = clock()
+        """The first is later by what was done aside."""
+        self._said = math.nan
+        self._stage: _Stage | None = None
+        """The last of those that were planned."""
+        self._aside: _Stage | None = None
+        """What is done instead; none while the other goes on."""
         self._begun = self._first = self._now = (0, 0)
         """Frames and keyframes before it began, when there were keyframes first, and by now."""
         self._found_at = self._began
@@ -131,14 +144,26 @@ class RunForecast:
     def stage(self, name: str, fraction: float) -> None:
         """After each part of a stage, such as ``mesh: fuse``."""
         name, begin, end = PARTS.get(name, (name, 0.0, 1.0))
-        if name != self._stage:
-            now, is_planned = self._clock(), name in self._plan.seconds(0.0)
-            if not self._is_planned:
-                self._aside += now - self._stage_began
-            self._stage, self._stage_began, self._is_planned = name, now, is_planned
-            self._last = name if is_planned else self._last
-        self._fraction = begin + (end - begin) * fraction
-        self._found, self._found_at = self._by_now(), self._clock()
+        now, part = self._clock(), begin + (end - begin) * fraction
+        if name not in self._plan.seconds(0.0):
+            if self._aside is None or self._aside.name != name:
+                self._end_aside(now)
+                self._aside = _Stage(name, now)
+            self._aside.part = part
+        else:
+            self._end_aside(now)
+            if self._stage is None or self._stage.name != name:
+                self._stage = _Stage(name, now)
+            self._stage.part = part
+        self._found, self._found_at = self._by_now(), now
+
+    def _end_aside(self, now: float) -> None:
+        """What was done aside counts for no stage, nor for the pace."""
+        if self._aside is not None:
+            self._began += now - self._aside.began
+            if self._stage is not None:
+                self._stage.began += now - self._aside.began
+        self._aside = None
 
     def _planned(self) -> dict[str, float]:
         """Of each stage, without what was done before."""
@@ -161,21 +186,32 @@ class RunForecast:
 
     def _by_now(self) -> float:
         """Seconds left when something is reported, by all that has been."""
-        stages, since = self._planned(), self._clock() - self._stage_began
-        names, part, here = list(stages), self._fraction, 0.0
-        place = names.index(self._last) if self._last else -1
-        if self._stage == "frames":
-            part = self._plan.tracked(*self._now) - self._plan.tracked(*self._begun)
-            part = min(part / max(stages["frames"], 1e-9), 1.0)
-        done, spent = sum(stages[name] for name in names[: max(place, 0)]), -self._aside
-        if self._is_planned and self._stage:
-            here, spent = stages[self._stage], spent + since
-            done += part * here
-        elif self._last:
-            done += stages[self._last]
-        spent += self._stage_began - self._began
-        pace = (spent + SURE_OF_PACE) / (done + SURE_OF_PACE)
-        own = max(pace * here * (1 - part), 0.05 * since)
-        if part > 0:  # the better known the more of it is done
-            own += min(1.0, 2 * part) * (since * (1 - part) / part - own)
+        stages, stage, now = self._planned(), self._stage, self._clock()
+        names, until, own = list(stages), now if self._aside is None else self._aside.began, 0.0
+        place = -1 if stage is None else names.index(stage.name)
+        done = sum(stages[name] for name in names[: max(place, 0)])
+        part = 0.0 if stage is None else self._part_of(stage, stages)
+        here = 0.0 if stage is None else stages[stage.name]
+        spent = until - self._began
+        pace = (spent + SURE_OF_PACE) / (done + part * here + SURE_OF_PACE)
+        if stage is not None:
+            own = _left(pace * here, until - stage.began, part)
+        if self._aside is not None:
+            own += _left(0.0, now - self._aside.began, self._aside.part)
         return own + pace * sum(stages[name] for name in names[place + 1 :])
+
+    def _part_of(self, stage: _Stage, stages: dict[str, float]) -> float:
+        """How much of it is done, by time; of the frames those with keyframes take most."""
+        if stage.name != "frames":
+            return stage.part
+        done = self._plan.tracked(*self._now) - self._plan.tracked(*self._begun)
+        return min(done / max(stages["frames"], 1e-9), 1.0)
+
+
+def _left(expected: float, since: float, part: float) -> float:
+    """Seconds left of a stage that takes about so many, ``since`` so many: by how much of it is
+    done, the better the more that is."""
+    left = max(expected * (1 - part), 0.05 * since * (part < 1))
+    if part > 0:
+        left += min(1.0, 2 * part) * (since * (1 - part) / part - left)
+    return left
