@@ -7,11 +7,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
-from geogs.application.machine.compilation import compiling
+from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.photos import open_photographs
@@ -46,6 +48,17 @@ def left_of(budget: float | None, begin: float) -> float | None:
     if budget is None:
         return None
     return max(budget - (time.perf_counter() - begin), _LEAST_BUDGET)
+
+
+def _compiled(
+    device: torch.device, kernels: Compilation, budget: float | None, progress: RunProgress
+) -> float:
+    """Seconds to wait until all is compiled: once on a machine, and in no budget."""
+    if budget is not None and kernels.is_working:
+        progress.write(
+            "note: Kernels are compiled first, once on this machine; the --budget begins after it."
+        )
+    return compiled_kernels(device) + kernels.wait(progress.stage)
 
 
 @on_one_torch_thread
@@ -86,8 +99,7 @@ def reconstruct(
                     )
             else:
                 source = open_posed_source(source, config.input)
-        # Once per machine: in no budget.
-        begin += compiled_kernels(used) + kernels.wait(progress.stage)
+        begin += _compiled(used, kernels, budget, progress)
     checks = progress if check and poses == "given" else None
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), left_of(budget, begin))
@@ -130,8 +142,7 @@ def reconstruct_to_folder(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
                     stop, settings.budget,
                 )  # fmt: skip
-        # Once per machine: in no budget.
-        begin += compiled_kernels(device) + kernels.wait(progress.stage)
+        begin += _compiled(device, kernels, settings.budget, progress)
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)

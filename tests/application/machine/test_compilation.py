@@ -55,6 +55,7 @@ def test_what_is_not_compiled_yet_is_waited_for_and_said():
     assert said[2:] == [0.75, 1.0]
     assert kernels.wait(lambda stage, part: pytest.fail("all is there")) < 0.1
     kernels.stop()
+    assert not kernels.is_working
 
 
 def test_a_process_that_fails_or_lasts_holds_nobody_up():

@@ -34,6 +34,11 @@ class Compilation:
     def __init__(self, process: "subprocess.Popen[str] | None" = None, kernels: int = 0) -> None:
         self._process, self._kernels, self._done = process, kernels, 0
 
+    @property
+    def is_working(self) -> bool:
+        """Whether something has still to be compiled."""
+        return self._process is not None and self._process.poll() is None
+
     def wait(self, report: StageProgress, first: int | None = None) -> float:
         """Until all is compiled, or the ``first`` so many; how many seconds that took from now on.
 
@@ -42,11 +47,11 @@ class Compilation:
         start, needed = time.perf_counter(), self._kernels if first is None else first
         while self._process is not None and self._done < needed:
             assert self._process.stdout is not None
-            is_over = self._process.poll() is not None
+            is_working = self.is_working
             if not self._process.stdout.readline():
                 break
             self._done += 1
-            if not is_over:
+            if is_working:
                 report("compiling, once", min(self._done / needed, 1.0))
         return time.perf_counter() - start
 
@@ -61,7 +66,7 @@ class Compilation:
 def compiling(device: torch.device) -> Iterator[Compilation]:
     """Inside, what a command on a device needs for the CPU is compiled beside it, if it is not."""
     with_map = device.type == "cpu"
-    if is_compiled(with_map):
+    if is_compiled(with_map) or not sys.executable:
         yield Compilation()
         return
     command = [sys.executable, "-m", __name__, *(() if with_map else ("mesh",))]
