@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs_synth.clips import loose, pieces
+from geogs_synth.clips import loose, pieces, thin_things
 from geogs_synth.clips.pieces import BOARDS, StandingPiece
 from geogs_synth.draw import Draw, about_z
 from geogs_synth.scene.solids import NONE, SolidBatch, Solids
@@ -35,9 +35,11 @@ class _Group:
 
 
 def draw_furnishing(
-    draw: Draw, size: Float[Tensor, "b 3"], least: float, most: float
+    draw: Draw, size: Float[Tensor, "b 3"], least: float, most: float, thin: float = 0.0
 ) -> Furnishing:
-    """Furnishes rooms of these sizes; the densities are those of :class:`RoomOptions`."""
+    """Furnishes rooms of these sizes; the densities are those of :class:`RoomOptions`.
+
+    Where there may be thin things there are twice as many places."""
     b = len(size)
     density = draw.uniform(least, most, b)[:, None]
     cupboards = pieces.cupboards(draw, size, 8)
@@ -60,7 +62,7 @@ def draw_furnishing(
     def scattered(solids: SolidBatch, factor: float = 1.0) -> SolidBatch:
         return solids.without(draw.uniform(0, 1, *solids.kind.shape) > factor * density)
 
-    return _join(
+    groups = [
         _Group(_put(cupboards, standing[0]), 1),
         _Group(_put(tables, standing[1]), 5),
         _Group(some(pieces.chairs(draw, size, 2)), 6),
@@ -74,6 +76,27 @@ def draw_furnishing(
         _Group(scattered(loose.clutter(draw, anywhere, 20), 1.2), 1),
         _Group(scattered(loose.wires(draw, size, 5)), 1),
         _Group(scattered(loose.slabs(draw, size, 4), 0.6), 1),
+    ]
+    return _join(*groups, *(_thin_things(draw, size, thin) if thin > 0 else ()))
+
+
+def _thin_things(draw: Draw, size: Float[Tensor, "b 3"], most: float) -> tuple[_Group, ...]:
+    """Railings, lattices, cables, bushes and more chairs: none in some rooms, many in others."""
+    density = draw.uniform(0, most, len(size))[:, None]
+
+    def some(placed: StandingPiece) -> SolidBatch:
+        return _put(placed, draw.uniform(0, 1, *placed[1].yaw.shape) < density)
+
+    cables = thin_things.cables(draw, size, 3)
+    gone = draw.uniform(0, 1, len(size), 3) > density
+    cables = cables.without(gone.repeat_interleave(thin_things.SEGMENTS, 1))
+    return (
+        _Group(some(thin_things.railings(draw, size, 2)), thin_things.BALUSTERS + 2),
+        _Group(some(thin_things.lattices(draw, size, 2)), 2 * thin_things.BARS),
+        _Group(cables, thin_things.SEGMENTS),
+        _Group(some(thin_things.bushes(draw, size, 2)), thin_things.TWIGS),
+        _Group(some(pieces.chairs(draw, size, 3)), 6),
+        _Group(some(pieces.tables(draw, size, 1)), 5),
     )
 
 

@@ -64,6 +64,9 @@ class RoomOptions(Settings, group="training.rooms"):
     """Least fraction of the places for solids that a room fills (there are about 125)."""
     most_density: Annotated[float, Range("least_density", 1)] = 0.5
     """Largest fraction of them."""
+    thin: Fraction = 0.0
+    """Largest fraction of the places for thin things that a room fills: railings, lattices,
+    cables, twigs, chairs."""
     motions: MotionWeights = MotionWeights()
     """Kinds of camera motion."""
     scenes: SceneWeights = SceneWeights()

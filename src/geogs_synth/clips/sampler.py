@@ -25,6 +25,8 @@ from geogs_synth.scene.rooms import Rooms, room_per_view
 from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
 
+PLACES = 128
+"""Places for solids in a room, at most; of more some are left out."""
 _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 """Sizes of rooms, metres."""
 
@@ -119,12 +121,12 @@ def draw_plan(
     key = (seed, int(options.validation), step, rank)
     draw = Draw(torch.device("cpu"), *key)
     size = _draw_sizes(draw, batch)
-    layout = draw_furnishing(draw, size, options.least_density, options.most_density)
+    layout = draw_furnishing(draw, size, options.least_density, options.most_density, options.thin)
     surfaces = draw_surfaces(draw, layout, options.textures, materials)
     lights = draw_lights(draw, size, options.views, options.light_change)
     paths = draw_paths(draw, options, size)
     flaws = draw_flaws(draw, batch, options.views, options.clean, options.disturbance)
-    rooms = Rooms(size, layout.solids, surfaces, lights)
+    rooms = Rooms(size, layout.solids, surfaces, lights).with_places(PLACES)
     if options.scenes == only_scene("usual"):
         return Plan(key, rooms, paths, flaws)
     rooms, paths, dynamics = draw_dynamics(draw, options, rooms, paths, materials)

@@ -5,14 +5,14 @@ A room fills [0, size]. Surfaces: 0..5 are the room's faces -x, +x, -y, +y, -z (
 (an ellipsoid only the first).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs_synth.scene.batch import each
-from geogs_synth.scene.solids import SolidBatch
+from geogs_synth.scene.batch import each, gathered
+from geogs_synth.scene.solids import NONE, SolidBatch
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,18 @@ class Rooms:
     solids: SolidBatch
     surfaces: Surfaces
     lights: Lights
+
+    def with_places(self, most: int) -> "Rooms":
+        """With at most so many places for solids: empty ones are taken away first, then the last.
+        As it is where there are no more."""
+        kind = self.solids.kind
+        if kind.shape[1] <= most:
+            return self
+        kept = (kind == NONE).long().sort(dim=1, stable=True).indices[:, :most]
+        faces = torch.stack([2 * kept + 6, 2 * kept + 7], -1).flatten(1)
+        walls = torch.arange(6, device=kind.device).expand(len(kind), 6)
+        surfaces = gathered(self.surfaces, torch.cat([walls, faces], 1))
+        return replace(self, solids=gathered(self.solids, kept), surfaces=surfaces)
 
 
 def packed_solids(solids: SolidBatch) -> Float[Tensor, "b n 16"]:

@@ -22,6 +22,10 @@ SMOOTH = 0.985
 """Cosine between true normals and those of true depth from which on a pixel is no edge."""
 CELL_SPREAD = 0.05
 """Difference of log depth within a coarse cell from which on it has no one depth."""
+NEAR_EDGE = 4
+"""Pixels around a pixel within which another depth makes it one of an edge."""
+CHOICE = 0.15
+"""Steps between planes over which the right one of the depths tried at 1/2 is not told apart."""
 SCALES = 4
 """Scales of differences, each twice as far apart."""
 
@@ -35,12 +39,14 @@ def depth_loss(
     # A ray may meet nothing: what is not valid must be a number all the same.
     truth = (torch.where(valid, batch.depth, typical) / typical).log()
     error = found.log_depth - truth
-    total = _mean(error.abs(), valid)
+    at_edge = spread_around(truth, valid, NEAR_EDGE) > CELL_SPREAD
+    total = _mean((1 + options.edges * at_edge) * error.abs(), valid)
     for level, coarse in ((1, found.at_half), (2, found.at_quarter)):
-        depth, known = coarse_truth(truth, valid, 2**level)
-        coarse = coarse[:, : depth.shape[1], : depth.shape[2]]
-        total = total + 2.0**-level * _mean((coarse - depth).abs(), known)
+        nearest, farthest, known = surfaces_of_cells(truth, valid, 2**level)
+        coarse = coarse[:, : known.shape[1], : known.shape[2]]
+        total = total + 2.0**-level * _mean(from_either(coarse, nearest, farthest), known)
     total = total + options.gradient * gradient_loss(error, valid)
+    total = total + options.choice * choice_loss(found, truth, valid)
 
     height, width = truth.shape[-2:]
     rays = cell_rays(batch.views.intrinsics, height, width, 1).unflatten(2, (height, width))
@@ -65,15 +71,53 @@ def depth_loss(
     return total + options.likelihood * late * _mean(likelihood, valid)
 
 
-def coarse_truth(
+def surfaces_of_cells(
     log_depth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"], cell: int
-) -> tuple[Float[Tensor, "b h2 w2"], Bool[Tensor, "b h2 w2"]]:
-    """Mean of cells of ``cell`` x ``cell`` pixels, and which of them lie on one surface."""
+) -> tuple[Float[Tensor, "b h2 w2"], Float[Tensor, "b h2 w2"], Bool[Tensor, "b h2 w2"]]:
+    """Depths of cells of ``cell`` x ``cell`` pixels, and where all pixels of a cell are known: the
+    mean of a cell that lies on one surface twice, else its nearest and its farthest pixel."""
     depth = log_depth[:, None]
     mean = functional.avg_pool2d(depth, cell)[:, 0]
-    spread = functional.max_pool2d(depth, cell) + functional.max_pool2d(-depth, cell)
-    known = -functional.max_pool2d(-valid[:, None].float(), cell)
-    return mean, (spread[:, 0] < CELL_SPREAD) & (known[:, 0] > 0.5)
+    farthest = functional.max_pool2d(depth, cell)[:, 0]
+    nearest = -functional.max_pool2d(-depth, cell)[:, 0]
+    one = farthest - nearest < CELL_SPREAD
+    known = -functional.max_pool2d(-valid[:, None].float(), cell)[:, 0] > 0.5
+    return torch.where(one, mean, nearest), torch.where(one, mean, farthest), known
+
+
+def from_either(
+    found: Float[Tensor, "b h w"],
+    nearest: Float[Tensor, "b h w"],
+    farthest: Float[Tensor, "b h w"],
+) -> Float[Tensor, "b h w"]:
+    """Distance from the surface that is closer: a mean of two would be no depth at all."""
+    return torch.minimum((found - nearest).abs(), (found - farthest).abs())
+
+
+def spread_around(
+    log_depth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"], reach: int
+) -> Float[Tensor, "b h w"]:
+    """Largest less smallest depth of the known pixels within ``reach`` across and down."""
+    size = 2 * reach + 1
+    low = torch.where(valid, log_depth, torch.inf)[:, None]
+    high = torch.where(valid, log_depth, -torch.inf)[:, None]
+    farthest = functional.max_pool2d(high, size, 1, reach)
+    return (farthest + functional.max_pool2d(-low, size, 1, reach))[:, 0]
+
+
+def choice_loss(
+    found: DepthPrediction, truth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]
+) -> Float[Tensor, ""]:
+    """Cross-entropy of the depths tried at 1/2 with those nearest to the truth, in cells of one
+    surface that one of them lies on."""
+    depth, farthest, known = surfaces_of_cells(truth, valid, 2)
+    rows, columns = depth.shape[1:]
+    step = torch.diff(found.log_planes, dim=1).mean(1)[:, None, None, None]
+    away = (found.tried.detach()[..., :rows, :columns] - depth[:, None]).abs() / step
+    known = known & (depth == farthest) & (away.amin(1) < 1)
+    wanted = (-away / CHOICE).softmax(1)
+    log = found.tried_logits[..., :rows, :columns].log_softmax(1)
+    return _mean(-(wanted * log).sum(1), known)
 
 
 def gradient_loss(error: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]) -> Tensor:
@@ -93,18 +137,29 @@ def plane_loss(
     truth: Float[Tensor, "b h w"],
     valid: Bool[Tensor, "b h w"],
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of the planes with the two beside the truth, by their nearness."""
-    depth, known = coarse_truth(truth, valid, 4)
-    first, planes = log_planes[:, :1, None], log_planes.shape[1]
+    """Cross-entropy of the planes with the two beside the truth, by their nearness; in a cell of
+    two surfaces with those beside either."""
+    nearest, farthest, known = surfaces_of_cells(truth, valid, 4)
+    log = logits[..., : known.shape[1], : known.shape[2]].log_softmax(1)
+    near, inside = _log_likelihood(log, log_planes, nearest)
+    far, also = _log_likelihood(log, log_planes, farthest)
+    either = torch.where(nearest == farthest, near, torch.logaddexp(near, far) - math.log(2))
+    return _mean(-either, known & inside & also)
+
+
+def _log_likelihood(
+    log: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d"], depth: Float[Tensor, "b h w"]
+) -> tuple[Float[Tensor, "b h w"], Bool[Tensor, "b h w"]]:
+    """Between the logarithms of the planes before and after a depth; where it is among them."""
+    planes = log_planes.shape[1]
     step = torch.diff(log_planes, dim=1).mean(1)[:, None, None]
-    place = ((depth - first) / step).nan_to_num(-1.0)
-    known = known & (place >= 0) & (place <= planes - 1)
+    place = ((depth - log_planes[:, :1, None]) / step).nan_to_num(-1.0)
     below = place.floor().clamp(0, planes - 2)
     fraction = (place - below).clamp(0, 1)
-    log = logits[..., : depth.shape[1], : depth.shape[2]].log_softmax(1)
     index = below.long()[:, None]
-    near = (1 - fraction) * log.gather(1, index)[:, 0] + fraction * log.gather(1, index + 1)[:, 0]
-    return _mean(-near, known)
+    between = (1 - fraction) * log.gather(1, index)[:, 0]
+    between = between + fraction * log.gather(1, index + 1)[:, 0]
+    return between, (place >= 0) & (place <= planes - 1)
 
 
 def angular(angle: Tensor, concentration: Tensor) -> Tensor:

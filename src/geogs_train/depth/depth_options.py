@@ -31,7 +31,7 @@ class TupleOptions(Settings, group="training.tuples"):
     """Most neighbours."""
     least_baseline: Positive = 0.015
     """Baseline over the median depth from which on a view is a good neighbour."""
-    most_baseline: Annotated[float, Range(above="least_baseline", most=10)] = 0.4
+    most_baseline: Annotated[float, Range(above="least_baseline", most=10)] = 0.5
     """Baseline over the median depth up to which it is."""
     dud: Fraction = 0.05
     """Fraction of the neighbours that show another room."""
@@ -57,6 +57,10 @@ class TupleOptions(Settings, group="training.tuples"):
 class DepthLossOptions(Settings, group="training.loss"):
     """Weights of the parts of the loss."""
 
+    edges: Weight = 2.0
+    """How much more the pixels near jumps of depth count."""
+    choice: Weight = 0.1
+    """Weight of the cross-entropy of the depths that are tried near what the planes say."""
     gradient: Weight = 0.5
     """Weight of differences of log depth at four scales."""
     bent: Weight = 0.5
@@ -96,8 +100,9 @@ class DepthTraining(TrainingSchedule):
             height=352,
             views=9,
             sway=0.25,
-            least_density=0.12,
-            most_density=0.9,
+            least_density=0.05,
+            most_density=0.8,
+            thin=0.9,
             motions=MotionWeights(0.3, 0.35, 0.12, 0.05, 0.18),
         )
     )

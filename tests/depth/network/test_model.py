@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from depth_tuples import NETWORK, random_views
-from geogs.depth.network.decoder import bounded, concentration, expected, facing
+from geogs.depth.network.decoder import bounded, concentration, facing
 from geogs.depth.network.layers import Norm, upsampled
 from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.plane_views import cell_rays
+from geogs.depth.network.plane_views import TriedDepths, cell_rays
 from geogs.depth.network.surface_normals import normals_of
 from geogs.depth.network.volume import combined
 from geogs.geometry.camera import Camera
@@ -39,16 +39,6 @@ def test_the_norm_is_that_of_groups():
     torch.testing.assert_close(norm(x), expected_)
 
 
-def test_the_mean_over_planes_equals_a_loop():
-    logits, planes = torch.randn(1, 4, 2, 2), torch.randn(1, 4)
-    found = expected(logits, planes)
-    for row in range(2):
-        for column in range(2):
-            weights = [math.exp(float(v)) for v in logits[0, :, row, column]]
-            mean = sum(w * float(z) for w, z in zip(weights, planes[0], strict=True))
-            assert float(found[0, row, column]) == pytest.approx(mean / sum(weights), abs=1e-5)
-
-
 def test_upsampling_is_a_convex_combination_of_nine():
     x, logits = torch.randn(1, 2, 3, 4), torch.randn(1, 36, 3, 4)
     found = upsampled(x, logits)
@@ -60,6 +50,28 @@ def test_upsampling_is_a_convex_combination_of_nine():
         ]
         mean = sum(w * float(n) for w, n in zip(weights, near, strict=True)) / sum(weights)
         assert float(found[0, 0, row, column]) == pytest.approx(mean, abs=1e-5)
+
+
+def test_upsampling_averages_nothing_across_an_edge():
+    x = torch.tensor([[0.0, 0.01, 1.0], [0.0, 0.01, 1.0], [0.0, 0.01, 1.0]])
+    x = torch.stack([x, 10 * x])[None]  # what lies beside follows the depth
+    logits = torch.randn(1, 36, 3, 3, generator=torch.Generator().manual_seed(1))
+    found = upsampled(x, logits, 0.04)
+    blended = upsampled(x, logits)
+    assert ((blended[0, 0] > 0.05) & (blended[0, 0] < 0.95)).sum() > 5
+    for row in range(6):
+        for column in range(6):
+            i, j, sub = row // 2, column // 2, 2 * (row % 2) + column % 2
+            places = [
+                (min(max(i + k // 3 - 1, 0), 2), min(max(j + k % 3 - 1, 0), 2)) for k in range(9)
+            ]
+            near = [float(x[0, 0, r, c]) for r, c in places]
+            weights = [math.exp(float(logits[0, 4 * k + sub, i, j])) for k in range(9)]
+            best = near[weights.index(max(weights))]
+            some = [(w, n) for w, n in zip(weights, near, strict=True) if abs(n - best) <= 0.04]
+            mean = sum(w * n for w, n in some) / sum(w for w, _ in some)
+            assert float(found[0, 0, row, column]) == pytest.approx(mean, abs=1e-5)
+            assert float(found[0, 1, row, column]) == pytest.approx(10 * mean, abs=1e-4)
 
 
 def test_neighbours_are_weighted_by_a_softmax_of_those_that_see():
@@ -142,7 +154,7 @@ def test_the_order_of_neighbours_and_those_that_are_not_there_do_not_matter():
 def volume_inputs(model: DepthNetwork, views) -> tuple:
     own = torch.randn(1, 8, 8, 8, generator=torch.Generator().manual_seed(1))
     theirs = torch.randn(1, 3, 8, 8, 8, generator=torch.Generator().manual_seed(2))
-    planes = torch.linspace(-1, 1, NETWORK.planes)[None]
+    planes = TriedDepths.planes(torch.linspace(-1, 1, NETWORK.planes)[None])
     return own, theirs[:, : views.others.shape[1]], views, planes
 
 

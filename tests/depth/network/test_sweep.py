@@ -1,12 +1,14 @@
 """Planes in the views of neighbours, against one point after the other."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from geogs.depth.network.plane_views import (
+    TriedDepths,
     cell_rays,
     log_planes,
     sample_cells,
@@ -29,7 +31,7 @@ def test_cells_are_seen_where_points_are_projected():
     height, width = 6, 8
     depths = torch.tensor([[0.7, 1.0, 1.6], [0.01, 2.0, 4.0]])
     rays = cell_rays(lens, height, width)
-    seen = see_planes(rays, depths, T, other, height, width)
+    seen = see_planes(rays, TriedDepths.planes(depths.log()), T, other, height, width)
     step = np.diff(np.log(depths.numpy()), axis=1).mean(1)
     checked = 0
     for b in range(2):
@@ -78,3 +80,29 @@ def test_cells_are_sampled_bilinearly_and_are_nothing_outside():
     torch.testing.assert_close(found[:, 0], by_hand)
     torch.testing.assert_close(found[:, 1], field[0, :, 3, 4])
     assert found[:, 2].abs().max() == 0
+
+
+def test_depths_of_single_cells_of_any_size_are_seen_like_planes():
+    rng = torch.Generator().manual_seed(3)
+    T, lens = (
+        se3_exp(0.1 * torch.randn(1, 6, generator=rng)),
+        torch.tensor([[30.0, 32.0, 15.0, 11.0]]),
+    )
+    planes = torch.tensor([[0.7, 1.0, 1.6]]).log()
+    rays = cell_rays(lens, 12, 16, 2)
+    wanted = [
+        see_planes(rays, replace(TriedDepths.planes(planes), cell=2), T, lens, 12, 16),
+        see_planes(rays, replace(TriedDepths.planes(planes + 0.1), cell=2), T, lens, 12, 16),
+    ]
+    odd = torch.arange(rays.shape[2]) % 2 == 1
+    mixed = torch.where(odd, planes[..., None] + 0.1, planes[..., None])
+    step = torch.diff(planes, dim=1).mean(1)
+    found = see_planes(rays, TriedDepths(mixed, planes, step, 2), T, lens, 12, 16)
+    for name in ("log_z", "angle", "log_step"):
+        one, two = (getattr(w, name) for w in wanted)
+        torch.testing.assert_close(getattr(found, name), torch.where(odd, two, one))
+    expected = torch.where(odd[:, None], wanted[1].cells, wanted[0].cells)
+    torch.testing.assert_close(found.cells, expected)
+    # The centre of a cell of two pixels lies half a pixel further than its first.
+    assert rays[0, 0, 1] - rays[0, 0, 0] == pytest.approx(2 / 30)
+    assert rays[0, 0, 0] == pytest.approx((0.5 - 15) / 30)

@@ -11,12 +11,16 @@ from depth_tuples import NETWORK, random_views
 from geogs.depth.network.model import DepthNetwork
 from geogs_train.depth.depth_loss import (
     CELL_SPREAD,
+    CHOICE,
     angular,
-    coarse_truth,
+    choice_loss,
     depth_loss,
+    from_either,
     gradient_loss,
     outlier_laplace,
     plane_loss,
+    spread_around,
+    surfaces_of_cells,
 )
 from geogs_train.depth.depth_options import DepthLossOptions
 from geogs_train.depth.depth_tuples import DepthBatch
@@ -53,23 +57,67 @@ def test_the_density_of_angles_integrates_to_a_constant():
     assert totals[2] == pytest.approx(totals[1], rel=1e-4)
 
 
-def test_coarse_truth_equals_a_loop():
+def test_surfaces_of_cells_equal_a_loop():
     rng = torch.Generator().manual_seed(3)
     log_depth = 0.02 * torch.rand(1, 8, 12, generator=rng)
     log_depth[0, 4:, 6:] += 1.0
     valid = torch.ones(1, 8, 12, dtype=torch.bool)
     valid[0, 1, 9] = False
-    mean, known = coarse_truth(log_depth, valid, 4)
+    nearest, farthest, known = surfaces_of_cells(log_depth, valid, 4)
     kinds = set()
     for i in range(2):
         for j in range(3):
             cell = log_depth[0, 4 * i : 4 * i + 4, 4 * j : 4 * j + 4]
-            flat = bool(cell.max() - cell.min() < CELL_SPREAD)
+            one = bool(cell.max() - cell.min() < CELL_SPREAD)
             sound = bool(valid[0, 4 * i : 4 * i + 4, 4 * j : 4 * j + 4].all())
-            kinds.add((flat, sound))
-            assert float(mean[0, i, j]) == pytest.approx(float(cell.mean()), abs=1e-6)
-            assert bool(known[0, i, j]) == (flat and sound)
+            kinds.add((one, sound))
+            mean = float(cell.mean())
+            low, high = (mean, mean) if one else (float(cell.min()), float(cell.max()))
+            assert float(nearest[0, i, j]) == pytest.approx(low, abs=1e-6)
+            assert float(farthest[0, i, j]) == pytest.approx(high, abs=1e-6)
+            assert bool(known[0, i, j]) == sound
     assert kinds == {(True, True), (False, True), (True, False)}
+
+
+def test_at_an_edge_either_surface_is_right_and_their_mean_is_not():
+    found = torch.tensor([[[0.1, 0.5, 0.9, 1.0]]])
+    error = from_either(found, torch.full_like(found, 0.1), torch.full_like(found, 0.9))
+    assert error[0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0, 0.1], abs=1e-6)
+
+
+def test_the_spread_around_pixels_equals_a_loop():
+    rng = torch.Generator().manual_seed(6)
+    depth, valid = torch.rand(1, 7, 9, generator=rng), torch.rand(1, 7, 9, generator=rng) < 0.5
+    found = spread_around(depth, valid, 2)
+    for i in range(7):
+        for j in range(9):
+            window = (0, slice(max(i - 2, 0), i + 3), slice(max(j - 2, 0), j + 3))
+            some = depth[window][valid[window]]
+            wanted = float(some.max() - some.min()) if len(some) else -math.inf
+            assert float(found[0, i, j]) == pytest.approx(wanted, abs=1e-6)
+
+
+def test_the_choice_learns_the_depth_that_is_nearest():
+    planes = torch.linspace(-0.55, 0.55, 12)[None]
+    tried = torch.tensor([-0.3, 0.0, 0.02, 0.6]).reshape(1, 4, 1, 1).expand(1, 4, 16, 16)
+    logits = torch.zeros(1, 4, 16, 16, requires_grad=True)
+    torch.manual_seed(0)
+    found = DepthNetwork(NETWORK)(random_views(1, 2, 32, 32))
+    found = replace(found, log_planes=planes, tried=tried, tried_logits=logits)
+    truth = torch.full((1, 32, 32), 0.02)
+    truth[0, 2, 2] = 0.9  # a cell of two surfaces says nothing
+    truth[0, :2, 2:4] = 0.3  # nor does one that nothing tried lies on
+    valid = torch.ones(1, 32, 32, dtype=torch.bool)
+    weights = [math.exp(-abs(float(z) - 0.02) / 0.1 / CHOICE) for z in tried[0, :, 0, 0]]
+    wanted = [w / sum(weights) for w in weights]
+    loss = choice_loss(found, truth, valid)
+    assert float(loss.detach()) == pytest.approx(math.log(4), rel=1e-5)
+    loss.backward()
+    for k in range(4):
+        slope = float(logits.grad[0, k, 0, 0])
+        assert slope == pytest.approx((0.25 - wanted[k]) / 254, rel=1e-3)
+    assert logits.grad[0, :, 0, 1].abs().max() == 0
+    assert logits.grad[0, :, 1, 1].abs().max() == 0
 
 
 def test_differences_of_errors_equal_a_loop():
@@ -105,6 +153,16 @@ def test_the_cross_entropy_of_planes_equals_a_loop():
         total.append(-(1 - share) * float(log[below]) - share * float(log[below + 1]))
     found = plane_loss(logits, planes, truth, torch.ones(1, 8, 8, dtype=torch.bool))
     assert float(found) == pytest.approx(sum(total) / 3, rel=1e-5)
+
+
+def test_in_a_cell_of_two_surfaces_the_planes_of_either_are_right():
+    planes = torch.linspace(-1, 1, 5)[None]
+    logits = torch.randn(1, 5, 1, 1, generator=torch.Generator().manual_seed(7))
+    truth = torch.full((1, 4, 4), -0.5)
+    truth[0, :, 2:] = 1.0
+    p = logits[0, :, 0, 0].softmax(0)
+    found = plane_loss(logits, planes, truth, torch.ones(1, 4, 4, dtype=torch.bool))
+    assert float(found) == pytest.approx(-math.log(0.5 * float(p[1] + p[4])), rel=1e-5)
 
 
 def batch_of(depth: torch.Tensor) -> DepthBatch:

@@ -2,20 +2,27 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from geogs.depth.network.close_search import COUNT, chosen, close_depths, plane_modes
 from geogs.depth.network.layers import Block, Residual, doubled, upsampled
 from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs.depth.network.plane_views import cell_rays
-from geogs.depth.network.stereo_views import DepthPrediction
+from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.surface_normals import normals_of
+from geogs.depth.network.volume import PlaneVolume
 
-MOST_RESIDUAL = 2.0
-"""Steps between planes by which a depth may be moved away from what the planes say."""
+MOST_RESIDUAL = 1.0
+"""Steps between planes by which a depth may be moved away from what was chosen."""
+APART = 0.04
+"""Relative distance of depths from which on they are of two surfaces, and not averaged."""
+_ABOUT = 5
+"""Numbers beside the scores of the depths tried at 1/2."""
 LEAST_LOG_SCALE, MOST_LOG_SCALE = -6.5, 0.0
 """Bounds of the logarithm of the Laplace scale of log depth."""
 MOST_CONCENTRATION = 500.0
@@ -55,72 +62,93 @@ class VolumeNetwork(nn.Module):
 
 
 class DepthReadout(nn.Module):
-    """Reads the result off the features of the volume at 1/4 and the context at 1/2."""
+    """Reads the result off the features of the volume at 1/4 and the context at 1/2, with a second
+    search there."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
         deep, wide = options.volume[0], options.decoder
         self.planes = nn.Sequential(Block(deep, deep), nn.Conv2d(deep, options.planes, 1))
         self.to_half = nn.Sequential(Block(deep, deep), nn.Conv2d(deep, 36, 1))
-        self.join = nn.Sequential(Block(deep + options.context[0] + 2, wide), Residual(wide))
+        fine = replace(options, groups=options.fine_groups, matching=options.fine_matching)
+        self.close = PlaneVolume(fine)
+        beside = options.context[0] + 2 + COUNT + _ABOUT
+        self.join = nn.Sequential(Block(deep + beside, wide), Residual(wide))
+        self.choice = nn.Sequential(Block(wide, wide), nn.Conv2d(wide, COUNT, 1))
         self.depth = nn.Sequential(Block(wide, wide), nn.Conv2d(wide, 3, 1))
         self.normal = nn.Sequential(Block(wide + 5, wide), nn.Conv2d(wide, 4, 1))
         self.to_full = nn.Sequential(Block(wide, wide), nn.Conv2d(wide, 36, 1))
         for head in (self.depth, self.normal):
-            for parameter in head[-1].parameters():  # at first, what the planes say
+            for parameter in head[-1].parameters():  # at first, what was chosen
                 nn.init.normal_(parameter, std=1e-3)
 
     def forward(
         self,
         features: Float[Tensor, "b c h4 w4"],
         context: Float[Tensor, "b x h2 w2"],
+        fine: Float[Tensor, "b v f h2 w2"],
         log_planes: Float[Tensor, "b d"],
-        intrinsics: Float[Tensor, "b 4"],
+        views: StereoViews,
         scores: Float[Tensor, "b d h4 w4"],
     ) -> DepthPrediction:
-        device = features.device.type
+        """``fine`` is what is matched at 1/2: that of the keyframe first."""
+        with torch.autocast(features.device.type, enabled=False):
+            step = torch.diff(log_planes, dim=1).mean(1)
         logits = self.planes(features).float()
-        with torch.autocast(device, enabled=False):
-            at_quarter = expected(logits, log_planes)
         to_half = self.to_half(features)
-        with torch.autocast(device, enabled=False):
-            coarse = upsampled(at_quarter[:, None], to_half)
-        height, width = coarse.shape[-2:]
-        rays = cell_rays(intrinsics, height, width, 2).unflatten(2, (height, width))
+        with torch.autocast(features.device.type, enabled=False):
+            modes = plane_modes(logits, log_planes)
+            coarse = upsampled(modes.first[:, None], to_half, APART)
+            tried, about = close_depths(modes, coarse[:, 0], step)
+            found = self.close(fine[:, 0], fine[:, 1:], views, tried)
         local = coarse - functional.avg_pool2d(coarse, 5, 1, 2, count_include_pad=False)
-        joined = torch.cat([doubled(features), context, coarse, 10 * local], 1)
-        x = self.join(joined)
+        x = self.join(torch.cat([doubled(features), context, coarse, 10 * local, found, about], 1))
+        choice = found[:, :COUNT] + self.choice(x).float()
         raw = self.depth(x).float()
-        step = torch.diff(log_planes, dim=1).mean(1)[:, None, None, None]
-        at_half = coarse + MOST_RESIDUAL * step * raw[:, :1].tanh()
-        with torch.autocast(device, enabled=False):
-            bent = normals_of(at_half[:, 0].detach(), rays)
+        with torch.autocast(features.device.type, enabled=False):
+            depths = tried.log_depth.unflatten(2, coarse.shape[-2:])
+            # What was searched passes no gradient on; what it was searched around learns here.
+            depths = depths + (coarse - coarse.detach())
+            aside = MOST_RESIDUAL * step[:, None, None] * raw[:, 0].tanh()
+            at_half = chosen(choice, depths, step) + aside
+        fine_maps = self._at_full(x, at_half, raw[:, 1:], views.intrinsics)
+        return DepthPrediction(
+            **fine_maps,
+            at_half=at_half,
+            at_quarter=modes.first,
+            tried=depths,
+            tried_logits=choice,
+            plane_logits=logits,
+            plane_scores=scores,
+            log_planes=log_planes,
+        )
+
+    def _at_full(
+        self,
+        x: Float[Tensor, "b c h2 w2"],
+        at_half: Float[Tensor, "b h2 w2"],
+        raw: Float[Tensor, "b 2 h2 w2"],
+        intrinsics: Float[Tensor, "b 4"],
+    ) -> dict[str, Tensor]:
+        """The prediction's maps of the image's size, by their names."""
+        height, width = at_half.shape[-2:]
+        rays = cell_rays(intrinsics, height, width, 2).unflatten(2, (height, width))
+        with torch.autocast(x.device.type, enabled=False):
+            bent = normals_of(at_half.detach(), rays)
         tilt = self.normal(torch.cat([x, bent, rays[:, :2]], 1)).float()
         to_full = self.to_full(x)
-        with torch.autocast(device, enabled=False):
+        with torch.autocast(x.device.type, enabled=False):
             normal = facing(tilt[:, :3] + bent, rays)
-            numbers = torch.cat([at_half, raw[:, 1:], normal, tilt[:, 3:]], 1)
-            fine = upsampled(numbers, to_full)
+            numbers = torch.cat([at_half[:, None], raw, normal, tilt[:, 3:]], 1)
+            fine = upsampled(numbers, to_full, APART)
             own = cell_rays(intrinsics, 2 * height, 2 * width, 1).unflatten(2, (2 * height, -1))
-            return DepthPrediction(
-                log_depth=fine[:, 0],
-                log_scale=bounded(fine[:, 1]),
-                outlier=fine[:, 2] + _LIKELY,
-                normal=facing(fine[:, 3:6], own),
-                concentration=concentration(fine[:, 6]),
-                at_half=at_half[:, 0],
-                at_quarter=at_quarter,
-                plane_logits=logits,
-                plane_scores=scores,
-                log_planes=log_planes,
-            )
-
-
-def expected(
-    logits: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d"]
-) -> Float[Tensor, "b h w"]:
-    """Mean logarithm of depth of the distribution over the planes."""
-    return (logits.softmax(1) * log_planes[:, :, None, None]).sum(1)
+            return {
+                "log_depth": fine[:, 0],
+                "log_scale": bounded(fine[:, 1]),
+                "outlier": fine[:, 2] + _LIKELY,
+                "normal": facing(fine[:, 3:6], own),
+                "concentration": concentration(fine[:, 6]),
+            }
 
 
 def bounded(raw: Tensor) -> Tensor:

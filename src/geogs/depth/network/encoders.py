@@ -11,7 +11,7 @@ from geogs.depth.network.plane_views import cell_rays
 
 
 class MatchingEncoder(nn.Module):
-    """Features of one length at 1/4, alike in all views."""
+    """Features of one length at 1/4, and others at 1/2, alike in all views."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -23,11 +23,17 @@ class MatchingEncoder(nn.Module):
         self.at_eighth = nn.Sequential(Block(quarter, eighth, 4), Residual(eighth))
         self.back = nn.Conv2d(eighth, quarter, 1)
         self.out = nn.Sequential(Block(quarter, quarter), nn.Conv2d(quarter, options.matching, 1))
+        self.back_to_half = nn.Conv2d(quarter, half, 1)
+        self.fine = nn.Sequential(Block(half, half), nn.Conv2d(half, options.fine_matching, 1))
 
-    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h4 w4"]:
-        quarter = self.at_quarter(self.at_half(images))
-        found = self.out(quarter + doubled(self.back(self.at_eighth(quarter))))
-        return found.shape[1] ** 0.5 * functional.normalize(found.float(), dim=1)
+    def forward(
+        self, images: Float[Tensor, "n 3 h w"]
+    ) -> tuple[Float[Tensor, "n c h4 w4"], Float[Tensor, "n f h2 w2"]]:
+        half = self.at_half(images)
+        quarter = self.at_quarter(half)
+        joined = quarter + doubled(self.back(self.at_eighth(quarter)))
+        fine = self.fine(half + doubled(self.back_to_half(joined)))
+        return _of_one_length(self.out(joined)), _of_one_length(fine)
 
 
 class ContextEncoder(nn.Module):
@@ -58,3 +64,7 @@ def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
     """Each colour of each image without its mean, and all by the image's contrast."""
     centred = images - images.mean((2, 3), keepdim=True)
     return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
+
+
+def _of_one_length(features: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    return features.shape[1] ** 0.5 * functional.normalize(features.float(), dim=1)

@@ -1,9 +1,10 @@
 """The depth network: a keyframe and posed neighbours to depth, deviation, normals, confidence.
 
 A plane sweep with learned features whose scores become the channels of a 2D network (after
-SimpleRecon), with weights for each neighbour's visibility (after CVA-MVSNet), depth as the mean
-over planes with a bounded correction, and a deviation and normals with a concentration trained by
-their likelihoods. It sees lengths relative to the typical depth only.
+SimpleRecon), with weights for each neighbour's visibility (after CVA-MVSNet); depth around the
+likeliest plane; a second search at 1/2 near that depth and on either side of edges (as in the
+cascades of multi-view stereo), one of whose depths is chosen; and a deviation and normals with a
+concentration trained by their likelihoods. It sees lengths relative to the typical depth only.
 """
 
 from dataclasses import replace
@@ -19,7 +20,7 @@ from geogs.depth.network.decoder import DepthReadout, VolumeNetwork
 from geogs.depth.network.depth_calibration import DepthCalibration
 from geogs.depth.network.encoders import ContextEncoder, MatchingEncoder, normalised
 from geogs.depth.network.network_sizes import DepthNetworkOptions
-from geogs.depth.network.plane_views import log_planes
+from geogs.depth.network.plane_views import TriedDepths, log_planes
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.volume import PlaneVolume
 from geogs.networks.tensor_files import load_trained
@@ -53,16 +54,17 @@ class DepthNetwork(nn.Module):
         images = _padded(normalised(images.flatten(0, 1)))
         device = views.image.device.type
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
-            features = self.matching(images).unflatten(0, (len(views.image), -1))
+            coarse, fine = (x.unflatten(0, (len(views.image), -1)) for x in self.matching(images))
             images = images.unflatten(0, (len(views.image), -1))
             context = self.context(images[:, 0], views.intrinsics)
             with torch.autocast(device, enabled=False):
                 planes = log_planes(
                     views.near / views.typical, views.far / views.typical, self.options.planes
                 )
-                volume = self.volume(features[:, 0], features[:, 1:], views, planes)
+                tried = TriedDepths.planes(planes)
+                volume = self.volume(coarse[:, 0], coarse[:, 1:], views, tried)
             body = self.body(volume, context[1:])
-            found = self.readout(body, context[0], planes, views.intrinsics, volume[:, :-1])
+            found = self.readout(body, context[0], fine, planes, views, volume[:, :-1])
         return _cropped(found, height, width)
 
 

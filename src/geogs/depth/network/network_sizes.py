@@ -18,6 +18,10 @@ class DepthNetworkOptions(Settings, group="training.network"):
     """Groups of channels whose correlations are kept apart; divides ``matching``."""
     matching: Annotated[int, Range("groups", 4096)] = 32
     """Channels of what is matched between views."""
+    fine_groups: Annotated[int, Range(1, 64)] = 4
+    """The same of the search at 1/2; divides ``fine_matching``."""
+    fine_matching: Annotated[int, Range("fine_groups", 4096)] = 16
+    """Channels of what is matched there."""
     encoder: tuple[Channels, ...] = (24, 48, 96)
     """Channels of the matching encoder at 1/2, 1/4 and 1/8."""
     context: tuple[Channels, ...] = (32, 48, 80, 128, 176)

@@ -11,14 +11,35 @@ from torch import Tensor
 from torch.nn import functional
 
 CELL = 4
-"""Pixels per cell of the features; cell i covers the pixels 4 i to 4 i + 3."""
+"""Pixels per cell of the coarse features; cell i covers the pixels 4 i to 4 i + 3."""
 LEAST_Z = 0.02
 """Depth in a neighbour, over the typical depth, below which nothing is seen."""
 
 
 @dataclass(frozen=True)
+class TriedDepths:
+    """Depths that are tried in every cell of keyframes; logarithms are of depth over the typical
+    one."""
+
+    log_depth: Float[Tensor, "b d #p"]
+    """The same for all cells where they are planes."""
+    label: Float[Tensor, "b d"]
+    """What a network is told of each."""
+    step: Float[Tensor, "b"]
+    """From one to the next, about."""
+    cell: int = CELL
+    """Pixels per cell."""
+
+    @staticmethod
+    def planes(log_planes: Float[Tensor, "b d"]) -> "TriedDepths":
+        """Evenly spaced planes."""
+        step = torch.diff(log_planes, dim=1).mean(1)
+        return TriedDepths(log_planes[..., None], log_planes, step)
+
+
+@dataclass(frozen=True)
 class PlaneViews:
-    """The cells of keyframes, on every plane, as one neighbour each sees them."""
+    """The cells of keyframes, at every depth tried, as one neighbour each sees them."""
 
     cells: Float[Tensor, "b d p 2"]
     """x, y among the neighbour's cells."""
@@ -29,7 +50,7 @@ class PlaneViews:
     angle: Float[Tensor, "b d p"]
     """Between the two rays, radians."""
     log_step: Float[Tensor, "b d p"]
-    """Logarithm of the pixels that a cell moves from this plane to the next."""
+    """Logarithm of the pixels that a cell moves from this depth to the next."""
 
 
 def log_planes(
@@ -54,7 +75,7 @@ def cell_rays(
 
 def see_planes(
     rays: Float[Tensor, "b 3 p"],
-    depths: Float[Tensor, "b d"],
+    tried: TriedDepths,
     T: Float[Tensor, "b 4 4"],
     intrinsics: Float[Tensor, "b 4"],
     height: int,
@@ -62,11 +83,11 @@ def see_planes(
 ) -> PlaneViews:
     """Where cells at these depths are in a neighbour with ``height`` x ``width`` cells.
 
-    ``T`` takes points of the keyframe's camera to the neighbour's; its translation and the depths
-    are over the typical depth.
+    ``T`` takes points of the keyframe's camera to the neighbour's; its translation is over the
+    typical depth.
     """
     rotated = T[:, :3, :3] @ rays
-    z = depths[:, None, :, None]
+    z = tried.log_depth.exp()[:, None]
     point = z * rotated[:, :, None] + T[:, :3, 3, None, None]
     focal, centre = (intrinsics[:, k, None, None] for k in (slice(0, 2), slice(2, 4)))
     depth = point[:, 2]
@@ -74,12 +95,12 @@ def see_planes(
     pixels = focal * (point[:, :2] / safe[:, None]) + centre
     # d pixel / d log z is z d pixel / dz.
     slope = rotated[:, :2, None] - point[:, :2] / safe[:, None] * rotated[:, 2:, None]
-    step = torch.diff(depths.log(), dim=1).mean(1)[:, None, None]
-    moved = (focal * slope * (z / safe[:, None])).square().sum(1).sqrt() * step
+    moved = (focal * slope * (z / safe[:, None])).square().sum(1).sqrt()
+    moved = moved * tried.step[:, None, None]
     cosine = (rotated[:, :, None] * point).sum(1) / (
         rays.norm(dim=1)[:, None] * point.square().sum(1).sqrt().clamp_min(1e-6)
     )
-    cells = (pixels - (CELL - 1) / 2) / CELL
+    cells = (pixels - (tried.cell - 1) / 2) / tried.cell
     x, y = cells.unbind(1)
     inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
     return PlaneViews(

@@ -56,6 +56,10 @@ class DepthPrediction:
     """``log_depth`` at 1/2; cell i covers the pixels 2 i and 2 i + 1."""
     at_quarter: Float[Tensor, "b h4 w4"]
     """``log_depth`` at 1/4 before it was refined."""
+    tried: Float[Tensor, "b e h2 w2"]
+    """``log_depth`` that was tried at 1/2."""
+    tried_logits: Float[Tensor, "b e h2 w2"]
+    """Logits of these."""
     plane_logits: Float[Tensor, "b d h4 w4"]
     """Logits of the planes at 1/4."""
     plane_scores: Float[Tensor, "b d h4 w4"]

@@ -1,11 +1,17 @@
-"""How well each plane fits each pixel of a keyframe: scores of all neighbours, by visibility."""
+"""How well each depth fits each cell of a keyframe: scores of all neighbours, by visibility."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from geogs.depth.network.network_sizes import DepthNetworkOptions
-from geogs.depth.network.plane_views import PlaneViews, cell_rays, sample_cells, see_planes
+from geogs.depth.network.plane_views import (
+    PlaneViews,
+    TriedDepths,
+    cell_rays,
+    sample_cells,
+    see_planes,
+)
 from geogs.depth.network.rating import rate_planes
 from geogs.depth.network.stereo_views import StereoViews
 
@@ -56,7 +62,7 @@ class PlaneScorer(nn.Module):
 
 
 class PlaneVolume(nn.Module):
-    """Scores of all planes over all neighbours."""
+    """Scores of all depths that are tried over all neighbours."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -67,14 +73,11 @@ class PlaneVolume(nn.Module):
         own: Float[Tensor, "b c h w"],
         theirs: Float[Tensor, "b k c h w"],
         views: StereoViews,
-        log_planes: Float[Tensor, "b d"],
+        tried: TriedDepths,
     ) -> Float[Tensor, "b d1 h w"]:
-        """A score for each plane, and the fraction of planes and neighbours that see a cell.
-
-        ``log_planes`` are over the typical depth.
-        """
+        """A score for each depth, and the fraction of depths and neighbours that see a cell."""
         height, width = own.shape[-2:]
-        rays = cell_rays(views.intrinsics, height, width)
+        rays = cell_rays(views.intrinsics, height, width, tried.cell)
         own, theirs = own.float().contiguous(), theirs.float().contiguous()
         pixel = torch.cat([rays[:, :2], _roughness(own)], 1)
         scores, weights, masks = [], [], []
@@ -82,9 +85,9 @@ class PlaneVolume(nn.Module):
             T = views.T_nk[:, k].clone()
             T[:, :3, 3] /= views.typical[:, None]
             lens = views.other_intrinsics[:, k]
-            seen = see_planes(rays, log_planes.exp(), T, lens, height, width)
-            pose = _pose_numbers(T)[:, None].expand(-1, log_planes.shape[1], -1)
-            plane = torch.cat([log_planes[..., None], pose], -1)
+            seen = see_planes(rays, tried, T, lens, height, width)
+            pose = _pose_numbers(T)[:, None].expand(-1, tried.label.shape[1], -1)
+            plane = torch.cat([tried.label[..., None], pose], -1)
             rated = self.scorer(own.flatten(2), theirs[:, k], seen, pixel, plane)
             scores.append(rated[:, 0])
             weights.append(rated[:, 1])
