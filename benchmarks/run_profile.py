@@ -40,7 +40,9 @@ from geogs.threads import on_one_torch_thread, worker_count
 STARTS = {
     "geogs run --help": "from geogs.cli.main import main; main(['run', '--help'])",
     "import torch": "import torch",
-    "imports of geogs run": "import geogs.application.run, geogs.application.terminal_progress",
+    "imports of geogs run": (
+        "import geogs.application.run, geogs.application.progress.terminal_progress"
+    ),
 }
 """What a process of its own does before it ends."""
 LEAST_SHARE = 0.01

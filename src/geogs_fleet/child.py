@@ -49,8 +49,8 @@ def compute(settings: RunSettings) -> None:
     Raises:
         InputError, TrackingLost, OutputError, DeviceError: as of a run.
     """
+    from geogs.application.progress.terminal_progress import TerminalProgress
     from geogs.application.run import resume, run
-    from geogs.application.terminal_progress import TerminalProgress
 
     output = settings.output
     assert output is not None, "a fleet gives every source a folder"

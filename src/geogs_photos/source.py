@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from geogs.application.interrupt import Stop
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.documents import UNUSABLE, expanded, read_json
 from geogs.errors import InputError

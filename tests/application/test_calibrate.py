@@ -11,7 +11,7 @@ import pytest
 
 from geogs.application.calibrate import refined, self_calibrated
 from geogs.application.interrupt import Interruption
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_source

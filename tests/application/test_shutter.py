@@ -9,8 +9,8 @@ import pytest
 from geogs.application.calibrate import with_shutter_found
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.summary import source_summary
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source

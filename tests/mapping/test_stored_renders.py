@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from depth_scene import make_scene
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.result_page import write_report
 from geogs.application.results.surfaces import fusion_views, splat_colours, write_surface
-from geogs.application.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.rendered import SurfaceRules, rendered_keyframe

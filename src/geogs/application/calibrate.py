@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 
 from geogs.application.interrupt import Stop
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.config import Config
 from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.frame_source import Source

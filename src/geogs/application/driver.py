@@ -14,11 +14,11 @@ from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation
 from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result, Written
 from geogs.application.results.surfaces import write_depth_mesh
 from geogs.application.results.write import write_files
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import ReconstructSettings, RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.errors import DeviceError, OutputError

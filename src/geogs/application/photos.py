@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 
 from geogs.application.chosen_frames import ChosenFrames
 from geogs.application.interrupt import Stop
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

@@ -18,10 +18,10 @@ from geogs.application.machine.device import compiled_kernels, full_memory_in_a_
 from geogs.application.output_cost import OutputForecast
 from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result, Written
 from geogs.application.results.surfaces import Snapshots
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import ReconstructSettings
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings

@@ -6,8 +6,8 @@ import shlex
 from geogs.application.chosen_frames import stretch_length
 from geogs.application.fallback import impossible, is_wanted
 from geogs.application.photos import has_pycolmap, seconds_to_place
+from geogs.application.progress.run_forecast import RunPlan
 from geogs.application.results.verdict import Verdict
-from geogs.application.run_forecast import RunPlan
 from geogs.application.run_settings import RunSettings
 from geogs.config import InputConfig, preset_of
 from geogs.evaluation.duration import duration

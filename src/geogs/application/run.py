@@ -17,12 +17,12 @@ from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
+from geogs.application.progress.run_forecast import RunPlan
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.run_forecast import RunPlan
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
 from geogs.application.slam_in_python import go_on_in

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.result import Result
 from geogs.application.run import run as run_to_folder
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.config import Config
 

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from geogs.application.calibrate import self_calibrated, with_shutter_found
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.write import write_config
-from geogs.application.run_progress import RunProgress
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device

@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
     sequence = find_sequence(options.name)
 
     from geogs.application.download.download import download
-    from geogs.application.terminal_progress import TerminalProgress
+    from geogs.application.progress.terminal_progress import TerminalProgress
 
     with TerminalProgress(options) as progress:
         progress.write(f"{sequence.name}: licence {sequence.licence}, see {sequence.page}")

@@ -11,8 +11,8 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse_options(RemeshSettings, argv, "mesh", _defaults)
 
+    from geogs.application.progress.terminal_progress import TerminalProgress
     from geogs.application.results.remesh import remesh
-    from geogs.application.terminal_progress import TerminalProgress
 
     with TerminalProgress() as progress:
         path = remesh(options, progress)

@@ -9,8 +9,8 @@ from geogs.application.run_settings import RunSettings, Verbosity
 from geogs.errors import TrackingLost
 
 if TYPE_CHECKING:
+    from geogs.application.progress.run_progress import RunProgress
     from geogs.application.results.result import Written
-    from geogs.application.run_progress import RunProgress
 
 
 NOT_JUDGED = (
@@ -27,7 +27,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
     Raises:
         TrackingLost: there is no mesh in the end, of a work that nobody stopped; the rest is kept.
     """
-    from geogs.application.terminal_progress import TerminalProgress
+    from geogs.application.progress.terminal_progress import TerminalProgress
 
     begin = time.perf_counter()
     if options.verbose:

@@ -3,8 +3,8 @@
 from dataclasses import asdict, replace
 
 from geogs.application.interrupt import Interruption
+from geogs.application.progress.terminal_progress import TerminalProgress
 from geogs.application.run_settings import ReconstructSettings, RunSettings
-from geogs.application.terminal_progress import TerminalProgress
 from geogs.cli import reconstruct as reconstruct_command
 from geogs.cli import run as run_command
 from geogs.cli.options import record

@@ -10,9 +10,9 @@ from geogs.application.calibrate import with_shutter_found
 from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun, run_state
 from geogs.application.prior_choice import open_prior
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.result import Result
 from geogs.application.results.write import write_results
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device

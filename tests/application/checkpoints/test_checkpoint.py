@@ -25,7 +25,7 @@ from geogs.application.checkpoints.checkpoint import (
     has_checkpoint,
     write_checkpoint,
 )
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.errors import InputError, OutputError
 from geogs.stopwatch import Stopwatch
 from geogs.version import __version__

@@ -17,8 +17,8 @@ from safetensors.torch import load_file
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, run_state
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.saved_result import load_result
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli
 from geogs.config import InputConfig

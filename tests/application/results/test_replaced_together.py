@@ -18,6 +18,7 @@ from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.evaluate import evaluate
 from geogs.application.export.export import export
 from geogs.application.interrupt import Stop
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.result_settings import (
     EvalSettings,
     ExportSettings,
@@ -30,7 +31,6 @@ from geogs.application.results import surfaces
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import write_stage
-from geogs.application.run_progress import RunProgress
 from geogs.application.run_settings import RunSettings
 from geogs.cli.main import main
 from geogs.config import Config, InputConfig, MeshConfig

@@ -19,7 +19,7 @@ from safetensors.torch import load, save
 
 from geogs.application.checkpoints.folder import FORMAT, CheckpointFolder
 from geogs.application.machine.device import is_gpu_failure
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError, OutputError
 from geogs.stopwatch import Stopwatch

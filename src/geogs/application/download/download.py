@@ -6,8 +6,8 @@ from pathlib import Path
 from geogs.application.download.fetch import fetch
 from geogs.application.download.sequences import PublicSequence
 from geogs.application.download.unpack import unpack
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed
-from geogs.application.run_progress import RunProgress
 
 
 def download(sequence: PublicSequence, into: Path, progress: RunProgress | None = None) -> Path:

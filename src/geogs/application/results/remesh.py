@@ -3,12 +3,12 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.result_settings import RemeshSettings
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.result_page import write_page_anew
 from geogs.application.results.saved_result import SavedResult, load_result, result_folder
 from geogs.application.results.surfaces import fusion_views
-from geogs.application.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.config.old_names import present_values
 from geogs.documents import UNUSABLE, read_yaml

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.verdict import Verdict, verdict
-from geogs.application.run_progress import RunProgress
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.io.sources.frame_source import Source

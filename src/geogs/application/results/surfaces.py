@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.mapped_scene import MappedScene
-from geogs.application.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.writers.map_file import save_map

@@ -1,6 +1,6 @@
 """Brings a run's map to metres, at its end."""
 
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.scale.known_length import KnownLength, SensorScale, find_scale
 from geogs.application.scale.measurable_scene import (
     MeasurableScene,

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from geogs.application.machine.device import peak_memory
-from geogs.application.run_forecast import RunForecast, RunPlan
-from geogs.application.run_progress import RunProgress
+from geogs.application.progress.run_forecast import RunForecast, RunPlan
+from geogs.application.progress.run_progress import RunProgress
 from geogs.application.run_settings import Verbosity
 from geogs.errors import OutputError
 from geogs.evaluation.duration import duration

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from geogs.application.run_forecast import RunPlan
+    from geogs.application.progress.run_forecast import RunPlan
     from geogs.pose_estimate import PoseEstimate
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geogs.application.run_forecast import RunForecast, RunPlan
+from geogs.application.progress.run_forecast import RunForecast, RunPlan
 from geogs.config import Config
 
 RUNS = json.loads((Path(__file__).parents[1] / "fixtures" / "run_events.json").read_text())

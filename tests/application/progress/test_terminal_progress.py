@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from geogs.application import terminal_progress
+from geogs.application.progress import terminal_progress
+from geogs.application.progress.terminal_progress import TerminalProgress
 from geogs.application.run_settings import Verbosity
-from geogs.application.terminal_progress import TerminalProgress
 from geogs.errors import OutputError
 from geogs.pose_estimate import PoseEstimate
 from geogs.world.segments import TrackState

@@ -1,0 +1,1 @@
+"""How far a run is, what it says of it, and how long it still takes."""
