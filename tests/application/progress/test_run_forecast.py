@@ -13,7 +13,7 @@ import pytest
 from geogs.application.progress.run_forecast import RunForecast, RunPlan
 from geogs.config import Config
 
-RUNS = json.loads((Path(__file__).parents[1] / "fixtures" / "run_events.json").read_text())
+RUNS = json.loads((Path(__file__).parents[2] / "fixtures" / "run_events.json").read_text())
 
 
 class Played:
