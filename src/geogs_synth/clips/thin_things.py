@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from geogs_synth.clips.pieces import FloorPose, Numbers, StandingPiece, boxes, stand
 from geogs_synth.draw import Draw
-from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids
+from geogs_synth.scene.solids import FRUSTUM, SolidBatch, Solids
 
 BALUSTERS, BARS, SEGMENTS, TWIGS = 12, 5, 5, 12
 """Of a railing; of a lattice, each way; of a cable; of a bush."""
@@ -72,14 +72,13 @@ def bushes(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     length = reach * draw.uniform(0.3, 1.0, *n, TWIGS)
     wide = draw.log_uniform(0.002, 0.05, *n)[..., None].expand(*n, TWIGS)
     thick = wide * draw.uniform(0.2, 1.0, *n)[..., None]
-    kind = draw.choose((0.3, 0.4, 0.3), *n)[..., None].expand(*n, TWIGS)
+    kind = draw.choose((0.3, 0.4, 0.3), *n)[..., None].expand(*n, TWIGS)  # box, frustum, ellipsoid
     # A frustum's first two numbers are the radii of its ends.
     half = torch.stack([wide, torch.where(kind == FRUSTUM, 0.5 * wide, thick), length], -1)
     centre = reach[..., None] * draw.normal(0.45, *n, TWIGS, 3)
     middle = draw.uniform(0.1, 1.0, *n)[..., None] * (size[:, None, 2:] - 0.2)
     centre[..., 2] = centre[..., 2] + middle
     piece = Solids(kind, draw.rotation(*n, TWIGS), centre, half)
-    assert (BOX, FRUSTUM, ELLIPSOID) == (0, 1, 2)  # what is drawn above
     return piece, stand(draw, size, reach.expand(*n, 2), 0.2)
 
 
