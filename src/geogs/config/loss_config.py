@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from geogs.config.setting import Fraction, Only, Positive, Range, Settings, Weight
+from geogs.config.setting import CountOrZero, Fraction, Only, Positive, Range, Settings, Weight
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,10 @@ class LossConfig(Settings, group="mapping.loss"):
 
     depth_weight: Weight = 0.15
     """L_d, rendered depth against the keyframe's depth."""
+    edge_factor: Weight = 5.0
+    """How much more L_d weighs near jumps of the keyframe's depth, where disks end."""
+    edge_reach: CountOrZero = 3
+    """Pixels of the render around such a jump that are near it."""
     measured_factor: Annotated[Weight, Only("run")] = 13.0
     """How much more L_d weighs in keyframes whose depth a sensor measured."""
     normal_weight: Annotated[Weight, Only("run")] = 0.05

@@ -41,7 +41,7 @@ def depth_engine(
         return network
     from geogs.depth.network.joint import JointDepthEngine
 
-    return JointDepthEngine(network, classical)
+    return JointDepthEngine(network, classical, render)
 
 
 def _classical(

@@ -12,6 +12,7 @@ from torch import Tensor
 from geogs.config import LossConfig, MappingConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
+from geogs.geometry.jumps import depth_jumps
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
 from geogs.mapping.dense_depths import get_depth, put_depth
@@ -63,6 +64,10 @@ class LoadedView:
     """Grey images of the :class:`DepthView`, once it was asked for."""
     is_depth_written: bool = True
     is_render_written: bool = True
+
+
+SURE = 0.5
+"""Least confidence of depths whose jumps count as edges."""
 
 
 class ViewArrays:
@@ -231,9 +236,12 @@ class ViewArrays:
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w 3"] | None]:
         """Depth, its weight in L_d, and normals: a prior's, else those that came with the depth."""
         is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
+        weight = depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
+        sure = torch.where(depth.confidence >= SURE, depth.depth, 0.0)
+        at_edges = depth_jumps(sure).around(self.loss.edge_reach)
         return (
             depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE),
-            depth.confidence * (self.loss.measured_factor if is_measured else 1.0),
+            torch.where(at_edges, self.loss.edge_factor * weight, weight),
             depth.normal if loaded.normal is None else loaded.normal,
         )
 

@@ -11,7 +11,7 @@ from depth_scene import make_scene
 from geogs.config import DepthConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.engine_choice import depth_engine
-from geogs.depth.network.joint import AGREE, APART, REACH, joined
+from geogs.depth.network.joint import AGREE, APART, REACH, VOTE, joined
 from geogs.geometry.camera import Camera
 
 
@@ -36,15 +36,15 @@ def precision(c: float) -> float:
 
 def test_two_depths_are_joined_as_a_loop_does():
     first, second = random_depth(0, False), random_depth(1, True)
-    found = joined(first, second)
+    vote = 0.3 * torch.randn(9, 12, generator=torch.Generator().manual_seed(2))
+    found = joined(first, second, vote)
     agreeing = 0
     for y in range(9):
         for x in range(12):
             z = [float(d.depth[y, x]) for d in (first, second)]
             c = [float(d.confidence[y, x]) for d in (first, second)]
-            around = (slice(max(y - 3, 0), y + 4), slice(max(x - 3, 0), x + 4))
-            mean = [float(d.confidence[around].sum()) for d in (first, second)]
-            winner = 0 if mean[0] > mean[1] else 1
+            choice = VOTE[0] * float(vote[y, x]) + VOTE[1]
+            winner = 1 if choice >= 0 else 0
             if abs(math.log(z[0] / z[1])) < REACH:
                 agreeing += 1
                 w = [precision(v) ** 2 for v in c]
@@ -52,7 +52,8 @@ def test_two_depths_are_joined_as_a_loop_does():
                 score = AGREE[0] * logit(max(c)) + AGREE[1] * logit(min(c)) + AGREE[2]
             else:
                 depth = z[winner]
-                score = APART[0] * logit(c[winner]) + APART[1] * logit(c[1 - winner]) + APART[2]
+                score = APART[0] * logit(c[winner]) + APART[1] * logit(c[1 - winner])
+                score += APART[2] * abs(choice) + APART[3]
             assert float(found.depth[y, x]) == pytest.approx(depth, rel=1e-4)
             assert float(found.confidence[y, x]) == pytest.approx(
                 1 / (1 + math.exp(-score)), abs=1e-3

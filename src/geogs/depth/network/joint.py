@@ -1,31 +1,36 @@
-"""The classical search and the network together: the one where there is texture, the other else."""
+"""The classical search and the network: both where they agree, else the one the images back."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch.nn import functional
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
+from geogs.depth.photo_vote import photo_vote
+from geogs.geometry.camera import Camera
 
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""
-WINDOW = 7
-"""Pixels across and down over whose mean confidences it is decided who is right elsewhere."""
-AGREE, APART = (0.8, 0.2, 0.75), (0.85, -0.3, -0.35)
-"""Logit of the chance that the result is right, from those of what was chosen and of the other and
-a constant: where both agree (the more confident one is what was chosen) and where not. A logistic
-regression on four keyframes of two rendered rooms."""
+VOTE = (14.0, 0.8)
+"""Logit of the chance that the network is right where one of them is: from the images' vote and a
+constant."""
+AGREE, APART = (0.74, 0.53, 0.28), (0.57, -0.23, 0.41, -0.85)
+"""Logit of the chance that the result is right, where both agree: from the larger and the smaller
+of their logits and a constant; and where not: from those of what was chosen and of the other, the
+logit of the choice and a constant. All are logistic regressions on eight keyframes of four rendered
+rooms."""
 _BOUND = 0.02
 
 
 class JointDepthEngine(AlternativeSearch):
     """Searches with both engines, and takes of each what it knows; normals are the network's."""
 
-    def __init__(self, network: DepthEngine, classical: DepthEngine) -> None:
+    def __init__(self, network: DepthEngine, classical: DepthEngine, render: Camera) -> None:
         super().__init__(classical)
-        self.network = network
+        self.network, self.render = network, render
 
     def estimate(
         self,
@@ -42,17 +47,34 @@ class JointDepthEngine(AlternativeSearch):
             references, neighbours, lambda done: progress(0.5 + 0.5 * done), limits
         )
         return [
-            joined(s, n) if others else n
-            for s, n, others in zip(searched, learned, neighbours, strict=True)
+            self._joined(view, others, s, n) if others else n
+            for view, others, s, n in zip(references, neighbours, searched, learned, strict=True)
         ]
 
+    def _joined(
+        self,
+        reference: DepthView,
+        neighbours: Sequence[DepthView],
+        searched: DenseDepth,
+        learned: DenseDepth,
+    ) -> DenseDepth:
+        depths = torch.stack([searched.depth, learned.depth])
+        same = agreement(searched, learned)
+        vote = photo_vote(reference, neighbours, depths, same, self.render)
+        return joined(searched, learned, vote)
 
-def joined(first: DenseDepth, second: DenseDepth) -> DenseDepth:
+
+def agreement(first: DenseDepth, second: DenseDepth) -> Bool[Tensor, "h w"]:
+    """Where both depths are of one surface."""
+    return (first.depth.log() - second.depth.log()).abs() < REACH
+
+
+def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) -> DenseDepth:
     """One depth of two; normals are the second's.
 
-    Where they differ by less than ``REACH`` it is the mean of their logarithms, weighted by the
-    squared precision of normal errors that are below 2 % with the chance that the confidences say;
-    elsewhere that which is more confident around the pixel. Squared, because the most confident are
+    Where they agree it is the mean of their logarithms, weighted by the squared precision of normal
+    errors that are below 2 % with the chance that the confidences say; elsewhere that which the
+    ``vote`` of the images (``photo_vote``) makes likelier. Squared, because the most confident are
     more precise than a chance tells.
     """
     confidence = torch.stack([first.confidence, second.confidence])
@@ -60,14 +82,12 @@ def joined(first: DenseDepth, second: DenseDepth) -> DenseDepth:
     bounded = confidence.clamp(_BOUND, 1 - _BOUND)
     weight = bounded.erfinv().pow(4)
     mean = (weight * logs).sum(0) / weight.sum(0)
-    agree = (logs[0] - logs[1]).abs() < REACH
-    around = functional.avg_pool2d(confidence[None], WINDOW, 1, WINDOW // 2)[0]
-    take = around[0] > around[1]
+    choice = VOTE[0] * vote + VOTE[1]
+    agree, take = agreement(first, second), choice < 0
     depth = torch.where(agree, mean, torch.where(take, logs[0], logs[1])).exp()
     logit = bounded.logit()
-    other = torch.where(take, logit[1], logit[0])
-    chosen = torch.where(take, logit[0], logit[1])
+    chosen, other = torch.where(take, logit, logit.flip(0))
     both = AGREE[0] * logit.amax(0) + AGREE[1] * logit.amin(0) + AGREE[2]
-    alone = APART[0] * chosen + APART[1] * other + APART[2]
+    alone = APART[0] * chosen + APART[1] * other + APART[2] * choice.abs() + APART[3]
     (found,) = dense_depths([(depth, torch.where(agree, both, alone).sigmoid())])
     return replace(found, normal=second.normal)

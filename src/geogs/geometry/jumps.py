@@ -1,0 +1,58 @@
+"""Where a depth map jumps from one surface to another."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+JUMP = 0.04
+"""Least jump of depth, as a part of the farther depth: 1 - near / far."""
+
+
+class DepthJumps(NamedTuple):
+    """Pixels at either end of a jump along a row or a column."""
+
+    near: Bool[Tensor, "h w"]
+    """On the nearer surface."""
+    far: Bool[Tensor, "h w"]
+    """On the farther surface."""
+
+    def around(self, reach: int) -> Bool[Tensor, "h w"]:
+        """Pixels at most so many rows and columns from an end."""
+        return widened(self.near | self.far, reach)
+
+
+def depth_jumps(depth: Float[Tensor, "h w"]) -> DepthJumps:
+    """Jumps of a depth map that no plane explains.
+
+    Inverse depth is linear along a plane: of the step between two pixels what is left without the
+    slope before, or without the slope after, has to exceed ``JUMP``. Pixels without depth (0 or
+    less) end no jump.
+    """
+    inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), torch.nan)
+    across, down = _ends(inverse), DepthJumps(*(ends.mT for ends in _ends(inverse.mT)))
+    return DepthJumps(across.near | down.near, across.far | down.far)
+
+
+def _ends(inverse: Float[Tensor, "h w"]) -> DepthJumps:
+    """Along rows; comparisons with what is unknown are false."""
+    step = inverse.diff(dim=1)
+    before = F.pad(step[:, :-1], (1, 0), value=torch.inf)
+    after = F.pad(step[:, 1:], (0, 1), value=torch.inf)
+    left = torch.minimum(torch.minimum((step - before).abs(), (step - after).abs()), step.abs())
+    jump = left > JUMP * torch.maximum(inverse[:, 1:], inverse[:, :-1])
+    rises, falls = jump & (step > 0), jump & (step < 0)
+    return DepthJumps(
+        F.pad(rises, (1, 0)) | F.pad(falls, (0, 1)), F.pad(rises, (0, 1)) | F.pad(falls, (1, 0))
+    )
+
+
+def widened(mask: Bool[Tensor, "h w"], reach: int) -> Bool[Tensor, "h w"]:
+    """The mask and what is at most so many rows and columns from it."""
+    if reach < 1:
+        return mask
+    side = 2 * reach + 1
+    return F.max_pool2d(mask[None, None].float(), side, 1, reach)[0, 0] > 0
+
