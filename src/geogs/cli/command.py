@@ -42,6 +42,7 @@ COMMANDS = {
     "doctor": Command(
         "geogs.cli.doctor", "show what this machine can do, test it, say what to mend"
     ),
+    "completion": Command("geogs.cli.completion", "make the Tab key of a shell complete geogs"),
 }
 """Those of this package."""
 

@@ -1,6 +1,7 @@
 """What ``--help`` and ``--help-all`` print, from the types and the words of the options."""
 
 import inspect
+import re
 import shutil
 import textwrap
 from pathlib import Path
@@ -20,7 +21,7 @@ def help_text(options: type, command: str, everything: bool) -> str:
     usage = [_place(leaf) for leaf in places]
     groups: dict[str, list[Leaf]] = {"": []}
     for leaf in known:
-        if leaf not in places and (everything or not leaf.group or leaf.mark(Basic) is not None):
+        if leaf not in places and (everything or is_shown_first(leaf)):
             groups.setdefault(leaf.group, []).append(leaf)
     lines = [" ".join(["usage: geogs", command, *usage, "[OPTIONS]"]), ""]
     lines += [inspect.cleandoc(options.__doc__ or "").replace("``", ""), ""]
@@ -33,6 +34,16 @@ def help_text(options: type, command: str, everything: bool) -> str:
         more = f"geogs {command} --help-all shows all {len(known)} options."
         lines += ["", more]
     return "\n".join(lines)
+
+
+def is_shown_first(leaf: Leaf) -> bool:
+    """Whether ``--help`` shows an option, and not ``--help-all`` alone."""
+    return not leaf.group or leaf.mark(Basic) is not None
+
+
+def first_clause(text: str) -> str:
+    """What a text says before its first colon, semicolon or full stop."""
+    return text[:1] + re.split(r"[:;.]", text[1:])[0]
 
 
 def _place(leaf: Leaf) -> str:

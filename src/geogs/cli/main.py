@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 from geogs.cli import process
 from geogs.cli.command import all_commands, find_command
+from geogs.cli.completion import ASKED, matching
 from geogs.errors import GeogsError
 from geogs.version import __version__
 
@@ -47,6 +48,10 @@ def _dispatch(arguments: list[str]) -> int:
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help", "help"):
         print(help_text())
+        return 0
+    if arguments[1:] == [ASKED]:
+        helps = {known: command.help for known, command in all_commands().items()}
+        print(matching(helps, name))
         return 0
     if name in ("-V", "--version"):
         print(f"geogs {__version__}")

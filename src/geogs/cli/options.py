@@ -7,13 +7,13 @@ option that is a tuple of texts can be repeated.
 """
 
 import difflib
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar
 
-from geogs.cli.help import help_text
+from geogs.cli.completion import ASKED, candidates, matching
+from geogs.cli.help import first_clause, help_text
 from geogs.config.leaves import Leaf, default_of, leaves
 from geogs.config.old_names import present_name
 from geogs.config.setting import Positional, dashed, group_of, refusal
@@ -41,13 +41,11 @@ def parse_options(
 
     Raises:
         InputError: an option is unknown, wrong or missing.
-        SystemExit: with 0 after ``--help``, with 2 where there are no arguments but some needed.
+        SystemExit: with 0 after ``--help`` and ``--complete``, with 2 where there are no arguments
+            but some needed.
     """
     known = leaves(options, command)
-    everything = "--help-all" in argv
-    if everything or "--help" in argv or "-h" in argv:
-        print(help_text(options, command, everything))
-        raise SystemExit(0)
+    _say_what_is_asked(options, known, argv, command)
     words, given = _named(known, argv, command)
     for leaf in known:
         if words and leaf.mark(Positional) is not None:
@@ -61,7 +59,8 @@ def parse_options(
         raise SystemExit(2)
     if missing:
         name = (*missing[0].options, missing[0].name.upper())[0]
-        raise InputError(f"geogs {command} needs {name}: {_gist(missing[0].help)}.")
+        what = first_clause(missing[0].help)
+        raise InputError(f"geogs {command} needs {name}: {what[:1].lower()}{what[1:]}.")
     values = {leaf.path: _value(leaf, given[leaf.name]) for leaf in known if leaf.name in given}
     texts = {name: some[-1] for name, some in given.items()}
     made: Options = _made(options, default(texts) if default else None, values, ())
@@ -71,6 +70,20 @@ def parse_options(
 def record(kind: type[Record], options: object) -> Record:
     """The plain record that options of a command are more than."""
     return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # type: ignore[arg-type]
+
+
+def _say_what_is_asked(
+    options: type, known: Sequence[Leaf], argv: Sequence[str], command: str
+) -> None:
+    """Help, or what completes a word, where that is all that is wanted; then SystemExit."""
+    everything = "--help-all" in argv
+    if argv and argv[-1] == ASKED:
+        print(matching(candidates(known, argv[:-1]), argv[-2] if argv[:-1] else ""))
+    elif everything or "--help" in argv or "-h" in argv:
+        print(help_text(options, command, everything))
+    else:
+        return
+    raise SystemExit(0)
 
 
 def _named(
@@ -146,8 +159,3 @@ def _made(
         elif at in values:
             changed[field.name] = values[at]
     return options(**changed) if default is None else replace(default, **changed)
-
-
-def _gist(text: str) -> str:
-    """The first clause of a text, to stand within a sentence."""
-    return text[:1].lower() + re.split(r"[:;.]", text[1:])[0]
