@@ -3,7 +3,7 @@
 The format is that of Turk (1994): a header lists elements (tables) and their properties (columns),
 then come the rows. A property is a number, or a list of numbers with its length before it.
 
-Read by hand, as a file may come from anybody: trimesh is as fast, but would be a dependency, and
+Read by hand, as a file may come from anybody: trimesh is no faster, would be a dependency, and
 does not say in one sentence what is wrong with a damaged file.
 """
 
