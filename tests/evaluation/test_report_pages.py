@@ -5,15 +5,10 @@ import pytest
 from PIL import Image
 
 from box_room import CAMERA, box, circle
+from geogs.evaluation.held_camera import level_axes, look_at_one_place
 from geogs.evaluation.pages import plots
 from geogs.evaluation.pages.run_page import write_run_page
-from geogs.evaluation.pages.shading import (
-    Viewpoint,
-    level_axes,
-    look,
-    look_at_one_place,
-    viewpoints,
-)
+from geogs.evaluation.pages.shading import Viewpoint, look, viewpoints
 
 
 def test_level_axes_stand_upright():

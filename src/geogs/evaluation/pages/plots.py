@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from geogs.evaluation.pages.shading import Sight, Viewpoint, level_axes, look
+from geogs.evaluation.held_camera import level_axes
+from geogs.evaluation.pages.shading import Sight, Viewpoint, look
 from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.surface import Surface
 from geogs.evaluation.trajectory_errors import TrajectoryErrors

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from geogs.evaluation.pages.shading import level_axes
+from geogs.evaluation.held_camera import level_axes
 from geogs.io.writers.atomic import atomic_file
 from geogs.types import Trajectory
 

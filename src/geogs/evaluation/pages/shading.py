@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from geogs.evaluation.held_camera import level_axes, look_at_one_place
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.geometry.camera import Camera
 from geogs.geometry.creases import creased
@@ -92,25 +93,6 @@ def _shares(
     return np.stack([1 - second - third, second, third], 1).clip(0, 1)
 
 
-def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:
-    """Rows right, forward, up of the world as the camera was held.
-
-    Up is against the mean of the image's down axis (people hold cameras upright); right is the
-    direction of most motion at right angles to it.
-    """
-    up = -T_wc[:, :3, 1].mean(0)
-    norm = np.linalg.norm(up)
-    up = up / norm if norm > 1e-3 else np.array([0.0, 0.0, 1.0])
-    offset = T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(0)
-    flat = offset - np.outer(offset @ up, up)
-    right = np.linalg.svd(flat, full_matrices=False)[2][0]
-    right = right - (right @ up) * up
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(np.roll(np.eye(3)[np.abs(up).argmax()], 1), up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(up, right), up])
-
-
 def viewpoints(
     vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], camera: Camera
 ) -> list[Viewpoint]:
@@ -127,24 +109,6 @@ def viewpoints(
         chosen["another side"] = T_wc[cosine.max(1).argmin()]
     views = [Viewpoint(name, inside, np.linalg.inv(T)) for name, T in chosen.items()]
     return views if around else [*views, _from_above(vertices, T_wc, _WIDTH, inside.height)]
-
-
-def look_at_one_place(T_wc: Float[np.ndarray, "k 4 4"]) -> bool:
-    """Whether the optical axes of all cameras pass near one point in front of them.
-
-    The point nearest to all axes must be in front of every camera and, on average, at most a
-    tenth of its distance beside the axis; and the cameras must be apart by at least a tenth of it.
-    """
-    axes, centres = T_wc[:, :3, 2], T_wc[:, :3, 3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    offset = (across @ centres[..., None])[..., 0].sum(0)
-    focus = np.linalg.lstsq(across.sum(0), offset, rcond=None)[0]
-    along = ((focus - centres) * axes).sum(1)
-    if not (along > 0).all():
-        return False
-    beside = np.linalg.norm(focus - centres - along[:, None] * axes, axis=1)
-    spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
-    return bool(beside.mean() < 0.1 * along.mean() and spread > 0.1 * along.mean())
 
 
 def _from_above(

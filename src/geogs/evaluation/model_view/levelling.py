@@ -1,0 +1,179 @@
+"""Which way is up in a reconstruction: by its planes, and by how the camera was held."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from geogs.evaluation.held_camera import level_axes
+
+FARTHEST = 55.0
+"""Degrees between up and the camera's own mean up, at most."""
+AGREES = 5.0
+"""Degrees up to which a surface is called level or upright."""
+LEAST_SHARE = 0.18
+"""Of all area, which has to agree; of a ball 9 % do."""
+LEAST_WALLS = 0.25
+"""Length of the mean of walls' quadrupled azimuths from which rooms count as rectangular."""
+LEAST_CEILING, MOST_OVER = 0.1, 0.03
+"""Area of a ceiling as a part of that of floors, and of what is over it as a part of all."""
+_STEP, _WIDTH = 2.5, 4.0
+"""Degrees between directions that are tried, and the deviation of a vote."""
+_PARTS = 32
+"""Steps of a normal's coordinates by which facets vote together."""
+_UPRIGHT = 0.5
+"""Weight of upright area, beside level area."""
+_HELD, _HELD_WIDTH = 0.1, 20.0
+"""Votes of the camera, as a part of all area, and their deviation in degrees."""
+_FIRM = 1e-3
+"""The same where the best direction is refined: it decides only what planes leave open."""
+
+
+class Facets(NamedTuple):
+    """Triangles as what counts of them from afar."""
+
+    centres: Float[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "m 3"]
+    """Unit, towards free space; smooth where those of the vertices are."""
+    areas: Float[np.ndarray, "m"]
+
+
+@dataclass(frozen=True)
+class Level:
+    """How a reconstruction stands upright."""
+
+    axes: Float[np.ndarray, "3 3"]
+    """Rows right, forward, up in the world; right runs along the walls of a rectangular room."""
+    share: float | None
+    """Part of the surface that is level or upright then; none where the camera alone decided."""
+
+    @property
+    def sentence(self) -> str:
+        """For the page."""
+        if self.share is None:
+            return "Upright as the camera was held."
+        return f"Upright by its planes: {self.share:.0%} of the surface are level or vertical."
+
+
+def facets(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+) -> Facets:
+    """Triangles of a mesh with the means of their corners' normals."""
+    corners = vertices.astype(np.float64)[faces]
+    areas = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    return Facets(corners.mean(1), _unit(normals[faces].astype(np.float64).sum(1)), areas / 2)
+
+
+def level(surface: Facets | None, T_wc: Float[np.ndarray, "k 4 4"]) -> Level:
+    """Stand a surface upright: floors, ceilings and table tops level, walls vertical.
+
+    Each facet votes with its area for the directions along its normal and, half as much, for those
+    at right angles to it; the best within 55 degrees of the camera's mean up is refined by least
+    squares. Where less than 18 % of the area agree, as on a plant, the camera decides alone.
+    """
+    held = level_axes(T_wc)
+    if surface is None or not surface.areas.sum() > 0:
+        return Level(held, None)
+    normals, weights = _together(surface)
+    up = _refined(normals, weights, _best(normals, weights, held[2]), held[2])
+    share = float(weights[_off(normals @ up) < np.sin(np.radians(AGREES))].sum())
+    if share < LEAST_SHARE:
+        return Level(held, None)
+    return Level(_along_walls(normals, weights, level_axes(T_wc, up)), share)
+
+
+def ceiling(surface: Facets, up: Float[np.ndarray, "3"], above: float) -> float | None:
+    """Height along ``up`` of the ceiling; none where little above that height faces down, or where
+    it is not the top of all."""
+    heights, facing = surface.centres @ up, surface.normals @ up
+    below = np.cos(np.radians(2 * AGREES))
+    is_ceiling = (facing < -below) & (heights > above)
+    floor = surface.areas[facing > below].sum()
+    if not surface.areas[is_ceiling].sum() > LEAST_CEILING * floor:
+        return None
+    order = np.argsort(heights[is_ceiling])
+    summed = surface.areas[is_ceiling][order].cumsum()
+    height = float(heights[is_ceiling][order][summed.searchsorted(summed[-1] / 2)])
+    over = surface.areas[heights > height + 0.05 * np.ptp(heights)].sum()
+    return height if over < MOST_OVER * surface.areas.sum() else None
+
+
+def _together(surface: Facets) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:
+    """Mean normals of facets that lie alike, and their parts of the whole area."""
+    cells = np.rint(_PARTS * surface.normals).astype(np.int64) @ np.array([10_000, 100, 1])
+    _, group = np.unique(cells, return_inverse=True)
+    sums = [
+        np.bincount(group, surface.areas * values)
+        for values in (*surface.normals.T, np.ones(len(group)))
+    ]
+    return _unit(np.stack(sums[:3], 1)), sums[3] / sums[3].sum()
+
+
+def _best(
+    normals: Float[np.ndarray, "b 3"], weights: Float[np.ndarray, "b"], held: np.ndarray
+) -> Float[np.ndarray, "3"]:
+    """The direction with most votes, of those on rings around the camera's own."""
+    side = _unit(np.cross(held, np.eye(3)[np.abs(held).argmin()]))
+    rings = [held[None]]
+    for tilt in np.radians(np.arange(_STEP, FARTHEST, _STEP)):
+        turns = np.arange(0, 2 * np.pi, np.radians(_STEP) / np.sin(tilt))[:, None]
+        around = np.cos(turns) * side + np.sin(turns) * np.cross(held, side)
+        rings.append(np.cos(tilt) * held + np.sin(tilt) * around)
+    tried = np.concatenate(rings)
+    own = _HELD * _vote(np.arccos(np.clip(tried @ held, -1, 1)), _HELD_WIDTH)
+    votes = [weights @ _votes(normals @ up) for up in tried]
+    return np.asarray(tried[int(np.argmax(votes + own))])
+
+
+def _refined(
+    normals: Float[np.ndarray, "b 3"],
+    weights: Float[np.ndarray, "b"],
+    up: np.ndarray,
+    held: np.ndarray,
+) -> Float[np.ndarray, "3"]:
+    """Least squares over what agrees: (n·up)² of walls, and what is missing to 1 of floors."""
+    for _ in range(10):
+        cosine = normals @ up
+        shares = weights * _votes(cosine) * np.where(np.abs(cosine) > 0.7, -1.0, 1.0)
+        spread = (normals.T * shares) @ normals - _FIRM * np.outer(held, held)
+        up = np.linalg.eigh(spread)[1][:, 0]
+        up *= np.sign(up @ held) or 1.0
+    return up
+
+
+def _along_walls(
+    normals: Float[np.ndarray, "b 3"], weights: Float[np.ndarray, "b"], axes: np.ndarray
+) -> Float[np.ndarray, "3 3"]:
+    """Axes turned about up until walls face along them, by less than 45 degrees."""
+    east, north, high = (normals @ axis for axis in axes)
+    walls = weights * (np.abs(high) < np.sin(np.radians(2 * AGREES)))
+    mean = (walls * np.exp(4j * np.arctan2(north, east))).sum() / max(walls.sum(), 1e-12)
+    if abs(mean) < LEAST_WALLS:
+        return axes
+    turn = np.angle(mean) / 4
+    right = np.cos(turn) * axes[0] + np.sin(turn) * axes[1]
+    return np.stack([right, np.cross(axes[2], right), axes[2]])
+
+
+def _votes(cosine: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
+    """What normals say of a direction, by their cosines to it."""
+    is_level = np.abs(cosine) > 0.7
+    return np.where(is_level, 1.0, _UPRIGHT) * _vote(np.arcsin(_off(cosine).clip(0, 1)), _WIDTH)
+
+
+def _off(cosine: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b"]:
+    """Sine of the angle to level or to upright, whichever is nearer."""
+    return np.minimum(np.abs(cosine), np.sqrt((1 - cosine**2).clip(0, 1)))
+
+
+def _vote(angle: np.ndarray, degrees: float) -> np.ndarray:
+    return np.exp(-0.5 * (np.degrees(angle) / degrees) ** 2)
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,95 @@
+"""From where a model is seen first: all of it is in the picture, and most of it faces one."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from geogs.evaluation.held_camera import look_at_one_place
+from geogs.evaluation.model_view.levelling import Facets
+
+FIELD = 45.0
+"""Degrees from the lower edge of the picture to the upper."""
+ASPECT = 1.5
+"""Width of a picture by its height into which all fits; a narrower one is seen from farther."""
+ELEVATION = 40.0
+"""Degrees by which one looks down on a place."""
+_TURNS = 24
+"""Directions around that are tried."""
+_MARGIN = 1.05
+_KEPT = 0.005
+"""Part of the points on each side that may be cut off."""
+
+
+class StartView(NamedTuple):
+    """A camera that looks at a point, in the frame of the map."""
+
+    eye: Float[np.ndarray, "3"]
+    target: Float[np.ndarray, "3"]
+
+
+def start_view(
+    points: Float[np.ndarray, "n 3"],
+    axes: Float[np.ndarray, "3 3"],
+    T_wc: Float[np.ndarray, "k 4 4"],
+    surface: Facets | None = None,
+) -> StartView:
+    """A place obliquely from above, from where most of its surface faces the eye, so that walls
+    nearest to it turn their backs; an object from the side of the cameras.
+
+    Args:
+        points: of its shape; all of them are in the picture, but those that float far away.
+        axes: rows right, forward and up of the world.
+        T_wc: the cameras, which are in the picture, too.
+        surface: by what the side is chosen; without it, what the cameras looked at is ahead.
+    """
+    local = points.astype(np.float64) @ axes.T
+    low, high = np.quantile(local, [_KEPT, 1 - _KEPT], axis=0)
+    is_near = ((local >= low) & (local <= high)).all(1)
+    local = np.concatenate([local[is_near], T_wc[:, :3, 3] @ axes.T])
+    middle = (local.min(0) + local.max(0)) / 2
+    if look_at_one_place(T_wc):
+        side = axes @ T_wc[0, :3, 3] - middle
+        direction = np.array([*side[:2], max(side[2], 0.35 * np.linalg.norm(side[:2]))])
+        direction /= max(np.linalg.norm(direction), 1e-12)
+    else:
+        direction = _open_side(axes, T_wc, surface)
+    eye, target = _fitted(local, direction)
+    return StartView(axes.T @ eye, axes.T @ target)
+
+
+def _open_side(
+    axes: Float[np.ndarray, "3 3"], T_wc: Float[np.ndarray, "k 4 4"], surface: Facets | None
+) -> Float[np.ndarray, "3"]:
+    """The direction, in level axes, from which most area faces one, as it is foreshortened."""
+    rise = np.radians(ELEVATION)
+    turns = 2 * np.pi * (np.arange(_TURNS) + 0.5) / _TURNS
+    level = np.stack([np.cos(turns), np.sin(turns)], 1) * np.cos(rise)
+    tried = np.column_stack([level, np.full(_TURNS, np.sin(rise))])
+    if surface is None:
+        faced = tried @ (axes @ -T_wc[:, :3, 2].mean(0))
+    else:
+        local = surface.normals @ axes.T
+        faced = np.array([surface.areas @ np.maximum(local @ d, 0) for d in tried])
+    return np.asarray(tried[int(faced.argmax())])
+
+
+def _fitted(
+    local: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """The nearest eye in this direction that sees all points, and the target in their midst.
+
+    With z towards the eye and t = tan(field / 2), planes through the picture's edges touch points
+    where x_eye + t z_eye = a = max(x + t z) and -x_eye + t z_eye = b = max(-x + t z), so that
+    x_eye = (a - b) / 2 and z_eye = (a + b) / 2 t; y likewise, and the greater z counts.
+    """
+    right = np.cross([0.0, 0.0, 1.0], direction)
+    right /= max(np.linalg.norm(right), 1e-12)
+    frame = np.stack([right, np.cross(direction, right), direction])
+    seen = local @ frame.T
+    t = np.tan(np.radians(FIELD / 2)) * np.array([ASPECT, 1.0])
+    a, b = ((sign * seen[:, :2] + t * seen[:, 2:]).max(0) for sign in (1, -1))
+    middle = (seen[:, 2].min() + seen[:, 2].max()) / 2
+    away = max(float(((a + b) / (2 * t)).max() - middle), 1e-6)
+    target = np.array([*(a - b) / 2, middle]) @ frame
+    return target + _MARGIN * away * direction, target
