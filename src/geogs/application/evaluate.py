@@ -19,7 +19,7 @@ from geogs.application.results.saved_result import load_result
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.doubts import doubts
-from geogs.evaluation.model_view.shown_model import Colouring, Legend, ShownModel
+from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths, ShownModel
 from geogs.evaluation.pages.evaluation_page import SAME_POSES_CM, Evaluation, write_report
 from geogs.evaluation.pages.run_page import PICTURES, figures, run_figures, run_sections
 from geogs.evaluation.reliability import Reliability, reliability
@@ -224,11 +224,13 @@ def _model_beside_truth(
         limit = surface.scores.colour_limit_cm
         errors = 100 * surface.distance
         colours = error_colours(vertices, surface.points, errors, limit, surface.reach)
-        ends = ("0", f"{limit:g} cm and more")
+        ends = ("0", f"{float(f'{limit:.2g}'):g} cm and more")
         legend = Legend("Distance to the truth", ends, ERROR_STOPS, "grey: not compared")
         return [Colouring("Error", colours, legend)]
 
     back = np.linalg.inv(T)
     true_path = trajectory.truth[:, :3, 3] @ back[:3, :3].T + back[:3, 3]
     disks = result.disks
-    return shown_model(result.trajectory, views, result.camera, mesh, disks, coloured, true_path)
+    unit = Lengths(trajectory.scale, "Metres, by comparison with the truth.")
+    frames, camera = result.trajectory, result.camera
+    return shown_model(frames, views, camera, mesh, disks, unit, coloured, true_path)

@@ -6,8 +6,11 @@ import torch
 
 from box_room import box, circle
 from browser import open_tab
-from geogs.application.results.result_page import ShownView, first_view, shown_model
-from geogs.evaluation.model_view.shown_model import Colouring, Legend
+from geogs.application.results.result_page import ShownView, shown_model
+from geogs.evaluation.held_camera import level_axes
+from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths
+from geogs.evaluation.model_view.start_view import start_view
+from geogs.evaluation.pages.lengths import lengths
 from geogs.evaluation.pages.run_page import write_run_page
 from geogs.geometry.camera import Camera
 from geogs.mesh.triangle_mesh import Mesh
@@ -40,7 +43,7 @@ def box_page(folder, with_truth: bool = False):
     legend = Legend("Distance to the truth", ("0", "10 cm"), ("#ffffcc", "#800026"))
     blue = np.full_like(colours, (20, 40, 230))
     more = (lambda mesh: [Colouring("Error", blue, legend)]) if with_truth else (lambda mesh: ())
-    model = shown_model(trajectory, views, CAMERA, mesh, disks, more)
+    model = shown_model(trajectory, views, CAMERA, mesh, disks, Lengths(1.0, "Metres."), more)
     verdict = {"sentence": "Reliable & sound.", "is_reliable": True}
     write_run_page(folder, {"source": "box", "frames": 60, "verdict": verdict}, model)
     return folder / "index.html"
@@ -55,12 +58,10 @@ def share(picture: np.ndarray, colour: list[int]) -> float:
 
 def test_rooms_are_seen_from_above_and_wholly():
     points = np.random.default_rng(0).uniform([-3, -2, -1.2], [3, 2, 1.2], (5000, 3))
-    axes, eye, target = first_view(points, circle())
-    assert np.allclose(target, 0, atol=0.1)
+    axes = np.eye(3)
+    eye, target = start_view(points, axes, circle())
+    assert np.allclose(target, 0, atol=0.8)
     assert (eye - target) @ axes[2] > 0.4 * np.linalg.norm(eye - target)
-    towards = (points - eye) @ (target - eye) / np.linalg.norm(target - eye)
-    angle = np.degrees(np.arccos(towards / np.linalg.norm(points - eye, axis=1)))
-    assert np.quantile(angle, 0.99) < 30  # of half a diagonal
     assert np.linalg.norm(eye - target) < 10
 
 
@@ -69,11 +70,43 @@ def test_objects_are_seen_from_the_side_of_the_cameras():
     inwards[:, 2, 3] = 0
     inwards[:, :3, [0, 2]] *= -1  # half a turn about the image's vertical axis
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3))
-    axes, eye, target = first_view(points, inwards)
-    assert np.allclose(target, 0, atol=0.02)
+    axes = level_axes(inwards)
+    eye, target = start_view(points, axes, inwards)
+    assert np.allclose(target, 0, atol=0.15)
     side = (eye - target) / np.linalg.norm(eye - target)
     assert side @ inwards[0, :3, 3] > 0.4  # of half a metre
     assert 0.1 < side @ axes[2] < 0.5  # a little from above
+
+
+def test_a_page_says_what_its_lengths_are():
+    metric = {"scale": "metric (a depth sensor)", "metric_scale": {"deviation": 0.01}}
+    assert lengths(metric).metres == 1
+    assert lengths(metric).note == "Metres by a depth sensor, to about 2 %."
+    assert lengths({"scale": "of the poses (millimetres)"}).metres == 0.001
+    for unknown in ("of the poses (arbitrary)", "arbitrary (monocular)", 7, None):
+        assert lengths({"scale": unknown}).metres is None
+    assert "do not tell metres" in lengths({}).note
+    assert (
+        lengths({**metric, "metric_scale": {"deviation": "x"}}).note == "Metres by a depth sensor."
+    )
+
+
+def drawn(tab) -> np.ndarray:
+    """The model as it is now; waits until it is no longer drawn."""
+    tab.page.wait_for_function(
+        "() => new Promise((done) => setTimeout(() => requestAnimationFrame(() => "
+        "done(!document.getElementById('model').stage.steps.size)), 300))"
+    )
+    return tab.picture()[:, :600]  # beside the image of the keyframe
+
+
+def azimuth(tab) -> float:
+    """Direction of the view around the vertical, degrees."""
+    return np.degrees(tab.page.evaluate("() => model.stage.orbit.getAzimuthalAngle()"))
+
+
+def look(tab, name: str) -> None:
+    tab.page.click(f"[data-part=looks] button:text-is('{name}')")
 
 
 @pytest.mark.system
@@ -82,9 +115,12 @@ def test_page_draws_turns_and_says_nothing(tmp_path):
     assert page.stat().st_size < 1.2e6
     with open_tab(page.as_uri()) as tab:
         tab.page.wait_for_selector("#model[data-state=drawn]", timeout=600_000)
-        tab.page.wait_for_selector(".strip button")
+        tab.page.wait_for_selector(".beside img[src]", timeout=600_000)
         assert "Reliable & sound." in tab.page.inner_text("p.verdict")
-        first = tab.picture()
+        assert "Upright by its planes: 100% of the surface" in tab.page.inner_text(
+            "p.note >> nth=1"
+        )
+        first = drawn(tab)
         # One looks from above through walls that face away: the floor and the far walls are there.
         assert share(first, RED) > 0.03
         assert share(first, GREEN) > 0.05
@@ -92,27 +128,57 @@ def test_page_draws_turns_and_says_nothing(tmp_path):
                 for c, d in ((0, 1), (1, 0))]  # fmt: skip
         assert rows[0] > rows[1]  # the floor is below
 
+        look(tab, "Error")
+        assert share(drawn(tab), [0, 0, 1]) > 0.1
+        assert "10 cm" in tab.page.inner_text(".legend")
+        look(tab, "Disks")
+        assert share(drawn(tab), [0, 0, 1]) < 0.05  # nothing else hides them, nor do they hide it
+        look(tab, "Error")
+        assert share(drawn(tab), [0, 0, 1]) > 0.1
+
+        before = azimuth(tab)
         box_of = tab.page.locator("canvas").bounding_box()
-        x, y = box_of["x"] + box_of["width"] / 2, box_of["y"] + box_of["height"] / 2
+        x, y = box_of["x"] + box_of["width"] / 3, box_of["y"] + box_of["height"] / 2
         tab.page.mouse.move(x, y)
         tab.page.mouse.down()
-        tab.page.mouse.move(x + 200, y, steps=4)
+        tab.page.mouse.move(x + 250, y, steps=5)
         tab.page.mouse.up()
-        tab.page.wait_for_timeout(700)
-        turned = tab.picture()
-        assert (np.abs(turned - first).max(-1) > 25).mean() > 0.05
-
-        tab.page.click("[data-part=looks] button:text-is('Error')")
-        tab.page.wait_for_timeout(200)
-        assert share(tab.picture(), [0, 0, 1]) > 0.1
-        assert "10 cm" in tab.page.inner_text(".legend")
-        cell = tab.page.locator(".strip button").nth(3)
-        cell.click()
-        assert tab.page.inner_text(".name").startswith("keyframe 4 of 10")
-        tab.page.click("[data-part=layers] button:text-is('Mesh')")
-        tab.page.click("[data-part=layers] button:text-is('Disks')")
-        tab.page.click("[data-part=layers] button:text-is('Images')")
-        tab.page.wait_for_timeout(400)
-        assert share(tab.picture(), [0, 0, 1]) > 0.002  # the images of the keyframes, blue
+        turned = (before - azimuth(tab) + 180) % 360 - 180
+        assert abs(turned) == pytest.approx(60, abs=3)
+        assert (np.abs(drawn(tab) - first).max(-1) > 25).mean() > 0.05
         assert tab.complaints == []
         assert all(r.startswith(("file:", "blob:", "data:")) for r in tab.requests)
+
+
+@pytest.mark.system
+def test_page_plays_the_path_and_measures(tmp_path):
+    page = box_page(tmp_path)
+    with open_tab(page.as_uri()) as tab:
+        tab.page.wait_for_selector(".beside img[src]", timeout=600_000)
+        tab.page.eval_on_selector("[data-part=place]", "(s) => { s.value = 3; s.oninput(); }")
+        assert tab.page.inner_text("[data-part=keyframe]").startswith("keyframe 4 of 10")
+        outside = drawn(tab)
+        tab.page.click("[data-part=ride]")
+        inside = drawn(tab)
+        assert (np.abs(inside - outside).max(-1) > 25).mean() > 0.2
+        position = tab.page.evaluate("() => model.stage.camera.position.toArray()")
+        assert np.linalg.norm(position) == pytest.approx(0.5, abs=0.11)  # of the circle
+        tab.page.click("[data-part=ride]")
+        drawn(tab)
+        # Two points of the floor: where rays through pixels meet it, by hand.
+        tab.page.click("text=Measure")
+        assert "Metres." in tab.page.inner_text("[data-part=hint]")
+        ends = [[-1.0, -1.2, -0.5], [1.5, -1.2, 0.5]]
+        to_pixel = "(p) => model.stage.pixel(model.stage.camera.position.clone().fromArray(p))"
+        canvas = tab.page.locator("canvas").bounding_box()
+        for end in ends:
+            u, v = tab.page.evaluate(to_pixel, end)
+            tab.page.mouse.click(canvas["x"] + u, canvas["y"] + v)
+        said, unit = tab.page.inner_text("[data-part=length]").split()
+        assert unit == "m"
+        assert float(said) == pytest.approx(np.linalg.norm(np.subtract(*ends)), rel=0.02)
+        tab.page.click("[data-part=play]")
+        tab.page.wait_for_function(
+            "() => Number(document.querySelector('[data-part=place]').value) > 3.5"
+        )
+        assert tab.complaints == []

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from box_room import box, circle
+from geogs.evaluation.held_camera import level_axes
 from geogs.evaluation.model_view.model_section import model_section
 from geogs.evaluation.model_view.packed_model import STEPS, pack, webgl_axes
 from geogs.evaluation.model_view.shown_model import (
@@ -17,7 +18,7 @@ from geogs.evaluation.model_view.shown_model import (
     ShownModel,
     SurfaceModel,
 )
-from geogs.evaluation.pages.shading import level_axes
+from geogs.evaluation.model_view.start_view import StartView
 
 
 def unpacked(content: bytes, place: list[int]) -> np.ndarray:
@@ -51,7 +52,7 @@ def model() -> ShownModel:
         np.exp(random.uniform(-6, -2, (20, 2))).astype(np.float32),
     )
     return ShownModel(
-        level_axes(circle()), np.array([4.0, 5, 6]), np.zeros(3), ImageExtent(0.8, 0.6),
+        level_axes(circle()), StartView(np.array([4.0, 5, 6]), np.zeros(3)), ImageExtent(0.8, 0.6),
         SurfaceModel(
             vertices.astype(np.float32), faces, unit(vertices), [Colouring("Colour", colours)]
         ),
@@ -96,6 +97,7 @@ def test_axes_are_those_of_webgl(model):
     assert np.allclose(R @ model.axes[2], [0, 1, 0])  # up is y
     assert np.allclose(R @ model.axes[1], [0, 0, -1])  # forward is away
     scene, _, images = pack(model)
+    assert np.allclose(scene["start"]["eye"], R @ [4, 5, 6])
     T = np.array(scene["keyframes"][2]["T_wc"]).reshape(3, 4)
     assert np.allclose(T, R @ model.keyframes[2].T_wc[:3], atol=1e-6)
     offset, length = scene["keyframes"][2]["image"]

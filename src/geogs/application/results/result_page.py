@@ -10,25 +10,30 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.application.results.saved_result import SavedResult
+from geogs.evaluation.model_view.levelling import Facets, Level, ceiling, facets, level
 from geogs.evaluation.model_view.shown_model import (
     Colouring,
     DiskModel,
     ImageExtent,
     KeyframeModel,
+    Lengths,
     PathModel,
     ShownModel,
     SurfaceModel,
 )
-from geogs.evaluation.pages.shading import level_axes, look_at_one_place
+from geogs.evaluation.model_view.start_view import StartView, start_view
+from geogs.evaluation.pages.lengths import lengths
 from geogs.geometry.camera import Camera
 from geogs.mesh.decimate import with_at_most
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
-MOST_FACES, MOST_DISKS, MOST_IMAGES = 400_000, 100_000, 240
-"""Most of each on a page."""
-IMAGE_BYTES = 1_800_000
+MOST_FACES, MOST_DISKS, MOST_IMAGES = 300_000, 60_000, 240
+"""Most of each on a page, which then has less than 8 MB."""
+IMAGE_BYTES = 1_500_000
 """Bytes of all images of a page together, about."""
+CUT = 0.04
+"""Of the height of a room, by which it is cut below its ceiling for those who look from above."""
 _BYTES_A_PIXEL = 0.2
 _LONGEST_EDGE, _SHORTEST_EDGE = 480, 128
 _QUALITY = 75
@@ -71,7 +76,8 @@ def write_report(
         )
     model = None
     if renders:
-        model = shown_model(trajectory, _rendered_views(renders), renders[0].camera, mesh, disks)
+        views, camera = _rendered_views(renders), renders[0].camera
+        model = shown_model(trajectory, views, camera, mesh, disks, lengths(summary))
     write_run_page(folder, summary, model)
 
 
@@ -98,7 +104,8 @@ def write_page_anew(
     trajectory = result.trajectory if trajectory is None else trajectory
     summary = result.summary if summary is None else summary
     faces = 0 if mesh is None else len(mesh.faces)
-    model = shown_model(trajectory, shown_views(result), result.camera, mesh, result.disks)
+    views = shown_views(result)
+    model = shown_model(trajectory, views, result.camera, mesh, result.disks, lengths(summary))
     pictures = result.folder / "report"
     write_run_page(new / "report", {**summary, "mesh_faces": faces}, model, pictures)
 
@@ -130,6 +137,7 @@ def shown_model(
     camera: Camera,
     mesh: Mesh | None,
     disks: MapSnapshot | None,
+    unit: Lengths,
     more_colourings: Callable[[Mesh], Sequence[Colouring]] = lambda mesh: (),
     true_path: Float[np.ndarray, "n 3"] | None = None,
 ) -> ShownModel:
@@ -141,11 +149,11 @@ def shown_model(
         camera: of their images.
         mesh: the surface, if there is one.
         disks: of the map, if they are shown.
+        unit: what a unit of the map is.
         more_colourings: of the surface as it is shown, besides the colours of the images.
         true_path: positions of the true camera, in the frame of the map.
     """
-    notes = []
-    surface = None
+    notes, surface, seen = [], None, None
     if mesh is not None and len(mesh.faces):
         shown = with_at_most(mesh, MOST_FACES)
         if shown is not mesh:
@@ -155,6 +163,7 @@ def shown_model(
         surface = SurfaceModel(
             shown.vertices, shown.faces, shown.normals, [*own, *more_colourings(shown)]
         )
+        seen = facets(shown.vertices, shown.faces, shown.normals)
     disk_model = None
     if disks is not None and len(disks):
         disk_model = _disks(disks)
@@ -163,35 +172,43 @@ def shown_model(
     paths = [PathModel("Path", trajectory.T_wc[:, :3, 3], trajectory.states)]
     if true_path is not None:
         paths.append(PathModel("True path", true_path))
-    points = trajectory.T_wc[:, :3, 3]
-    if surface is not None:
-        points = np.concatenate([surface.vertices, points])
-    elif disk_model is not None:
-        points = np.concatenate([disk_model.position, points])
-    posed = trajectory.T_wc[trajectory.tracked]
-    posed = posed if len(posed) else trajectory.T_wc
-    axes, eye, target = first_view(points, posed)
-    lens = ImageExtent(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
+    shape = None if surface is None else surface.vertices
+    shape = shape if shape is not None or disk_model is None else disk_model.position
+    levelled, start, lid = stand(trajectory, shape, seen)
     return ShownModel(
-        axes, eye, target, lens, surface, paths, _keyframes(views, camera), disk_model, notes
+        levelled.axes,
+        start,
+        ImageExtent(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy),
+        surface,
+        paths,
+        _keyframes(views, camera),
+        disk_model,
+        lid,
+        unit,
+        [levelled.sentence, unit.note, *notes],
     )
 
 
-def first_view(
-    points: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"]
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Level axes, and from where to look at what: an object from the side of the cameras, a place
-    from above, all of it (but the farthest half percent of the points) in the picture."""
-    axes = level_axes(T_wc)
-    local = points.astype(np.float64) @ axes.T
-    low, high = np.quantile(local, [0.005, 0.995], axis=0)
-    middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
-    direction = np.array([-0.45, -0.75, 0.85])
-    if look_at_one_place(T_wc):
-        side = axes @ T_wc[0, :3, 3] - middle
-        direction = np.array([*side[:2], max(side[2], 0.35 * np.linalg.norm(side[:2]))])
-    direction /= max(np.linalg.norm(direction), 1e-12)
-    return axes, axes.T @ (middle + 1.95 * radius * direction), axes.T @ middle
+def stand(
+    trajectory: Trajectory, points: Float[np.ndarray, "n 3"] | None, surface: Facets | None
+) -> tuple[Level, StartView, float | None]:
+    """How a result stands upright, from where it is seen first, and where its ceiling is cut.
+
+    Args:
+        trajectory: of all frames.
+        points: of its shape, if it has one.
+        surface: its mesh, if it has one.
+    """
+    T_wc = trajectory.T_wc[trajectory.tracked]
+    T_wc = T_wc if len(T_wc) else trajectory.T_wc
+    points = T_wc[:, :3, 3] if points is None else points
+    levelled = level(surface, T_wc)
+    up = levelled.axes[2]
+    start = start_view(points, levelled.axes, T_wc, surface)
+    heights = np.quantile(points @ up, [0.005, 0.995])
+    top = None if surface is None else ceiling(surface, up, float(np.median(T_wc[:, :3, 3] @ up)))
+    lid = None if top is None else top - CUT * float(np.ptp(heights))
+    return levelled, start, lid
 
 
 def _disks(disks: MapSnapshot) -> DiskModel:

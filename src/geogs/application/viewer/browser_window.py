@@ -13,14 +13,22 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.application.viewer.guarded_server import GuardedServer
+from geogs.evaluation.model_view.start_view import FIELD, StartView
 from geogs.evaluation.pages.keyframe_layers import LAYERS, Layer
-from geogs.evaluation.pages.shading import level_axes
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion
+from geogs.io.writers.exports.mesh_writers import ONE_SIDED, glb
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
 
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
+AMBIENT = float(np.pi)
+"""Light by which a rough surface has just its own colours."""
+FRUSTA, CAMERA_NOW = 0.01, 0.035
+"""Lengths of frusta as parts of the scene's size."""
+ROOM, BESIDE = 1.3, 0.1
+"""Distance from which a scene is seen, by that from which it fills a picture, and how far to the
+right of it one looks then, as a part of it."""
 _FAREWELL = 0.3
 """Seconds that the server takes to end."""
 _LEAST_MOVE = 1e-3
@@ -43,7 +51,8 @@ class Window:
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         # The light is in the colours already.
         self._server.scene.configure_default_lights(False)
-        self._server.scene.add_light_ambient("/light", intensity=3.0)
+        self._server.scene.configure_environment_map(None)
+        self._server.scene.add_light_ambient("/light", intensity=AMBIENT)
         self._server.scene.set_background_image(np.full((2, 2, 3), (27, 30, 35), np.uint8))
         gui = self._server.gui
         self._words = gui.add_html("")
@@ -100,22 +109,26 @@ class Window:
         """The picture of the panel."""
         self._picture.image = picture
 
-    def stand_upright(self, T_wc: Float[np.ndarray, "n 4 4"], size: float) -> None:
-        """Turn the scene as the camera was held; frusta are drawn for a scene of this size."""
-        axes = level_axes(T_wc)
+    def stand_upright(self, up: Float[np.ndarray, "3"], size: float) -> None:
+        """Turn this direction of the scene up; frusta are drawn for a scene of this size."""
         self._size = size
-        self._server.scene.set_up_direction(tuple(axes[2]))
+        self._server.scene.set_up_direction(tuple(up))
 
-    def look_from(
-        self,
-        eye: Float[np.ndarray, "3"],
-        target: Float[np.ndarray, "3"],
-        up: Float[np.ndarray, "3"],
-    ) -> None:
+    def look_from(self, start: StartView, up: Float[np.ndarray, "3"]) -> None:
         """Where those who look, and who come later, stand first."""
-        self._server.on_client_connect(lambda client: _look(client, eye, target, up))
-        for client in self._server.get_clients().values():
+
+        # The panel covers the right of the window, which may be narrow besides.
+        away = ROOM * (start.eye - start.target)
+        target = start.target + BESIDE * np.cross(up, away)
+        eye = target + away
+
+        def look(client: Any) -> None:
+            client.camera.fov = np.radians(FIELD)
             _look(client, eye, target, up)
+
+        self._server.on_client_connect(look)
+        for client in self._server.get_clients().values():
+            look(client)
 
     def follow(self, T_wc: Float[np.ndarray, "4 4"]) -> None:
         """Bring all who look behind a camera."""
@@ -129,8 +142,11 @@ class Window:
         """A surface in its colours."""
         if mesh.colours is None:
             mesh = replace(mesh, colours=np.full((len(mesh.vertices), 3), 200, np.uint8))
-        shape = mesh.creased().to_trimesh()
-        self._put("Mesh", self._server.scene.add_mesh_trimesh("/mesh", shape))
+        shown = mesh.creased()
+        shape = glb(shown.vertices, shown.faces, shown.normals, shown.colours, ONE_SIDED)
+        # The file is turned by half a turn about x.
+        turned = {"wxyz": (0.0, 1.0, 0.0, 0.0), "cast_shadow": False, "receive_shadow": False}
+        self._put("Mesh", self._server.scene.add_glb("/mesh", shape, **turned))
 
     def show_disks(self, disks: MapSnapshot) -> None:
         """Disks, coloured by where they face."""
@@ -169,7 +185,7 @@ class Window:
     ) -> None:
         """A frustum; one that is there already follows a correction."""
         if id not in self._frusta:
-            frustum = self._frustum(f"/keyframes/{id}", T_wc, camera, FRUSTUM, 0.035, image)
+            frustum = self._frustum(f"/keyframes/{id}", T_wc, camera, FRUSTUM, FRUSTA, image)
             self._parts["Keyframes"].append(frustum)
             frustum.visible = self._switches["Keyframes"].value
         else:
@@ -186,7 +202,7 @@ class Window:
         image: UInt8[np.ndarray, "h w 3"] | None,
     ) -> None:
         """Where the camera is now, or the keyframe that was chosen."""
-        self._frustum("/camera", T_wc, camera, NOW, 0.07, image)
+        self._frustum("/camera", T_wc, camera, NOW, CAMERA_NOW, image)
 
     def _frustum(
         self,
@@ -203,7 +219,7 @@ class Window:
             fov=2 * float(np.arctan2(camera.height / 2, camera.fy)),
             aspect=camera.width / camera.height,
             scale=size * self._size,
-            thickness=1.5,
+            thickness=1.0,
             thickness_units="screen",
             color=colour,
             image=image,

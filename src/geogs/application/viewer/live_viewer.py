@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from geogs.application.viewer.browser_window import Window
 from geogs.application.viewer.observer import RunObserver
+from geogs.evaluation.held_camera import level_axes
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 from geogs.geometry.camera import Camera
 from geogs.types import Frame, MapSnapshot
@@ -132,7 +133,8 @@ class LiveViewer(RunObserver):
         window.say(*update.words)
         if len(update.keyframes) > 1:
             extent = np.ptp(update.keyframes[:, :3, 3], axis=0)
-            window.stand_upright(update.keyframes, 2.5 * float(np.linalg.norm(extent)) + 1.0)
+            up = level_axes(update.keyframes)[2]
+            window.stand_upright(up, 2.5 * float(np.linalg.norm(extent)) + 1.0)
             window.show_path(update.keyframes[:, :3, 3])
         for id, T_wc in zip(update.keyframe_ids, update.keyframes, strict=True):
             window.show_keyframe(id, T_wc, update.camera)

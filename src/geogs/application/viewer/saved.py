@@ -4,13 +4,14 @@ import threading
 
 import numpy as np
 
-from geogs.application.results.result_page import first_view
+from geogs.application.results.result_page import stand
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.viewer.browser_window import Window
 from geogs.errors import InputError
+from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 
-MOST_FRUSTA, MOST_IMAGES = 400, 60
+MOST_FRUSTA = 24
 """Most keyframes shown, evenly along the path."""
 _IMAGE_EDGE = 160
 
@@ -23,16 +24,16 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
     """
     window = Window(f"geogs: {result.name}", host, port)
     mesh, trajectory = result.mesh, result.trajectory
-    tracked = trajectory.T_wc[trajectory.tracked]
-    tracked = tracked if len(tracked) else trajectory.T_wc
     points = result.disks.position.cpu().numpy() if mesh is None else mesh.vertices
-    axes, eye, target = first_view(np.concatenate([points, tracked[:, :3, 3]]), tracked)
-    window.stand_upright(tracked, float(np.linalg.norm(eye - target)))
-    window.look_from(eye, target, axes[2])
+    surface = None if mesh is None else facets(mesh.vertices, mesh.faces, mesh.normals)
+    levelled, start, _ = stand(trajectory, points, surface)
+    up = levelled.axes[2]
+    window.stand_upright(up, float(np.linalg.norm(start.eye - start.target)))
+    window.look_from(start, up)
     if mesh is not None:
         window.show_mesh(mesh)
     window.show_disks(result.disks)
-    window.show_path(tracked[:, :3, 3])
+    window.show_path(trajectory.T_wc[trajectory.tracked, :3, 3])
     _show_keyframes(result, window)
     _Inspector(result, window).begin()
     return window
@@ -42,14 +43,13 @@ def _show_keyframes(result: SavedResult, window: Window) -> None:
     views = result.views
     count = len(views.keyframe_id)
     shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
-    every = -(-len(shown) // MOST_IMAGES)
-    for place, number in enumerate(shown.tolist()):
-        id = int(views.keyframe_id[number])
-        image = result.image(number) if place % every == 0 else None
+    for number in shown.tolist():
+        image = result.image(number)
         if image is not None:
             step = -(-max(image.shape) // _IMAGE_EDGE)
             image = np.ascontiguousarray(image[::step, ::step])
-        window.show_keyframe(id, np.linalg.inv(views.T_cw[number]), result.camera, image)
+        id, T_wc = int(views.keyframe_id[number]), np.linalg.inv(views.T_cw[number])
+        window.show_keyframe(id, T_wc, result.camera, image)
 
 
 class _Inspector:

@@ -14,6 +14,8 @@ SCRIPTS = (
     "disks.js",
     "cameras.js",
     "controls.js",
+    "player.js",
+    "measure.js",
     "main.js",
 )
 """Scripts of the page, in the order in which they run; ``three.min.js`` comes before them."""

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int, UInt
 
 from geogs.evaluation.model_view.shown_model import DiskModel, ShownModel, SurfaceModel
+from geogs.evaluation.model_view.start_view import ASPECT, FIELD
 from geogs.geometry.lie import matrix_to_quaternion, quaternion_multiply
 from geogs.geometry.morton import morton_codes
 
@@ -32,9 +33,15 @@ def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
     R = webgl_axes(model.axes)
     arrays, images = _Arrays(), bytearray()
     scene: dict[str, Any] = {
-        "eye": (R @ model.eye).tolist(),
-        "target": (R @ model.target).tolist(),
+        "start": {
+            "eye": (R @ model.start.eye).tolist(),
+            "target": (R @ model.start.target).tolist(),
+            "field": FIELD,
+            "aspect": ASPECT,
+        },
         "lens": asdict(model.lens),
+        "lid": model.lid,
+        "lengths": asdict(model.lengths),
     }
     if model.surface is not None:
         scene["surface"] = _surface(model.surface, R, arrays)

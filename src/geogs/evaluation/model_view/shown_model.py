@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from geogs.evaluation.model_view.start_view import StartView
 from geogs.types import FrameState
 
 
@@ -89,19 +90,30 @@ class ImageExtent:
 
 
 @dataclass(frozen=True)
+class Lengths:
+    """What a unit of the map is."""
+
+    metres: float | None = None
+    """None where that is not known."""
+    note: str = ""
+    """A sentence on it, for those who measure."""
+
+
+@dataclass(frozen=True)
 class ShownModel:
     """All that is shown, in the frame of the map, with the axes by which it stands upright."""
 
     axes: Float[np.ndarray, "3 3"]
-    """Rows right, forward and up of the world, as the camera was held."""
-    eye: Float[np.ndarray, "3"]
-    """From where it is seen first."""
-    target: Float[np.ndarray, "3"]
-    """What it turns about."""
+    """Rows right, forward and up of the world."""
+    start: StartView
+    """From where it is seen first, and what it turns about."""
     lens: ImageExtent
     surface: SurfaceModel | None = None
     paths: Sequence[PathModel] = ()
     keyframes: Sequence[KeyframeModel] = ()
     disks: DiskModel | None = None
+    lid: float | None = None
+    """Height from which on nothing is shown to those who look down from above it."""
+    lengths: Lengths = field(default_factory=Lengths)
     notes: Sequence[str] = field(default_factory=tuple)
     """Sentences under it, such as what was left out."""

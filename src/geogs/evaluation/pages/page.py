@@ -207,14 +207,15 @@ _STYLE = """
 }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--text); background: var(--back);
   max-width: 1180px; margin: 0 auto; padding: 1.6em 1.2em 4em; }
-h1 { font-size: 1.5em; font-weight: 600; letter-spacing: -0.01em; margin: 0.2em 0; }
+h1 { font-size: 2.1em; font-weight: 650; letter-spacing: -0.02em; line-height: 1.2; margin: 0; }
 h2 { font-size: 1.08em; font-weight: 600; margin: 2.2em 0 0.6em; }
-.verdict { margin: 0.3em 0 0.9em; padding-left: 1.15em; position: relative; max-width: 75ch; }
+.verdict { font-size: 1.15em; margin: 0.5em 0 0.7em; padding-left: 1.15em; position: relative;
+  max-width: 80ch; }
 .verdict::before { content: ""; position: absolute; left: 0; top: 0.5em; width: 0.55em;
   height: 0.55em; border-radius: 50%; background: var(--soft); }
 .verdict.good::before { background: var(--good); } .verdict.bad::before { background: var(--bad); }
 dl { display: flex; flex-wrap: wrap; gap: 0.6em 2.2em; margin: 0.8em 0; }
-dt { color: var(--soft); font-size: 0.84em; } dd { margin: 0; font-size: 1.22em;
+dt { color: var(--soft); font-size: 0.9em; } dd { margin: 0; font-size: 1.5em; line-height: 1.25;
   font-variant-numeric: tabular-nums; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
 th, td { padding: 0.22em 1.2em 0.22em 0; border-bottom: 1px solid var(--line); white-space: pre;

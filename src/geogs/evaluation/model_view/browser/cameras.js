@@ -1,15 +1,16 @@
-// Paths, keyframes as frusta, and their images.
+// Paths, some keyframes as frusta, and the camera that the slider moves along them.
 
 const PATH = { tracked: 0xf2a33a, turned: 0xb58cff, lost: 0xff5a5a, truth: 0xc9ced6 };
-const FRUSTUM = 0x6fb1f0, CHOSEN = 0xffd166;
+const FRUSTUM = 0x8fb8dd, CHOSEN = 0xffd166;
+const MOST_FRUSTA = 24;
 
-function lines(stage, points, width, colours) {
+function lines(stage, points, colours, options) {
   const geometry = new THREE.LineSegmentsGeometry();
   geometry.setPositions(points);
-  if (Array.isArray(colours)) geometry.setColors(colours);
+  const isMany = Array.isArray(colours);
+  if (isMany) geometry.setColors(colours);
   const material = new THREE.LineMaterial({
-    linewidth: width, vertexColors: Array.isArray(colours),
-    color: Array.isArray(colours) ? 0xffffff : colours,
+    vertexColors: isMany, color: isMany ? 0xffffff : colours, ...options,
   });
   const resized = () => material.resolution.set(stage.box.clientWidth, stage.box.clientHeight);
   resized();
@@ -30,59 +31,67 @@ function makePath(stage, { name, points, states }, content) {
     }
   }
   if (!ends.length) return null;
-  const line = lines(stage, ends, known ? 3 : 2, colours);
+  const line = lines(stage, ends, colours, { linewidth: known ? 2.5 : 1.5 });
   line.name = name;
   return line;
 }
 
+// The corners of a frustum's lines for a camera at the origin, with the image at this depth.
+function frustumLines({ right, down }, depth) {
+  const far = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    .map(([x, y]) => [x * right * depth, y * down * depth, depth]);
+  return far.flatMap((corner, i) => [0, 0, 0, ...corner, ...corner, ...far[(i + 1) % 4]]);
+}
+
+// Keyframes evenly spread over a path, none nearer to the one before than a distance.
+function spread(keyframes, most, least) {
+  const chosen = [];
+  const step = Math.max(1, keyframes.length / most);
+  for (let i = 0; i < keyframes.length; i += step) {
+    const keyframe = keyframes[Math.floor(i)], before = chosen.at(-1);
+    if (!before || before.position.distanceTo(keyframe.position) > least) chosen.push(keyframe);
+  }
+  return chosen;
+}
+
 function makeKeyframes(stage, scene, images) {
-  const { right, down } = scene.lens;
-  const depth = 0.035 * stage.reach / Math.max(right, down);
-  const group = new THREE.Group(), shown = new THREE.Group();
-  const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]];
-  const keyframes = scene.keyframes.map(({ name, T_wc: m, image }, number) => {
+  const keyframes = scene.keyframes.map(({ name, T_wc: m, image }) => {
     const T = new THREE.Matrix4().set(...m, 0, 0, 0, 1);
     const blob = image && new Blob([images.subarray(image[0], image[0] + image[1])],
       { type: 'image/jpeg' });
-    const position = new THREE.Vector3(m[3], m[7], m[11]);
-    const forward = new THREE.Vector3(m[2], m[6], m[10]);
-    return { name, number, T, blob, position, forward };
+    const turn = new THREE.Quaternion().setFromRotationMatrix(T);
+    return { name, T, turn, blob, position: new THREE.Vector3(m[3], m[7], m[11]) };
   });
-
-  const ends = (keyframe, size) => {
-    const at = (x, y, z) => new THREE.Vector3(x, y, z).applyMatrix4(keyframe.T);
-    const far = corners.map(([x, y]) => at(x * right * size, y * down * size, size));
-    const apex = at(0, 0, 0), result = [];
-    far.forEach((corner, i) => {
-      const next = far[(i + 1) % 4];
-      result.push(...apex.toArray(), ...corner.toArray(), ...corner.toArray(), ...next.toArray());
-    });
-    return result;
-  };
-  // Of keyframes that stand close together and look the same way, one is drawn.
-  const drawn = [];
-  for (const keyframe of keyframes) {
-    const { position, forward } = keyframe;
-    const isNear = (other) => other.position.distanceTo(position) < 0.4 * depth
-      && other.forward.dot(forward) > 0.94;
-    if (!drawn.slice(-60).some(isNear)) drawn.push(keyframe);
+  const { right, down } = scene.lens;
+  const depth = 0.014 * stage.reach / Math.max(right, down);
+  const group = new THREE.Group();
+  const shape = frustumLines(scene.lens, depth), corner = new THREE.Vector3();
+  const all = spread(keyframes, MOST_FRUSTA, depth).flatMap(({ T }) => {
+    const placed = [];
+    for (let i = 0; i < shape.length; i += 3) {
+      placed.push(...corner.fromArray(shape, i).applyMatrix4(T).toArray());
+    }
+    return placed;
+  });
+  if (all.length) {
+    group.add(lines(stage, all, FRUSTUM, { linewidth: 1, transparent: true, opacity: 0.6 }));
   }
-  const all = drawn.flatMap((keyframe) => ends(keyframe, depth));
-  if (all.length) group.add(lines(stage, all, 1.5, FRUSTUM));
 
-  const loaded = new Map();
-  const picture = (keyframe, size) => {
-    const plane = new THREE.Mesh(
-      new THREE.PlaneGeometry(2 * right, 2 * down),
-      new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, color: 0x30343b }));
-    // The plane's y points up in the image, the camera's down.
-    plane.matrixAutoUpdate = false;
-    plane.matrix.copy(keyframe.T)
-      .multiply(new THREE.Matrix4().makeScale(size, -size, -size))
-      .multiply(new THREE.Matrix4().makeTranslation(0, 0, -1));
-    plane.userData.keyframe = keyframe;
-    if (!loaded.has(keyframe)) {
-      loaded.set(keyframe, createImageBitmap(keyframe.blob, { imageOrientation: 'flipY' })
+  // The camera that moves: its frustum with the image in it.
+  const moving = new THREE.Group(), size = 2.5 * depth;
+  moving.add(lines(stage, frustumLines(scene.lens, size), CHOSEN, { linewidth: 2 }));
+  const picture = new THREE.Mesh(
+    new THREE.PlaneGeometry(2 * right, 2 * down),
+    new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, color: 0x30343b }));
+  // The plane's y points up in the image, the camera's down.
+  picture.scale.set(size, -size, 1);
+  picture.position.z = size;
+  moving.add(picture);
+  const textures = new Map();
+  const show = async (keyframe) => {
+    picture.userData.keyframe = keyframe;
+    if (!textures.has(keyframe)) {
+      textures.set(keyframe, createImageBitmap(keyframe.blob, { imageOrientation: 'flipY' })
         .then((bitmap) => {
           const texture = new THREE.Texture(bitmap);
           texture.flipY = false;
@@ -91,71 +100,50 @@ function makeKeyframes(stage, scene, images) {
           return texture;
         }));
     }
-    loaded.get(keyframe).then((texture) => {
-      plane.material.map = texture;
-      plane.material.color.set(0xffffff);
-      plane.material.needsUpdate = true;
-      stage.draw();
-    });
-    return plane;
-  };
-
-  let planes = null, chosen = null;
-  const showImages = (on) => {
-    if (on && !planes) {
-      planes = new THREE.Group();
-      drawn.filter((k) => k.blob).forEach((k) => planes.add(picture(k, depth)));
-      group.add(planes);
-    }
-    if (planes) planes.visible = on;
-  };
-  const choose = (keyframe) => {
-    if (chosen) shown.remove(...chosen.parts);
-    chosen = keyframe && { keyframe, parts: [lines(stage, ends(keyframe, 2 * depth), 2.5, CHOSEN)] };
-    if (keyframe && keyframe.blob) chosen.parts.push(picture(keyframe, 2 * depth));
-    if (chosen) shown.add(...chosen.parts);
+    const texture = await textures.get(keyframe);
+    if (picture.userData.keyframe !== keyframe) return;
+    picture.material.needsUpdate = !picture.material.map;
+    picture.material.map = texture;
+    picture.material.color.set(0xffffff);
     stage.draw();
   };
 
-  // The nearest apex or image centre within some pixels of the pointer.
+  // Put the moving camera at a place, a number between two keyframes; that which is nearest.
+  const moveTo = (place) => {
+    const a = keyframes[Math.floor(place)];
+    const b = keyframes[Math.min(Math.floor(place) + 1, keyframes.length - 1)];
+    moving.position.lerpVectors(a.position, b.position, place % 1);
+    moving.quaternion.slerpQuaternions(a.turn, b.turn, place % 1);
+    moving.updateMatrixWorld();
+    const nearest = place % 1 < 0.5 ? a : b;
+    if (nearest.blob) show(nearest);
+    stage.draw();
+    return nearest;
+  };
+
+  // The number of the keyframe that is within some pixels of the pointer.
   const near = (x, y) => {
-    let best = null, least = 22;
-    for (const keyframe of keyframes) {
+    let best = null, least = 18;
+    keyframes.forEach(({ T }, number) => {
       for (const z of [0, depth]) {
-        const at = new THREE.Vector3(0, 0, z).applyMatrix4(keyframe.T).project(stage.camera);
-        if (at.z > 1) continue;
-        const dx = (at.x + 1) / 2 * stage.box.clientWidth - x;
-        const dy = (1 - at.y) / 2 * stage.box.clientHeight - y;
-        const away = Math.hypot(dx, dy);
-        if (away < least) [best, least] = [keyframe, away];
+        const at = stage.pixel(corner.set(0, 0, z).applyMatrix4(T));
+        const away = at ? Math.hypot(at[0] - x, at[1] - y) : Infinity;
+        if (away < least) [best, least] = [number, away];
       }
-    }
+    });
     return best;
   };
 
-  const ahead = 0.15 * stage.reach;
-  const field = () => 2 * Math.atan(Math.max(down, right / stage.camera.aspect)) * 180 / Math.PI;
-  const lookFrom = ({ position, forward }) =>
-    stage.fly(position, position.clone().addScaledVector(forward, ahead), field());
-
-  // From the first keyframe to the last, at a quarter of a second each.
-  const flyThrough = (ended) => {
-    const count = keyframes.length, { camera, orbit } = stage;
-    const seconds = Math.min(Math.max(0.25 * count, 4), 40);
-    const start = performance.now();
-    camera.fov = field();
+  // Look from where the moving camera is.
+  const ride = () => {
+    const { camera, orbit } = stage;
+    camera.fov = 2 * Math.atan(Math.max(down, right / camera.aspect)) * 180 / Math.PI;
     camera.updateProjectionMatrix();
-    stage.run((now) => {
-      const place = Math.min(Math.max((now - start) / 1000 / seconds, 0), 1) * (count - 1);
-      const a = keyframes[Math.floor(place)], b = keyframes[Math.min(Math.floor(place) + 1, count - 1)];
-      const way = new THREE.Vector3().lerpVectors(a.forward, b.forward, place % 1);
-      camera.position.lerpVectors(a.position, b.position, place % 1);
-      orbit.target.copy(camera.position).addScaledVector(way, ahead);
-      camera.lookAt(orbit.target);
-      if (place < count - 1) return true;
-      ended();
-      return false;
-    });
+    camera.position.copy(moving.position);
+    orbit.target.set(0, 0, 0.15 * stage.reach).applyMatrix4(moving.matrixWorld);
+    camera.lookAt(orbit.target);
   };
-  return { group, shown, keyframes, showImages, choose, near, lookFrom, flyThrough };
+  const shown = new THREE.Group();
+  shown.add(group, moving);
+  return { group, shown, aspect: right / down, keyframes, moveTo, near, ride };
 }

@@ -1,4 +1,4 @@
-// Buttons, legend, and the strip of keyframes.
+// Buttons and the legend.
 
 const element = (tag, attributes = {}, text = '') => {
   const made = Object.assign(document.createElement(tag), attributes);
@@ -40,34 +40,4 @@ function showLegend(box, legend) {
   ends.append(...legend.ends.map((end) => element('em', {}, end)));
   box.append(bar, ends);
   if (legend.note) box.append(element('small', {}, legend.note));
-}
-
-// A strip of images below; a click shows a keyframe where it is, another one looks from there.
-function makeStrip(box, keyframes, pick) {
-  const cells = new Map();
-  const seen = new IntersectionObserver((entries) => entries.forEach(({ isIntersecting, target }) => {
-    if (!isIntersecting) return;
-    seen.unobserve(target);
-    const image = target.firstChild;
-    image.onload = () => URL.revokeObjectURL(image.src);
-    image.src = URL.createObjectURL(target.keyframe.blob);
-  }), { root: box, rootMargin: '0px 400px' });
-  for (const keyframe of keyframes.filter((k) => k.blob)) {
-    const cell = element('button', { type: 'button', title: keyframe.name });
-    cell.keyframe = keyframe;
-    cell.append(element('img', { alt: '' }));
-    cell.onclick = () => pick(keyframe);
-    cells.set(keyframe, cell);
-    box.append(cell);
-    seen.observe(cell);
-  }
-  box.hidden = !cells.size;
-  return (keyframe) => {
-    cells.forEach((cell, k) => cell.setAttribute('aria-pressed', String(k === keyframe)));
-    const cell = cells.get(keyframe);
-    if (cell) {
-      box.scrollTo({ left: cell.offsetLeft - box.clientWidth / 2 + cell.clientWidth / 2,
-        behavior: 'smooth' });
-    }
-  };
 }

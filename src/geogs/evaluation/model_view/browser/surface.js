@@ -1,7 +1,29 @@
-// The mesh: in the colours of the images, plain, or in those of its errors. Walls are not seen from
-// behind, so that one looks into a room from outside.
+// The mesh: in the colours of the images, plain, or in those of its errors. What turns its back, and
+// a ceiling that one looks down on, is a veil, so that one looks into a room from outside.
 
-function makeSurface(packed, content) {
+const VERTEX = `
+  attribute vec3 tint; varying vec3 vTint; varying vec3 vNormal; varying vec3 vView; varying float vHeight;
+  void main() {
+    vec4 place = modelViewMatrix * vec4(position, 1.0);
+    vTint = tint; vNormal = normalMatrix * normal; vView = -place.xyz; vHeight = position.y;
+    gl_Position = projectionMatrix * place;
+  }`;
+
+const FRAGMENT = `
+  uniform float strength; uniform bool plain; uniform bool veil; uniform float lid;
+  varying vec3 vTint; varying vec3 vNormal; varying vec3 vView; varying float vHeight;
+  void main() {
+    if ((gl_FrontFacing && vHeight < lid) == veil) discard;
+    vec3 n = normalize(vNormal) * (gl_FrontFacing ? 1.0 : -1.0);
+    float head = max(dot(n, normalize(vView)), 0.0);
+    float lamp = max(dot(n, normalize(vec3(-0.35, 0.8, 0.5))), 0.0);
+    float light = 1.0 - strength + strength * (0.55 * head + 0.6 * lamp);
+    vec3 colour = plain ? vec3(0.80, 0.81, 0.83) : vTint;
+    if (veil) gl_FragColor = vec4(mix(colour, vec3(0.62, 0.68, 0.76), 0.6), 0.035 + 0.10 * pow(1.0 - head, 2.0));
+    else gl_FragColor = vec4(colour * light, 1.0);
+  }`;
+
+function makeSurface(packed, content, lid) {
   const geometry = new THREE.BufferGeometry();
   const vertices = lengths(unpacked(content, packed.vertices), packed.box);
   const faces = unpacked(content, packed.faces);
@@ -24,35 +46,24 @@ function makeSurface(packed, content) {
   }
   looks.set('Shape', { colour: null, legend: null, strength: 0.8 });
 
-  const material = new THREE.ShaderMaterial({
-    vertexShader: `
-      attribute vec3 tint; varying vec3 vTint; varying vec3 vNormal; varying vec3 vView;
-      void main() {
-        vec4 place = modelViewMatrix * vec4(position, 1.0);
-        vTint = tint; vNormal = normalMatrix * normal; vView = -place.xyz;
-        gl_Position = projectionMatrix * place;
-      }`,
-    fragmentShader: `
-      uniform float strength; uniform bool plain;
-      varying vec3 vTint; varying vec3 vNormal; varying vec3 vView;
-      void main() {
-        vec3 n = normalize(vNormal) * (gl_FrontFacing ? 1.0 : -1.0);
-        float head = max(dot(n, normalize(vView)), 0.0);
-        float lamp = max(dot(n, normalize(vec3(-0.35, 0.8, 0.5))), 0.0);
-        float light = 1.0 - strength + strength * (0.55 * head + 0.6 * lamp);
-        vec3 colour = plain ? vec3(0.80, 0.81, 0.83) : vTint;
-        gl_FragColor = vec4(colour * light, 1.0);
-      }`,
-    uniforms: { strength: { value: 0.2 }, plain: { value: false } },
-    side: THREE.FrontSide,
-  });
-  const mesh = new THREE.Mesh(geometry, material);
+  const shared = { strength: { value: 0.2 }, plain: { value: false }, lid };
+  const made = (veil) => new THREE.Mesh(geometry, new THREE.ShaderMaterial({
+    vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: { ...shared, veil: { value: veil } },
+    side: veil ? THREE.DoubleSide : THREE.FrontSide, transparent: veil, depthWrite: !veil,
+  }));
+  const solid = made(false), group = new THREE.Group();
+  group.add(solid, made(true));
   const look = (name) => {
     const { colour, strength } = looks.get(name);
     if (colour) geometry.setAttribute('tint', colour);
-    material.uniforms.plain.value = !colour;
-    material.uniforms.strength.value = strength;
+    shared.plain.value = !colour;
+    shared.strength.value = strength;
     return looks.get(name);
   };
-  return { mesh, looks, look, material };
+  // Where a ray meets what is not a veil.
+  const meet = (ray) => {
+    const hit = ray.intersectObject(solid).find(({ point }) => point.y < lid.value);
+    return hit && hit.point;
+  };
+  return { group, looks, look, meet };
 }

@@ -25,13 +25,11 @@ _UNLIT = "KHR_materials_unlit"
 Material = dict[str, object]
 """Entries of the document that say what the surface looks like."""
 
-PLAIN: Material = {
-    "materials": [{
-        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-        "doubleSided": True,
-    }],
-}  # fmt: skip
+_ROUGH = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+PLAIN: Material = {"materials": [{"pbrMetallicRoughness": _ROUGH, "doubleSided": True}]}
 """Rough, seen from both sides, in the colours of the vertices."""
+ONE_SIDED: Material = {"materials": [{"pbrMetallicRoughness": _ROUGH}]}
+"""The same, not seen from behind, so that one looks into a room from outside."""
 
 
 class GltfBuffer:
@@ -78,12 +76,8 @@ class GltfBuffer:
             "textures": [{"source": 0, "sampler": 0}],
         }
 
-    def write(self, path: Path, attributes: dict[str, int], corners: int, look: Material) -> None:
-        """Write the file with one mesh of these arrays.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+    def packed(self, attributes: dict[str, int], corners: int, look: Material) -> bytes:
+        """The file with one mesh of these arrays."""
         primitive = {"attributes": attributes, "indices": corners, "material": 0}
         document = {
             "asset": {"version": "2.0", "generator": "geogs"},
@@ -99,10 +93,11 @@ class GltfBuffer:
         text, data = json.dumps(document).encode(), self._data
         text += b" " * (-len(text) % 4)
         data += b"\0" * (-len(data) % 4)
-        with atomic_file(path) as stream:
-            stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)))
-            stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
-            stream.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
+        return b"".join([
+            struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)),
+            struct.pack("<I4s", len(text), b"JSON"), text,
+            struct.pack("<I4s", len(data), b"BIN\0"), data,
+        ])  # fmt: skip
 
     def _accessor(self, values: np.ndarray, target: int, entry: dict[str, object]) -> int:
         view = self._view(values.tobytes(), {"target": target})
@@ -124,7 +119,19 @@ def write_glb(
     normals: Float[np.ndarray, "n 3"],
     colours: UInt8[np.ndarray, "n 3"] | None,
 ) -> None:
-    """Write glTF 2.0 in one file: y up, looking along -z, counter-clockwise faces.
+    """Write glTF 2.0 in one file, with axes and colours as in ``glb``."""
+    with atomic_file(path) as stream:
+        stream.write(glb(vertices, faces, normals, colours))
+
+
+def glb(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+    colours: UInt8[np.ndarray, "n 3"] | None,
+    look: Material = PLAIN,
+) -> bytes:
+    """glTF 2.0 in one file: y up, looking along -z, counter-clockwise faces.
 
     The world is turned by a half turn about x, so that what was down in the first image is down.
     Colours are linear in the file, as glTF has them; ours are sRGB.
@@ -140,7 +147,7 @@ def write_glb(
         steps = np.round(linear(colours) * 65535).astype("<u2")
         opaque = np.concatenate([steps, np.full((len(steps), 1), 65535, "<u2")], 1)
         attributes["COLOR_0"] = gltf.add_steps(opaque)
-    gltf.write(path, attributes, corners, PLAIN)
+    return gltf.packed(attributes, corners, look)
 
 
 def write_textured_glb(
@@ -166,7 +173,8 @@ def write_textured_glb(
         "TEXCOORD_0": gltf.add((uv + 0.5) / size, "VEC2"),
     }
     corners = gltf.add_corners(faces)
-    gltf.write(path, attributes, corners, gltf.textured(_jpeg(texture)))
+    with atomic_file(path) as stream:
+        stream.write(gltf.packed(attributes, corners, gltf.textured(_jpeg(texture))))
 
 
 def _jpeg(texture: UInt8[np.ndarray, "h w 3"]) -> bytes:
