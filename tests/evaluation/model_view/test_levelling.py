@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from box_room import box, circle
-from geogs.evaluation.model_view.levelling import Facets, ceiling, level
+from geogs.evaluation.model_view.levelling import Facets, level
+from geogs.evaluation.model_view.room import DEEP, find_room
 from geogs.evaluation.model_view.start_view import ASPECT, FIELD, start_view
 
 HALF = np.array([3.0, 2.0, 1.2])
@@ -89,16 +90,22 @@ def test_what_has_no_planes_stands_as_the_camera_was_held():
         assert found.sentence == "Upright as the camera was held."
 
 
-def test_ceilings_are_found_where_they_are_the_top():
-    straight = Rotation.identity()
-    up = np.array([0.0, 0, 1])
-    assert ceiling(room(straight), up, 0.0) == pytest.approx(1.2, abs=0.02)
-    assert ceiling(room(straight, "EWNSF"), up, 0.0) is None
-    table = room(straight, "FC")
-    tower = room(straight, "EWNSF")
+def test_walls_and_ceilings_are_found_where_nothing_is_beyond():
+    straight, axes = Rotation.identity(), np.eye(3)
+    closed = find_room(room(straight, clutter=0.2), axes, circle())
+    assert np.allclose(closed.high, HALF - 2 * HALF * DEEP, atol=0.05)
+    assert np.allclose(closed.low[:2], -closed.high[:2], atol=0.05)
+    assert closed.low[2] == -np.inf
+    assert -1.2 < closed.ground < -0.9
+    open_room = find_room(room(straight, "NEF", clutter=0.2), axes, circle())
+    assert np.isfinite(open_room.high).tolist() == [True, True, False]
+    assert np.isinf(open_room.low).all()
+    table, tower = room(straight, "FC", clutter=0.2), room(straight, "F", clutter=0.2)
     higher = Facets(*(np.concatenate(pair) for pair in zip(table, tower, strict=True)))
-    higher.centres[len(table.areas):, 2] += 2  # fmt: skip
-    assert ceiling(higher, up, 0.0) is None
+    higher.centres[len(table.areas) :, 2] += 5
+    assert find_room(higher, axes, circle()).high[2] == np.inf
+    outwards = Facets(table.centres, -table.normals, table.areas)
+    assert find_room(outwards, axes, circle()).high[2] == np.inf
 
 
 def test_an_open_room_is_seen_from_where_it_is_open():

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.application.results.saved_result import SavedResult
-from geogs.evaluation.model_view.levelling import Facets, Level, ceiling, facets, level
+from geogs.evaluation.model_view.levelling import Facets, Level, facets, level
+from geogs.evaluation.model_view.room import find_room
 from geogs.evaluation.model_view.shown_model import (
     Colouring,
     DiskModel,
@@ -32,8 +33,6 @@ MOST_FACES, MOST_DISKS, MOST_IMAGES = 300_000, 60_000, 240
 """Most of each on a page, which then has less than 8 MB."""
 IMAGE_BYTES = 1_500_000
 """Bytes of all images of a page together, about."""
-CUT = 0.04
-"""Of the height of a room, by which it is cut below its ceiling for those who look from above."""
 _BYTES_A_PIXEL = 0.2
 _LONGEST_EDGE, _SHORTEST_EDGE = 480, 128
 _QUALITY = 75
@@ -174,7 +173,7 @@ def shown_model(
         paths.append(PathModel("True path", true_path))
     shape = None if surface is None else surface.vertices
     shape = shape if shape is not None or disk_model is None else disk_model.position
-    levelled, start, lid = stand(trajectory, shape, seen)
+    levelled, start = stand(trajectory, shape, seen)
     return ShownModel(
         levelled.axes,
         start,
@@ -183,7 +182,7 @@ def shown_model(
         paths,
         _keyframes(views, camera),
         disk_model,
-        lid,
+        None if seen is None else find_room(seen, levelled.axes, _known(trajectory)),
         unit,
         [levelled.sentence, unit.note, *notes],
     )
@@ -191,24 +190,24 @@ def shown_model(
 
 def stand(
     trajectory: Trajectory, points: Float[np.ndarray, "n 3"] | None, surface: Facets | None
-) -> tuple[Level, StartView, float | None]:
-    """How a result stands upright, from where it is seen first, and where its ceiling is cut.
+) -> tuple[Level, StartView]:
+    """How a result stands upright, and from where it is seen first.
 
     Args:
         trajectory: of all frames.
         points: of its shape, if it has one.
         surface: its mesh, if it has one.
     """
-    T_wc = trajectory.T_wc[trajectory.tracked]
-    T_wc = T_wc if len(T_wc) else trajectory.T_wc
-    points = T_wc[:, :3, 3] if points is None else points
+    T_wc = _known(trajectory)
     levelled = level(surface, T_wc)
-    up = levelled.axes[2]
-    start = start_view(points, levelled.axes, T_wc, surface)
-    heights = np.quantile(points @ up, [0.005, 0.995])
-    top = None if surface is None else ceiling(surface, up, float(np.median(T_wc[:, :3, 3] @ up)))
-    lid = None if top is None else top - CUT * float(np.ptp(heights))
-    return levelled, start, lid
+    points = T_wc[:, :3, 3] if points is None else points
+    return levelled, start_view(points, levelled.axes, T_wc, surface)
+
+
+def _known(trajectory: Trajectory) -> Float[np.ndarray, "k 4 4"]:
+    """Camera to world of the frames whose place is known, or of all where none is."""
+    tracked = trajectory.tracked
+    return trajectory.T_wc[tracked] if tracked.any() else trajectory.T_wc
 
 
 def _disks(disks: MapSnapshot) -> DiskModel:

@@ -26,7 +26,7 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
     mesh, trajectory = result.mesh, result.trajectory
     points = result.disks.position.cpu().numpy() if mesh is None else mesh.vertices
     surface = None if mesh is None else facets(mesh.vertices, mesh.faces, mesh.normals)
-    levelled, start, _ = stand(trajectory, points, surface)
+    levelled, start = stand(trajectory, points, surface)
     up = levelled.axes[2]
     window.stand_upright(up, float(np.linalg.norm(start.eye - start.target)))
     window.look_from(start, up)

@@ -16,8 +16,6 @@ LEAST_SHARE = 0.18
 """Of all area, which has to agree; of a ball 9 % do."""
 LEAST_WALLS = 0.25
 """Length of the mean of walls' quadrupled azimuths from which rooms count as rectangular."""
-LEAST_CEILING, MOST_OVER = 0.1, 0.03
-"""Area of a ceiling as a part of that of floors, and of what is over it as a part of all."""
 _STEP, _WIDTH = 2.5, 4.0
 """Degrees between directions that are tried, and the deviation of a vote."""
 _PARTS = 32
@@ -85,22 +83,6 @@ def level(surface: Facets | None, T_wc: Float[np.ndarray, "k 4 4"]) -> Level:
     if share < LEAST_SHARE:
         return Level(held, None)
     return Level(_along_walls(normals, weights, level_axes(T_wc, up)), share)
-
-
-def ceiling(surface: Facets, up: Float[np.ndarray, "3"], above: float) -> float | None:
-    """Height along ``up`` of the ceiling; none where little above that height faces down, or where
-    it is not the top of all."""
-    heights, facing = surface.centres @ up, surface.normals @ up
-    below = np.cos(np.radians(2 * AGREES))
-    is_ceiling = (facing < -below) & (heights > above)
-    floor = surface.areas[facing > below].sum()
-    if not surface.areas[is_ceiling].sum() > LEAST_CEILING * floor:
-        return None
-    order = np.argsort(heights[is_ceiling])
-    summed = surface.areas[is_ceiling][order].cumsum()
-    height = float(heights[is_ceiling][order][summed.searchsorted(summed[-1] / 2)])
-    over = surface.areas[heights > height + 0.05 * np.ptp(heights)].sum()
-    return height if over < MOST_OVER * surface.areas.sum() else None
 
 
 def _together(surface: Facets) -> tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b"]]:

@@ -10,6 +10,7 @@ from geogs.evaluation.model_view.shown_model import ShownModel
 SCRIPTS = (
     "unpack.js",
     "stage.js",
+    "room.js",
     "surface.js",
     "disks.js",
     "cameras.js",

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt
 
+from geogs.evaluation.model_view.room import Room
 from geogs.evaluation.model_view.shown_model import DiskModel, ShownModel, SurfaceModel
 from geogs.evaluation.model_view.start_view import ASPECT, FIELD
 from geogs.geometry.lie import matrix_to_quaternion, quaternion_multiply
@@ -21,6 +22,7 @@ from geogs.geometry.morton import morton_codes
 STEPS = 65_535
 """Steps of a quantised coordinate."""
 _BYTE = 127
+_FAR = 1e30
 _SCALE_STEPS = 255
 _STATES = ("tracked", "orientation only", "lost")
 
@@ -40,7 +42,7 @@ def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
             "aspect": ASPECT,
         },
         "lens": asdict(model.lens),
-        "lid": model.lid,
+        "room": model.room and _room(model.room),
         "lengths": asdict(model.lengths),
     }
     if model.surface is not None:
@@ -66,6 +68,16 @@ def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
     if model.disks is not None:
         scene["disks"] = _disks(model.disks, R, arrays)
     return scene, zlib.compress(bytes(arrays.content), 6), bytes(images)
+
+
+def _room(room: Room) -> dict[str, Any]:
+    """Bounds as WebGL has its axes, whose z is backward; far away where there is none."""
+    low, high = (np.clip(bound, -_FAR, _FAR).tolist() for bound in (room.low, room.high))
+    return {
+        "low": [low[0], low[2], -high[1]],
+        "high": [high[0], high[2], -low[1]],
+        "ground": room.ground,
+    }
 
 
 def webgl_axes(axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

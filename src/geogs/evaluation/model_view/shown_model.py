@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from geogs.evaluation.model_view.room import Room
 from geogs.evaluation.model_view.start_view import StartView
 from geogs.types import FrameState
 
@@ -112,8 +113,8 @@ class ShownModel:
     paths: Sequence[PathModel] = ()
     keyframes: Sequence[KeyframeModel] = ()
     disks: DiskModel | None = None
-    lid: float | None = None
-    """Height from which on nothing is shown to those who look down from above it."""
+    room: Room | None = None
+    """What is in the way of those who look in from outside."""
     lengths: Lengths = field(default_factory=Lengths)
     notes: Sequence[str] = field(default_factory=tuple)
     """Sentences under it, such as what was left out."""

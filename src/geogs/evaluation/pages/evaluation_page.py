@@ -148,8 +148,19 @@ def error_figures(evaluation: Evaluation) -> list[tuple[str, str]]:
         result.append(("within 2 sigma", f"{evaluation.reliability.within_two_sigma:.1%}"))
     if evaluation.reconstruction is not None:
         rows = [row for row in evaluation.reconstruction.rows() if not row[0].startswith(" ")]
-        result += rows[:3]
+        result += [_with_unit(*row) for row in rows[:3]]
     return result
+
+
+def _with_unit(name: str, value: str) -> tuple[str, str]:
+    """A number as people say it, from one that stands under "name (unit, of what)"."""
+    name, _, rest = name.partition(" (")
+    unit, _, of_what = rest.removesuffix(")").partition(" ")
+    try:
+        number = f"{float(f'{float(value):.3g}'):g}"
+    except ValueError:
+        return name, value
+    return f"{name} {of_what}".strip(), f"{number} {unit}".strip()
 
 
 def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
 // The disks as flat ellipses out to one and a half deviations, coloured by where they face; not seen from
 // behind.
 
-function makeDisks(packed, content, lid) {
+function makeDisks(packed, content, room) {
   const count = packed.position[1];
   const turns = Float32Array.from(unpacked(content, packed.quaternion), (v) => (v - 128) / 127);
   const [low, high] = packed.logs;
@@ -19,24 +19,24 @@ function makeDisks(packed, content, lid) {
   const material = new THREE.ShaderMaterial({
     vertexShader: `
       attribute vec3 centre; attribute vec4 turn; attribute vec2 size;
-      varying vec2 vPlace; varying vec3 vTint; varying float vHeight;
+      varying vec2 vPlace; varying vec3 vTint; varying vec3 vCentre;
       vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) + q.x * v); }
       void main() {
         vec4 q = normalize(turn);
-        vPlace = position.xy; vHeight = centre.y;
+        vPlace = position.xy; vCentre = centre;
         vTint = 0.52 + 0.38 * turned(q, vec3(0.0, 0.0, 1.0));
         vec3 offset = turned(q, vec3(1.5 * size * position.xy, 0.0));
         gl_Position = projectionMatrix * modelViewMatrix * vec4(centre + offset, 1.0);
       }`,
     fragmentShader: `
-      uniform float lid;
-      varying vec2 vPlace; varying vec3 vTint; varying float vHeight;
+      varying vec2 vPlace; varying vec3 vTint; varying vec3 vCentre;
+      ${IN_THE_WAY}
       void main() {
         float r = dot(vPlace, vPlace);
-        if (r > 1.0 || vHeight > lid) discard;
+        if (r > 1.0 || isInTheWay(vCentre)) discard;
         gl_FragColor = vec4(vTint * (1.0 - 0.45 * smoothstep(0.55, 1.0, r)), 1.0);
       }`,
-    uniforms: { lid },
+    uniforms: room.uniforms,
     side: THREE.FrontSide,
   });
   const mesh = new THREE.Mesh(geometry, material);

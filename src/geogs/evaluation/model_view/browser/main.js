@@ -45,19 +45,14 @@ async function show() {
 
 // The surface in one of its looks, or the disks in its place; the surface, if there is one.
 function showThings(stage, scene, content) {
-  const lid = { value: 1e30 };
-  // Who is below the ceiling sees it; who is above looks through.
-  const height = scene.lid ?? 1e30;
-  stage.orbit.addEventListener('change', () => {
-    lid.value = stage.camera.position.y > height ? height : 1e30;
-  });
-  const surface = scene.surface && makeSurface(scene.surface, content, lid);
+  const room = makeRoom(scene.room, stage.camera);
+  const surface = scene.surface && makeSurface(scene.surface, content, room);
   if (surface) stage.world.add(surface.group);
   let disks = null;
   const look = (name) => {
     const isDisks = name === 'Disks';
     if (isDisks && !disks) {
-      disks = makeDisks(scene.disks, content, lid);
+      disks = makeDisks(scene.disks, content, room);
       stage.world.add(disks);
     }
     if (disks) disks.visible = isDisks;

@@ -1,29 +1,30 @@
-// The mesh: in the colours of the images, plain, or in those of its errors. What turns its back, and
-// a ceiling that one looks down on, is a veil, so that one looks into a room from outside.
+// The mesh: in the colours of the images, plain, or in those of its errors. What turns its back, or
+// is in the way, is a veil, so that one looks into a room from outside.
 
 const VERTEX = `
-  attribute vec3 tint; varying vec3 vTint; varying vec3 vNormal; varying vec3 vView; varying float vHeight;
+  attribute vec3 tint; varying vec3 vTint; varying vec3 vNormal; varying vec3 vView; varying vec3 vPlace;
   void main() {
     vec4 place = modelViewMatrix * vec4(position, 1.0);
-    vTint = tint; vNormal = normalMatrix * normal; vView = -place.xyz; vHeight = position.y;
+    vTint = tint; vNormal = normalMatrix * normal; vView = -place.xyz; vPlace = position;
     gl_Position = projectionMatrix * place;
   }`;
 
 const FRAGMENT = `
-  uniform float strength; uniform bool plain; uniform bool veil; uniform float lid;
-  varying vec3 vTint; varying vec3 vNormal; varying vec3 vView; varying float vHeight;
+  uniform float strength; uniform bool plain; uniform bool veil;
+  varying vec3 vTint; varying vec3 vNormal; varying vec3 vView; varying vec3 vPlace;
+  ${IN_THE_WAY}
   void main() {
-    if ((gl_FrontFacing && vHeight < lid) == veil) discard;
+    if ((gl_FrontFacing && !isInTheWay(vPlace)) == veil) discard;
     vec3 n = normalize(vNormal) * (gl_FrontFacing ? 1.0 : -1.0);
     float head = max(dot(n, normalize(vView)), 0.0);
     float lamp = max(dot(n, normalize(vec3(-0.35, 0.8, 0.5))), 0.0);
     float light = 1.0 - strength + strength * (0.55 * head + 0.6 * lamp);
     vec3 colour = plain ? vec3(0.80, 0.81, 0.83) : vTint;
-    if (veil) gl_FragColor = vec4(mix(colour, vec3(0.62, 0.68, 0.76), 0.6), 0.035 + 0.10 * pow(1.0 - head, 2.0));
+    if (veil) gl_FragColor = vec4(mix(colour, vec3(0.62, 0.68, 0.76), 0.6), 0.07 + 0.08 * pow(1.0 - head, 2.0));
     else gl_FragColor = vec4(colour * light, 1.0);
   }`;
 
-function makeSurface(packed, content, lid) {
+function makeSurface(packed, content, room) {
   const geometry = new THREE.BufferGeometry();
   const vertices = lengths(unpacked(content, packed.vertices), packed.box);
   const faces = unpacked(content, packed.faces);
@@ -46,7 +47,7 @@ function makeSurface(packed, content, lid) {
   }
   looks.set('Shape', { colour: null, legend: null, strength: 0.8 });
 
-  const shared = { strength: { value: 0.2 }, plain: { value: false }, lid };
+  const shared = { strength: { value: 0.2 }, plain: { value: false }, ...room.uniforms };
   const made = (veil) => new THREE.Mesh(geometry, new THREE.ShaderMaterial({
     vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: { ...shared, veil: { value: veil } },
     side: veil ? THREE.DoubleSide : THREE.FrontSide, transparent: veil, depthWrite: !veil,
@@ -62,7 +63,7 @@ function makeSurface(packed, content, lid) {
   };
   // Where a ray meets what is not a veil.
   const meet = (ray) => {
-    const hit = ray.intersectObject(solid).find(({ point }) => point.y < lid.value);
+    const hit = ray.intersectObject(solid).find(({ point }) => !room.isInTheWay(point));
     return hit && hit.point;
   };
   return { group, looks, look, meet };
