@@ -5,7 +5,7 @@ import pytest
 
 from geogs.errors import InputError
 from geogs.io.writers.ply_writer import write_mesh
-from geogs.mesh.decimate import MEAN_FRACTION, QUANTILE, decimate
+from geogs.mesh.decimate import MEAN_FRACTION, QUANTILE, decimate, with_at_most
 from geogs.mesh.deviation import deviations
 from geogs.mesh.deviation_kernels import triangle_distance
 from geogs.mesh.mesh_file import read_mesh
@@ -117,3 +117,22 @@ def test_a_mesh_is_read_as_it_was_written(tmp_path):
     write_mesh(path, mesh.vertices[:5], mesh.faces)
     with pytest.raises(InputError, match="no triangles of its vertices"):
         read_mesh(path)
+
+
+def test_no_more_is_shown_than_asked_for_even_of_scraps():
+    """Ribbons of two triangles' width, which are nearly all border."""
+    along, across = np.meshgrid(np.linspace(0, 10, 201), np.linspace(0, 0.1, 3))
+    flat = np.stack([along, across, 0.05 * np.sin(3 * along)], -1).reshape(-1, 3)
+    row, column = (index.ravel() for index in np.meshgrid(np.arange(2), np.arange(200)))
+    a = 201 * row + column
+    ribbon = np.concatenate(
+        [np.stack([a, a + 1, a + 201], 1), np.stack([a + 1, a + 202, a + 201], 1)]
+    )
+    count = 12
+    vertices = np.concatenate([flat + [0, 0.3 * k, 0] for k in range(count)])
+    faces = np.concatenate([ribbon + len(flat) * k for k in range(count)])
+    mesh = Mesh.from_triangles(vertices, faces)
+    fewer = with_at_most(mesh, len(faces) // 4)
+    assert 0.8 * len(faces) / 4 < len(fewer.faces) <= len(faces) / 4
+    assert np.allclose(np.ptp(fewer.vertices, axis=0), np.ptp(vertices, axis=0), rtol=0.05)
+    assert with_at_most(mesh, len(faces)) is mesh

@@ -29,7 +29,7 @@ from geogs.mesh.decimate import with_at_most
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
-MOST_FACES, MOST_DISKS, MOST_IMAGES = 300_000, 60_000, 240
+MOST_FACES, MOST_DISKS, MOST_IMAGES = 240_000, 50_000, 240
 """Most of each on a page, which then has less than 8 MB."""
 IMAGE_BYTES = 1_500_000
 """Bytes of all images of a page together, about."""
