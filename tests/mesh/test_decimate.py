@@ -129,7 +129,7 @@ def test_no_more_is_shown_than_asked_for_even_of_scraps():
         [np.stack([a, a + 1, a + 201], 1), np.stack([a + 1, a + 202, a + 201], 1)]
     )
     count = 12
-    vertices = np.concatenate([flat + [0, 0.3 * k, 0] for k in range(count)])
+    vertices = np.concatenate([flat + np.array([0, 0.3 * k, 0]) for k in range(count)])
     faces = np.concatenate([ribbon + len(flat) * k for k in range(count)])
     mesh = Mesh.from_triangles(vertices, faces)
     fewer = with_at_most(mesh, len(faces) // 4)

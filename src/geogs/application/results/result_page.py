@@ -152,18 +152,12 @@ def shown_model(
         more_colourings: of the surface as it is shown, besides the colours of the images.
         true_path: positions of the true camera, in the frame of the map.
     """
-    notes, surface, seen = [], None, None
+    notes, surface, seen, disk_model = [], None, None, None
     if mesh is not None and len(mesh.faces):
-        shown = with_at_most(mesh, MOST_FACES)
-        if shown is not mesh:
-            notes.append(f"Shown with {len(shown.faces):,} of {len(mesh.faces):,} triangles.")
-        shown = shown.creased()
-        own = [] if shown.colours is None else [Colouring("Colour", shown.colours)]
-        surface = SurfaceModel(
-            shown.vertices, shown.faces, shown.normals, [*own, *more_colourings(shown)]
-        )
-        seen = facets(shown.vertices, shown.faces, shown.normals)
-    disk_model = None
+        surface = _surface(with_at_most(mesh, MOST_FACES), more_colourings)
+        if len(surface.faces) < len(mesh.faces):
+            notes.append(f"Shown with {len(surface.faces):,} of {len(mesh.faces):,} triangles.")
+        seen = facets(surface.vertices, surface.faces, surface.normals)
     if disks is not None and len(disks):
         disk_model = _disks(disks)
         if len(disk_model.position) < len(disks):
@@ -208,6 +202,13 @@ def _known(trajectory: Trajectory) -> Float[np.ndarray, "k 4 4"]:
     """Camera to world of the frames whose place is known, or of all where none is."""
     tracked = trajectory.tracked
     return trajectory.T_wc[tracked] if tracked.any() else trajectory.T_wc
+
+
+def _surface(mesh: Mesh, more_colourings: Callable[[Mesh], Sequence[Colouring]]) -> SurfaceModel:
+    shown = mesh.creased()
+    own = [] if shown.colours is None else [Colouring("Colour", shown.colours)]
+    colourings = [*own, *more_colourings(shown)]
+    return SurfaceModel(shown.vertices, shown.faces, shown.normals, colourings)
 
 
 def _disks(disks: MapSnapshot) -> DiskModel:

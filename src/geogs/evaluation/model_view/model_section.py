@@ -14,6 +14,7 @@ SCRIPTS = (
     "surface.js",
     "disks.js",
     "cameras.js",
+    "moving.js",
     "controls.js",
     "player.js",
     "measure.js",

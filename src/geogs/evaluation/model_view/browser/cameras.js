@@ -1,8 +1,8 @@
-// Paths, some keyframes as frusta, and the camera that the slider moves along them.
+// Paths, and some keyframes as frusta.
 
 const PATH = { tracked: 0xf2a33a, turned: 0xb58cff, lost: 0xff5a5a, truth: 0xc9ced6 };
-const FRUSTUM = 0x8fb8dd, CHOSEN = 0xffd166;
-const MOST_FRUSTA = 24;
+const FRUSTUM = 0x8fb8dd;
+const MOST_FRUSTA = 24, FRUSTUM_SIZE = 0.014;  // of the distance from which all is seen
 
 function lines(stage, points, colours, options) {
   const geometry = new THREE.LineSegmentsGeometry();
@@ -54,18 +54,20 @@ function spread(keyframes, most, least) {
   return chosen;
 }
 
-function makeKeyframes(stage, scene, images) {
-  const keyframes = scene.keyframes.map(({ name, T_wc: m, image }) => {
+function unpackedKeyframes(scene, images) {
+  return scene.keyframes.map(({ name, T_wc: m, image }) => {
     const T = new THREE.Matrix4().set(...m, 0, 0, 0, 1);
     const blob = image && new Blob([images.subarray(image[0], image[0] + image[1])],
       { type: 'image/jpeg' });
     const turn = new THREE.Quaternion().setFromRotationMatrix(T);
     return { name, T, turn, blob, position: new THREE.Vector3(m[3], m[7], m[11]) };
   });
-  const { right, down } = scene.lens;
-  const depth = 0.014 * stage.reach / Math.max(right, down);
+}
+
+function makeFrusta(stage, lens, keyframes) {
+  const depth = FRUSTUM_SIZE * stage.reach / Math.max(lens.right, lens.down);
   const group = new THREE.Group();
-  const shape = frustumLines(scene.lens, depth), corner = new THREE.Vector3();
+  const shape = frustumLines(lens, depth), corner = new THREE.Vector3();
   const all = spread(keyframes, MOST_FRUSTA, depth).flatMap(({ T }) => {
     const placed = [];
     for (let i = 0; i < shape.length; i += 3) {
@@ -76,51 +78,6 @@ function makeKeyframes(stage, scene, images) {
   if (all.length) {
     group.add(lines(stage, all, FRUSTUM, { linewidth: 1, transparent: true, opacity: 0.6 }));
   }
-
-  // The camera that moves: its frustum with the image in it.
-  const moving = new THREE.Group(), size = 2.5 * depth;
-  moving.add(lines(stage, frustumLines(scene.lens, size), CHOSEN, { linewidth: 2 }));
-  const picture = new THREE.Mesh(
-    new THREE.PlaneGeometry(2 * right, 2 * down),
-    new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, color: 0x30343b }));
-  // The plane's y points up in the image, the camera's down.
-  picture.scale.set(size, -size, 1);
-  picture.position.z = size;
-  moving.add(picture);
-  const textures = new Map();
-  const show = async (keyframe) => {
-    picture.userData.keyframe = keyframe;
-    if (!textures.has(keyframe)) {
-      textures.set(keyframe, createImageBitmap(keyframe.blob, { imageOrientation: 'flipY' })
-        .then((bitmap) => {
-          const texture = new THREE.Texture(bitmap);
-          texture.flipY = false;
-          texture.colorSpace = THREE.SRGBColorSpace;
-          texture.needsUpdate = true;
-          return texture;
-        }));
-    }
-    const texture = await textures.get(keyframe);
-    if (picture.userData.keyframe !== keyframe) return;
-    picture.material.needsUpdate = !picture.material.map;
-    picture.material.map = texture;
-    picture.material.color.set(0xffffff);
-    stage.draw();
-  };
-
-  // Put the moving camera at a place, a number between two keyframes; that which is nearest.
-  const moveTo = (place) => {
-    const a = keyframes[Math.floor(place)];
-    const b = keyframes[Math.min(Math.floor(place) + 1, keyframes.length - 1)];
-    moving.position.lerpVectors(a.position, b.position, place % 1);
-    moving.quaternion.slerpQuaternions(a.turn, b.turn, place % 1);
-    moving.updateMatrixWorld();
-    const nearest = place % 1 < 0.5 ? a : b;
-    if (nearest.blob) show(nearest);
-    stage.draw();
-    return nearest;
-  };
-
   // The number of the keyframe that is within some pixels of the pointer.
   const near = (x, y) => {
     let best = null, least = 18;
@@ -133,17 +90,5 @@ function makeKeyframes(stage, scene, images) {
     });
     return best;
   };
-
-  // Look from where the moving camera is.
-  const ride = () => {
-    const { camera, orbit } = stage;
-    camera.fov = 2 * Math.atan(Math.max(down, right / camera.aspect)) * 180 / Math.PI;
-    camera.updateProjectionMatrix();
-    camera.position.copy(moving.position);
-    orbit.target.set(0, 0, 0.15 * stage.reach).applyMatrix4(moving.matrixWorld);
-    camera.lookAt(orbit.target);
-  };
-  const shown = new THREE.Group();
-  shown.add(group, moving);
-  return { group, shown, aspect: right / down, keyframes, moveTo, near, ride };
+  return { group, near };
 }

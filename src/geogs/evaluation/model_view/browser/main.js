@@ -66,13 +66,13 @@ function showThings(stage, scene, content) {
 }
 
 function showKeyframes(stage, scene, bar) {
-  const cameras = makeKeyframes(stage, scene, embedded('model-images'));
-  stage.world.add(cameras.shown);
+  const keyframes = unpackedKeyframes(scene, embedded('model-images'));
+  const frusta = makeFrusta(stage, scene.lens, keyframes);
   toggle(bar, 'Cameras', true, (on) => {
-    cameras.group.visible = on;
+    frusta.group.visible = on;
     stage.draw();
   });
-  makePlayer(stage, cameras);
+  makePlayer(stage, scene.lens, keyframes, frusta);
 }
 
 show().catch((error) => {

@@ -2,8 +2,11 @@
 
 const SECONDS_A_KEYFRAME = 0.25, LEAST_SECONDS = 6, MOST_SECONDS = 60;
 
-function makePlayer(stage, cameras) {
-  const { keyframes } = cameras, last = keyframes.length - 1;
+function makePlayer(stage, lens, keyframes, frusta) {
+  const last = keyframes.length - 1, moving = makeMoving(stage, lens, keyframes);
+  const shown = new THREE.Group();
+  shown.add(frusta.group, moving.group);
+  stage.world.add(shown);
   const slider = part('place'), play = part('play'), ride = part('ride');
   const picture = part('beside').querySelector('img');
   const isOn = (button) => button.getAttribute('aria-pressed') === 'true';
@@ -17,10 +20,10 @@ function makePlayer(stage, cameras) {
 
   const go = (place) => {
     slider.value = place;
-    const keyframe = cameras.moveTo(place);
+    const keyframe = moving.moveTo(place);
     if (keyframe.blob) showImage(keyframe);
     part('keyframe').textContent = keyframe.name;
-    if (isOn(ride)) cameras.ride();
+    if (isOn(ride)) moving.ride();
   };
   const stop = () => {
     press(play, false);
@@ -40,11 +43,11 @@ function makePlayer(stage, cameras) {
   // Who looks through the camera sees no frames of cameras.
   const setRide = (on) => {
     press(ride, on);
-    cameras.shown.visible = !on;
+    shown.visible = !on;
   };
 
   // A picture held upright is no taller than one held across.
-  part('beside').style.maxWidth = `${Math.min(300, 220 * cameras.aspect)}px`;
+  part('beside').style.maxWidth = `${Math.min(300, 220 * lens.right / lens.down)}px`;
   slider.max = last;
   slider.oninput = () => {
     stop();
@@ -71,7 +74,7 @@ function makePlayer(stage, cameras) {
     stage.home();
   });
   stage.clicks.push((x, y) => {
-    const number = cameras.group.visible ? cameras.near(x, y) : null;
+    const number = frusta.group.visible ? frusta.near(x, y) : null;
     if (number !== null) go(number);
     return number !== null;
   });

@@ -82,6 +82,13 @@ function makeStage(box, scene) {
     stage.draw();
   };
 
+  addPointing(stage);
+  return stage;
+}
+
+// What is where: pixels of points, rays of pixels, and what is done at clicks.
+function addPointing(stage) {
+  const { box, camera } = stage;
   // Where a point is in the box, in pixels; none behind the camera.
   stage.pixel = (point) => {
     const { x, y, z } = point.clone().project(camera);
@@ -95,7 +102,7 @@ function makeStage(box, scene) {
   };
   // What is done at a click, which is no drag: the first of these that takes it.
   stage.clicks = [];
-  const canvas = renderer.domElement;
+  const canvas = stage.renderer.domElement;
   let down = null;
   canvas.addEventListener('pointerdown', (event) => { down = [event.clientX, event.clientY]; });
   canvas.addEventListener('pointerup', ({ clientX, clientY }) => {
@@ -103,5 +110,4 @@ function makeStage(box, scene) {
     const { left, top } = canvas.getBoundingClientRect();
     stage.clicks.some((act) => act(clientX - left, clientY - top));
   });
-  return stage;
 }
