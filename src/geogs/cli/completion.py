@@ -6,16 +6,12 @@ the last one is printed a line each, with a tabulator and a few words after it w
 something to say. Nothing printed means a file.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from geogs.cli.help import first_clause, is_shown_first
-from geogs.config.leaves import Leaf
-from geogs.config.setting import Positional, dashed
-
-ASKED = "--complete"
-"""Last of the arguments where a shell asks."""
+from geogs.cli.options import parse_options
+from geogs.config.setting import Positional
 
 SCRIPTS = {
     "bash": """\
@@ -58,33 +54,5 @@ class CompletionOptions:
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    from geogs.cli.options import parse_options  # which asks here for completions
-
     print(SCRIPTS[parse_options(CompletionOptions, argv, "completion").shell])
     return 0
-
-
-def matching(found: Mapping[str, str], unfinished: str) -> str:
-    """Lines for a shell: what begins like the unfinished word, and what it is."""
-    named = [(name, text) for name, text in found.items() if name.startswith(unfinished)]
-    return "\n".join(f"{name}\t{text}" if text else name for name, text in named)
-
-
-def candidates(known: Sequence[Leaf], typed: Sequence[str]) -> dict[str, str]:
-    """What could stand for the last of the words typed, and what each of them is."""
-    *before, unfinished = typed or [""]
-    taking = {name: leaf for leaf in known if leaf.kind.base is not bool for name in leaf.options}
-    last = taking.get(dashed(before[-1])) if before else None
-    if last is not None:
-        return dict.fromkeys(last.kind.choices, "")
-    if unfinished.startswith("-"):
-        offered = known if unfinished.strip("-") else filter(is_shown_first, known)
-        return {name: first_clause(leaf.help) for leaf in offered for name in _names(leaf)}
-    places = (leaf for leaf in known if leaf.mark(Positional) is not None)
-    return {choice: "" for leaf in places for choice in leaf.kind.choices}
-
-
-def _names(leaf: Leaf) -> Iterator[str]:
-    yield from leaf.options
-    if leaf.kind.base is bool and leaf.options:
-        yield leaf.switch_off

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar
 
-from geogs.cli.completion import ASKED, candidates, matching
+from geogs.cli.candidates import ASKED, candidates, matching
 from geogs.cli.help import first_clause, help_text
 from geogs.config.leaves import Leaf, default_of, leaves
 from geogs.config.old_names import present_name

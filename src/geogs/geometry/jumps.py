@@ -55,4 +55,3 @@ def widened(mask: Bool[Tensor, "h w"], reach: int) -> Bool[Tensor, "h w"]:
         return mask
     side = 2 * reach + 1
     return F.max_pool2d(mask[None, None].float(), side, 1, reach)[0, 0] > 0
-
