@@ -12,8 +12,6 @@ class MeshConfig(Settings, group="mesh"):
 
     voxel: Annotated[float | None, Range(1e-6, 1e6), Basic()] = None
     """Voxel size in map units; chosen from depth, budget and memory limit if none is given."""
-    footprint: Positive = 1.0
-    """A chosen voxel in footprints of a pixel at the median depth."""
     truncation: Annotated[float, Range(2, 16)] = 4.0
     """Voxels in front of and behind a surface in which distances are averaged."""
     min_weight: Positive = 1.5

@@ -4,6 +4,7 @@ import torch
 
 from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthEngine
+from geogs.depth.far_side import FarSideSearch
 from geogs.geometry.camera import Camera
 
 
@@ -24,7 +25,7 @@ def depth_engine(
     if engine == "auto":
         engine = "joint" if torch.device(device).type == "cuda" else "classical"
     if engine == "classical":
-        return classical
+        return FarSideSearch(classical, render)
     if engine == "tracker":
         from geogs.depth.tracker_depth import TrackerDepthEngine
 

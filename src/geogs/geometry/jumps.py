@@ -1,4 +1,4 @@
-"""Where a depth map jumps from one surface to another."""
+"""Where a depth map jumps from one surface to another, and how it goes on where it does not."""
 
 from typing import NamedTuple
 
@@ -55,3 +55,26 @@ def widened(mask: Bool[Tensor, "h w"], reach: int) -> Bool[Tensor, "h w"]:
         return mask
     side = 2 * reach + 1
     return F.max_pool2d(mask[None, None].float(), side, 1, reach)[0, 0] > 0
+
+
+def minmod_slopes(
+    inverse: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Differences of inverse depth per pixel to the right and down, which reach across no jump.
+
+    Each is the smaller of those to the two neighbours, zero where they disagree in sign or a
+    neighbour is not valid (minmod).
+    """
+
+    def slope(axis: int) -> Tensor:
+        difference = inverse.diff(dim=axis)
+        length = inverse.shape[axis]
+        both = valid.narrow(axis, 1, length - 1) & valid.narrow(axis, 0, length - 1)
+        difference = torch.where(both, difference, 0.0)
+        edge = torch.zeros_like(inverse.narrow(axis, 0, 1))
+        before = torch.cat([edge, difference], axis)
+        after = torch.cat([difference, edge], axis)
+        smaller = torch.where(before.abs() < after.abs(), before, after)
+        return torch.where(before * after > 0, smaller, 0.0)
+
+    return slope(1), slope(0)

@@ -89,7 +89,7 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
             )
         triangles = round(_FACES_PER_SQUARE * _area(points, config.voxel) / config.voxel**2)
         return VolumePlan(config.voxel, config.truncation, max_depth, blocks, triangles)
-    voxel = config.footprint * float(footprints.median())
+    voxel = float(footprints.median())
     faces = _FACES_PER_SQUARE * _area(points, voxel)
     voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
     while (n := len(band_blocks(points, voxel, config.truncation))) * BYTES_PER_BLOCK > limit:

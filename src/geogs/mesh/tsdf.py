@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.geometry.jumps import minmod_slopes
 from geogs.gpu.kernels import kernels_for
 from geogs.threads import run_chunks, worker_count
 
@@ -269,22 +270,7 @@ class SparseTsdf:
 def _plane_table(
     depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "p 4"]:
-    """Inverse depth, its slopes along u and v (1 / map unit / pixel) and weight of each pixel.
-
-    A slope is the smaller of the differences to the two neighbours, zero where they disagree in
-    sign or a neighbour is invalid (minmod), so it never reaches across a depth step.
-    """
+    """Inverse depth, its slopes along u and v (1 / map unit / pixel) and weight of each pixel."""
     inverse = torch.where(valid, 1.0 / torch.where(valid, depth, 1.0), 1.0)
-
-    def slope(axis: int) -> Tensor:
-        difference = inverse.diff(dim=axis)
-        length = depth.shape[axis]
-        both = valid.narrow(axis, 1, length - 1) & valid.narrow(axis, 0, length - 1)
-        difference = torch.where(both, difference, 0.0)
-        edge = torch.zeros_like(inverse.narrow(axis, 0, 1))
-        before = torch.cat([edge, difference], axis)
-        after = torch.cat([difference, edge], axis)
-        smaller = torch.where(before.abs() < after.abs(), before, after)
-        return torch.where(before * after > 0, smaller, 0.0)
-
-    return torch.stack([inverse, slope(1), slope(0), weight], -1).flatten(0, 1)
+    right, down = minmod_slopes(inverse, valid)
+    return torch.stack([inverse, right, down, weight], -1).flatten(0, 1)
