@@ -27,7 +27,7 @@ RUN = [
     "--stop", str(FRAMES), "--tracking.init-keyframes", "6",
     "--mapping.render-long-edge", "64", "--mapping.iterations", "2",
     "--mapping.pose-iterations", "0", "--mapping.final-iterations", "10",
-    "--mapping.no-final-depth",
+    "--mapping.no-final-depth", "--mapping.when", "online",
 ]  # fmt: skip
 POSED = [
     "--mapping.render-long-edge", "96", "--mapping.disk.stride", "2", "--search.least-steps", "20",
@@ -39,7 +39,7 @@ def run_config() -> geogs.Config:
     config = geogs.Config()
     mapping = replace(
         config.mapping, render_long_edge=64, iterations=2, pose_iterations=0, final_iterations=10,
-        final_depth=False,
+        final_depth=False, when="online",
     )  # fmt: skip
     return replace(
         config,

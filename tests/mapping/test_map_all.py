@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from geogs.application.checkpoints.checkpoint import SavedState, checkpoint_folder, write_checkpoint
-from geogs.config import Config, InputConfig
+from geogs.config import Config, InputConfig, preset
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from quick_systems import Work, quick_config
@@ -133,10 +133,10 @@ def test_what_needs_the_map_on_the_way_has_it(frames):
     for other in (
         replace(config.mapping, when="online"),
         replace(config.mapping, final_iterations=0),
-        replace(config.mapping, final_depth=False),
     ):
         assert not Slam(
             frames[0], replace(config, mapping=other), defers_map=True, device="cpu"
         ).world.maps_at_end
     assert not Slam(frames[0], config, device="cpu").world.maps_at_end
     assert Slam(frames[0], config, defers_map=True, device="cpu").world.maps_at_end
+    assert preset("fast").mapping.may_follow

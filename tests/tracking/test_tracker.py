@@ -102,6 +102,20 @@ def test_global_bundle_improves_and_reports_the_correction():
     assert torch.equal(correction.after[0], correction.before[0])
 
 
+@pytest.mark.parametrize("fine", [True, False])
+def test_all_keyframes_are_matched_as_finely_as_asked(fine, monkeypatch):
+    tracker, _ = run(frames(PATH[:30]), replace(CONFIG, fine_adjustment=fine))
+    measure, asked = tracker.map.operator.measure, []
+
+    def noted(*pair, **how):
+        asked.append(how["fine"])
+        return measure(*pair, **how)
+
+    monkeypatch.setattr(tracker.map.operator, "measure", noted)
+    global_bundle(tracker)
+    assert set(asked) == {fine}
+
+
 def test_garbage_in_the_middle_is_lost_and_recovered():
     stream = frames(PATH)
     rng = np.random.default_rng(0)

@@ -40,8 +40,7 @@ def _run(config: Config) -> Iterator[str]:
         )
     if mapping.when == "after" and not mapping.may_follow:
         yield (
-            "mapping.when after does nothing: without a final training that searches depths again "
-            "the map is made on the way."
+            "mapping.when after does nothing: without a final training the map is made on the way."
         )
     if mapping.pose_iterations == 0 and mapping.pose_lr != MappingConfig.pose_lr:
         yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."

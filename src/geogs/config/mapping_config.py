@@ -110,7 +110,7 @@ class MappingConfig(Settings, group="mapping"):
     when: Annotated[Literal["auto", "online", "after"], Only("run")] = "auto"
     """Map each keyframe as soon as it is final, or all at once after the final bundle adjustment,
     which takes less time and shows nothing before; auto: after, where images come from files,
-    nobody looks on, and the final training searches depths."""
+    nobody looks on, and there is a final training."""
     lag: Annotated[CountOrZero, Only("run")] = 4
     """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
     window: Annotated[Count, Only("run")] = 8
@@ -125,7 +125,7 @@ class MappingConfig(Settings, group="mapping"):
     """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online;
     auto: 600 on a CPU, 3000 on a GPU, where they take a few seconds."""
     final_depth: Annotated[bool, Only("run")] = True
-    """Search all keyframe depths once more with the final poses."""
+    """Search the depths of a map that was made on the way once more with the final poses."""
     final_pose_rounds: Annotated[CountOrZero, Only("run")] = 0
     """Times that the final training pauses to refine the poses of all keyframes against the map, in
     windows that overlap by half; 0 leaves them to the final bundle adjustment."""
@@ -150,8 +150,8 @@ class MappingConfig(Settings, group="mapping"):
 
     @property
     def may_follow(self) -> bool:
-        """Whether the map can be made after the video with no other result: no online one."""
-        return self.when != "online" and self.final_iterations != 0 and self.final_depth
+        """Whether the map can be made after the video: no online one, and there is a training."""
+        return self.when != "online" and self.final_iterations != 0
 
     def final_steps(self, on_gpu: bool) -> int:
         """Steps of the final training."""

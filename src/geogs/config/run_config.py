@@ -44,20 +44,27 @@ def preset_of(config: Config) -> Preset:
 def preset(name: Preset) -> Config:
     """The settings of a preset.
 
-    ``fast`` stops after the online map; ``accurate``, for a GPU, works on larger images, renders at
-    their size and trains longer; ``paper`` does what the GeoGS-SLAM paper does.
+    ``fast`` makes fewer keyframes, matches them at half resolution and maps them at a smaller size;
+    ``accurate``, for a GPU, works on larger images, renders at their size and trains longer;
+    ``paper`` does what the GeoGS-SLAM paper does.
     """
     base = Config()
     if name == "fast":
         mapping = replace(
             base.mapping,
+            render_long_edge=192,
             iterations=5,
             pose_iterations=0,
-            final_iterations=100,
+            final_iterations=300,
             final_depth=False,
-            depth=replace(base.mapping.depth, engine="classical"),
+            depth=replace(base.mapping.depth, engine="classical", planes=64),
         )
-        return replace(base, mapping=mapping)
+        return replace(
+            base,
+            tracking=replace(base.tracking, keyframe_parallax=0.024, fine_adjustment=False),
+            mapping=mapping,
+            mesh=replace(base.mesh, triangle_budget=500_000),
+        )
     if name == "accurate":
         disk = replace(base.mapping.disk, stride=6)
         mapping = replace(

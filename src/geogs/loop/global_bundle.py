@@ -65,7 +65,8 @@ def global_bundle(
         if len(stale) <= CONVERGED * len(pairs):
             break
         for start in range(0, len(stale), batch):
-            graph.measure(stale[start : start + batch], fine=True, packed=True)
+            part = stale[start : start + batch]
+            graph.measure(part, fine=config.fine_adjustment, packed=True)
             if progress is not None:
                 done = (n + start / len(stale)) / ROUNDS
                 progress(done, "matching all keyframes")

@@ -41,7 +41,7 @@ QUICK = [
     "--stop", str(FRAMES), "--tracking.init-keyframes", "6",
     "--mapping.render-long-edge", "64", "--mapping.iterations", "2",
     "--mapping.pose-iterations", "1", "--mapping.final-iterations", "10",
-    "--mapping.depth.planes", "32",
+    "--mapping.depth.planes", "32", "--mapping.when", "online",
     "--mapping.no-final-depth", "--resident-keyframes", "4", "--device", "cpu",
     "--input.readout", "0.01",
 ]  # fmt: skip

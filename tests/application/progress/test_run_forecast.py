@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from geogs.application.progress.run_forecast import RunForecast, RunPlan
-from geogs.config import Config
+from geogs.config import Config, preset
 
 RUNS = json.loads((Path(__file__).parents[2] / "fixtures" / "run_events.json").read_text())
 
@@ -46,6 +46,12 @@ def said(name: str, pace: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarr
     played = Played(plan, events, begin)
     times = np.arange(begin, end, 0.5 * pace)
     return times - begin, np.array([played.left_at(t) for t in times]), end - times
+
+
+def test_a_map_of_fewer_pixels_is_expected_to_take_less():
+    plans = [RunPlan(preset(name), 150, False, False, True) for name in ("fast", "default")]
+    fast, default = (plan.seconds(40)["mapping"] for plan in plans)
+    assert 0.2 < fast / default < 0.35
 
 
 @pytest.mark.parametrize("name", RUNS)
