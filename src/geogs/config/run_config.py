@@ -55,13 +55,13 @@ def preset(name: Preset) -> Config:
             render_long_edge=192,
             iterations=5,
             pose_iterations=0,
-            final_iterations=300,
+            final_iterations=400,
             final_depth=False,
             depth=replace(base.mapping.depth, engine="classical", planes=64),
         )
         return replace(
             base,
-            tracking=replace(base.tracking, keyframe_parallax=0.024, fine_adjustment=False),
+            tracking=replace(base.tracking, keyframe_parallax=0.03, fine_adjustment=False),
             mapping=mapping,
             mesh=replace(base.mesh, triangle_budget=500_000),
         )
