@@ -44,7 +44,7 @@ def preset_of(config: Config) -> Preset:
 def preset(name: Preset) -> Config:
     """The settings of a preset.
 
-    ``fast`` makes fewer keyframes, matches them at half resolution and maps them at a smaller size;
+    ``fast`` matches all keyframes at half resolution in the end and maps at a smaller size;
     ``accurate``, for a GPU, works on larger images, renders at their size and trains longer;
     ``paper`` does what the GeoGS-SLAM paper does.
     """
@@ -61,7 +61,7 @@ def preset(name: Preset) -> Config:
         )
         return replace(
             base,
-            tracking=replace(base.tracking, keyframe_parallax=0.03, fine_adjustment=False),
+            tracking=replace(base.tracking, fine_adjustment=False),
             mapping=mapping,
             mesh=replace(base.mesh, triangle_budget=500_000),
         )
