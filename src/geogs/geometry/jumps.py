@@ -65,16 +65,12 @@ def minmod_slopes(
     Each is the smaller of those to the two neighbours, zero where they disagree in sign or a
     neighbour is not valid (minmod).
     """
+    right, down = (_minmod(*maps) for maps in ((inverse, valid), (inverse.mT, valid.mT)))
+    return right, down.mT
 
-    def slope(axis: int) -> Tensor:
-        difference = inverse.diff(dim=axis)
-        length = inverse.shape[axis]
-        both = valid.narrow(axis, 1, length - 1) & valid.narrow(axis, 0, length - 1)
-        difference = torch.where(both, difference, 0.0)
-        edge = torch.zeros_like(inverse.narrow(axis, 0, 1))
-        before = torch.cat([edge, difference], axis)
-        after = torch.cat([difference, edge], axis)
-        smaller = torch.where(before.abs() < after.abs(), before, after)
-        return torch.where(before * after > 0, smaller, 0.0)
 
-    return slope(1), slope(0)
+def _minmod(inverse: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    step = torch.where(valid[:, 1:] & valid[:, :-1], inverse.diff(dim=1), 0.0)
+    before, after = F.pad(step, (1, 0)), F.pad(step, (0, 1))
+    smaller = torch.where(before.abs() < after.abs(), before, after)
+    return torch.where(before * after > 0, smaller, 0.0)

@@ -1,0 +1,145 @@
+"""Which of two depths the images speak for: against a loop, and on a square before a wall."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import max_pool2d
+
+from depth_scene import RENDER, WORKING, make_scene
+from geogs.depth.classical import CpuDepthEngine
+from geogs.depth.depth_engine import AlternativeSearch
+from geogs.depth.depth_view import DenseDepth
+from geogs.depth.far_side import APART, REACH, FarSideSearch, farther_surface
+from geogs.depth.photo_vote import (
+    CONTRAST,
+    DEVIATIONS,
+    LEAST_DEVIATION,
+    RADIUS,
+    averaged_by_colour,
+    best_half,
+    photo_vote,
+    seen_from,
+    truncated,
+)
+from geogs.geometry.camera import Camera
+
+
+def test_grey_values_are_looked_up_as_a_loop_does():
+    scene = make_scene()
+    reference, other = scene.views[0], scene.views[1]
+    pose = other.T_cw @ np.linalg.inv(reference.T_cw)
+    grey, depth = torch.from_numpy(other.grey), torch.from_numpy(scene.truth[0])
+    found = seen_from(grey[None], pose[None], depth, RENDER)[0].numpy()
+    K = RENDER.matrix().numpy()
+    inside = 0
+    for v, u in ((10, 12), (36, 48), (40, 90), (70, 3), (5, 94)):
+        point = pose[:3, :3] @ (np.linalg.inv(K) @ [u, v, 1] * scene.truth[0][v, u]) + pose[:3, 3]
+        x, y, _ = K @ point / point[2]
+        if not (0 <= x <= RENDER.width - 1 and 0 <= y <= RENDER.height - 1):
+            assert np.isnan(found[v, u])
+            continue
+        inside += 1
+        i, j = int(y), int(x)
+        a, b = y - i, x - j
+        corner = other.grey[i : i + 2, j : j + 2]
+        expected = np.array([1 - a, a]) @ corner @ np.array([1 - b, b])
+        assert found[v, u] == pytest.approx(expected, abs=1e-4)
+    assert inside >= 3
+
+
+def test_the_lower_half_counts_and_what_is_not_seen_does_not():
+    nan = float("nan")
+    costs = torch.tensor([[0.9, 0.2, 0.4, nan], [nan, 0.3, nan, nan]]).T[:, None, :]
+    found = best_half(costs)[0]
+    assert found.tolist() == pytest.approx([(0.2 + 0.4) / 2, 0.3])
+    assert float(best_half(torch.full((3, 1, 1), nan))) == 1
+
+
+def test_light_and_noise_of_a_neighbour_are_taken_out():
+    rng = torch.Generator().manual_seed(0)
+    noise = 0.01 * torch.randn(2, 1, 60, 60, generator=rng)
+    same = torch.ones(60, 60, dtype=torch.bool)
+    costs = truncated(noise + 0.3, same)
+    deviation = float((noise[0] - noise[0].median()).abs().median())
+    assert deviation > LEAST_DEVIATION
+    expected = ((noise - noise[0].median()).abs() / (DEVIATIONS * deviation)).clamp(max=1)
+    assert torch.allclose(costs, expected, atol=1e-4)
+    assert 0.01 < float((costs == 1).float().mean()) < 0.1  # beyond two deviations
+
+
+def test_the_mean_is_over_what_has_the_same_colour():
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal((14, 16)).astype(np.float32)
+    guide = rng.choice([0.2, 0.6], (1, 14, 16)).repeat(3, 0).astype(np.float32)
+    found = averaged_by_colour(torch.from_numpy(values), torch.from_numpy(guide)).numpy()
+    padded = np.pad(values, RADIUS, mode="edge")
+    colours = np.pad(guide[0], RADIUS, mode="edge")
+    side = 2 * RADIUS + 1
+    for y, x in ((0, 0), (7, 8), (13, 3)):
+        weight = np.exp(-abs(colours[y : y + side, x : x + side] - guide[0, y, x]) / CONTRAST)
+        expected = (weight * padded[y : y + side, x : x + side]).sum() / weight.sum()
+        assert found[y, x] == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_images_speak_for_the_true_depth():
+    scene = make_scene()
+    truth = torch.from_numpy(scene.truth[0])
+    wrong = 1.15 * truth
+    left = torch.arange(RENDER.width).expand(RENDER.height, -1) < 40
+    depths = torch.stack([torch.where(left, truth, wrong), torch.where(left, wrong, truth)])
+    depths[:, :, 80:] = truth[:, 80:]
+    same = (depths[0] - depths[1]).abs() < 1e-6
+    vote = photo_vote(scene.views[0], scene.views[1:], depths, same, RENDER)
+    assert float(vote.abs().max()) <= 1
+    inner = torch.zeros_like(left)
+    inner[8:-8, 8:72] = True
+    assert float((vote[inner & left] < 0).float().mean()) > 0.95
+    assert float((vote[inner & ~left] > 0).float().mean()) > 0.95
+    turned = photo_vote(scene.views[0], scene.views[1:], depths.flip(0), same, RENDER)
+    # The light is learned from the first of two depths that are the same where it counts.
+    assert torch.allclose(turned, -vote, atol=1e-5)
+
+
+def test_a_farther_plane_goes_on_beneath_the_foreground():
+    v, u = torch.meshgrid(torch.arange(30.0), torch.arange(50.0), indexing="ij")
+    floor = 1 / (0.25 + 0.002 * v)  # slanted along the edge, at which no slope is known across it
+    depth = torch.where(u < 20, torch.full_like(floor, 2.0), floor)
+    found = farther_surface(depth, 5)
+    assert not found[:, 20:].any()
+    assert not found[:, :15].any()
+    beneath = (slice(6, -6), slice(15, 20))
+    assert found[beneath].numpy() == pytest.approx(floor[beneath].numpy(), rel=1e-4)
+    assert not farther_surface(1 / (0.25 + 0.001 * u), 5).any()  # a slanted plane has none
+    assert (found[found > 0] > depth[found > 0] / (1 - 0.9 * APART)).all()
+
+
+class _Grown(AlternativeSearch):
+    """Finds the true depth, but for a foreground that is some pixels too large."""
+
+    def __init__(self, depth, confidence):
+        super().__init__(CpuDepthEngine(RENDER, WORKING, 8))
+        self.found = DenseDepth(depth, confidence, depth.median())
+
+    def estimate(self, references, neighbours, progress=None, limits=None):
+        return [self.found for _ in references]
+
+
+def test_a_foreground_that_has_grown_gives_back_what_is_behind_it():
+    working = Camera(fx=320.0, fy=320.0, cx=191.5, cy=143.5, width=384, height=288)
+    render = working.resized(192, 144)
+    scene = make_scene(0, working, render)
+    truth = torch.from_numpy(scene.truth[0])
+    ball = (truth < 2.1)[None, None].float()
+    fringe = (max_pool2d(ball, 5, 1, 2) > ball)[0, 0]
+    nearest = max_pool2d(ball / truth, 5, 1, 2)[0, 0]
+    depth = torch.where(fringe, 1 / nearest.clamp(min=1e-6), truth)
+    engine = FarSideSearch(_Grown(depth, torch.full_like(depth, 0.9)), render)
+    (found,) = engine.estimate([scene.views[0]], [scene.views[1:]])
+    wrong = lambda z, where: float(((z / truth - 1).abs() > 0.05)[where].float().mean())  # noqa: E731
+    assert round(REACH * 192) >= 3
+    assert wrong(depth, fringe) > 0.95
+    assert wrong(found.depth, fringe) < 0.35
+    assert wrong(found.depth, ball[0, 0] > 0) < 0.05
+    moved = found.depth != depth
+    assert float(found.confidence[moved].max()) < 0.5
+    assert found.typical == pytest.approx(float(found.depth.median()))
