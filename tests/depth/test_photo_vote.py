@@ -100,6 +100,21 @@ def test_the_images_speak_for_the_true_depth():
     assert torch.allclose(turned, -vote, atol=1e-5)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_says_the_same():
+    scene = make_scene()
+    truth = torch.from_numpy(scene.truth[0])
+    depths = torch.stack([truth, 1.1 * truth])
+    depths[1, :20] = truth[:20]
+    same = depths[0] == depths[1]
+    views = scene.views[0], scene.views[1:]
+    expected = photo_vote(*views, depths, same, RENDER)
+    found = photo_vote(*views, depths.cuda(), same.cuda(), RENDER)
+    assert float((found.cpu() - expected).abs().max()) < 1e-3
+    beyond = torch.where(truth < 2.1, truth, 1.3 * truth)
+    assert torch.allclose(farther_surface(beyond.cuda(), 4).cpu(), farther_surface(beyond, 4))
+
+
 def test_a_farther_plane_goes_on_beneath_the_foreground():
     v, u = torch.meshgrid(torch.arange(30.0), torch.arange(50.0), indexing="ij")
     floor = 1 / (0.25 + 0.002 * v)  # slanted along the edge, at which no slope is known across it

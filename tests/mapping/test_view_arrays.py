@@ -58,6 +58,27 @@ def test_measured_depth_weighs_more_in_the_losses_alone():
             torch.testing.assert_close(depth.confidence, confidence * one)
 
 
+def test_depth_weighs_more_beside_sure_jumps():
+    image = np.zeros((64, 80, 3), np.uint8)
+    keyframe = segment_of([Sample(0, image, torch.eye(4, dtype=torch.float64))], CAMERA)[0]
+    config = replace(Config().mapping, render_long_edge=40)
+    loss = replace(config.loss, edge_factor=4.0, edge_reach=2)
+    pool = views_of(keyframe.table, MapCameras.of(CAMERA, config), loss)
+    pool.add(0)
+    depth = torch.full((32, 40), 3.0)
+    depth[:, 20:] = 2
+    confidence = torch.full((32, 40), 0.8)
+    confidence[16:] = 0.4  # too unsure to say where it jumps
+    pool[0].set_depth(DenseDepth(depth, confidence, torch.tensor(2.0)))
+    constants = pool[0].constants
+    assert constants is not None
+    expected = confidence.clone()
+    expected[:18, 17:23] *= 4
+    expected[16:18, 17:18] = expected[16:18, 22:23] = 1.6
+    torch.testing.assert_close(constants.confidence, expected)
+    torch.testing.assert_close(pool[0].dense.confidence, confidence)
+
+
 def test_few_depths_stay_on_a_gpu_beside_their_file(monkeypatch):
     monkeypatch.setattr(view_arrays, "DEPTHS_ON_GPU", 2)
     image, eye = np.zeros((64, 80, 3), np.uint8), torch.eye(4, dtype=torch.float64)
