@@ -11,8 +11,8 @@ from depth_scene import RENDER, WORKING, DepthScene, make_scene
 from geogs import threads
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
+from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth
-from geogs.depth.engine_choice import depth_engine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
 from geogs.depth.sweep_neighbors import (
@@ -148,7 +148,7 @@ def test_check_lowers_the_confidence_of_a_floater_and_averages_noise(scene, dept
 
 
 def test_the_cpu_engine_is_the_functions(scene, depths):
-    engine = depth_engine("cpu", RENDER, WORKING, DepthConfig(), 128)
+    engine = CpuDepthEngine(RENDER, WORKING, DepthConfig.planes)
     views = scene.views
     dense = engine.estimate(views[:2], [[v for v in views if v.id != i] for i in range(2)])
     posed = [PosedDepth(v.T_cw, DenseDepth.of(d)) for v, d in zip(views, depths, strict=True)]

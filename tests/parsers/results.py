@@ -15,6 +15,7 @@ from geogs.application.results.output_folder import free_folder
 from geogs.application.results.remesh import mesh_settings
 from geogs.application.results.result_page import shown_model, shown_views, write_page_anew
 from geogs.application.results.saved_result import load_result
+from geogs.evaluation.pages.lengths import lengths
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
@@ -109,7 +110,7 @@ def shown(folder: Path) -> SurfaceMaps:
     """A result on its page, and a view of its map."""
     found = load_result(folder)
     views = shown_views(found)
-    shown_model(found.trajectory, views, found.camera, None, found.disks)
+    shown_model(found.trajectory, views, found.camera, None, found.disks, lengths(found.summary))
     id = int(found.views.keyframe_id[0])
     read_image(image_path(folder, 3))
     read_mask(mask_path(folder, 3))

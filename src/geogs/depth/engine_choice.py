@@ -21,11 +21,13 @@ def depth_engine(
     Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
     classical = _classical(device, render, working, config, resident)
+    if torch.device(device).type == "cpu":  # tried nowhere else
+        classical = FarSideSearch(classical, render)
     engine = config.engine
     if engine == "auto":
         engine = "joint" if torch.device(device).type == "cuda" else "classical"
     if engine == "classical":
-        return FarSideSearch(classical, render)
+        return classical
     if engine == "tracker":
         from geogs.depth.tracker_depth import TrackerDepthEngine
 

@@ -69,18 +69,19 @@ class FarSideSearch(AlternativeSearch):
 def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
     """Depth of the nearest farther surface within ``reach`` pixels, its plane gone on to the pixel.
 
-    0 where there is none. ``depth`` is positive; inverse depth is linear along a plane.
+    0 where there is none, or it would be farther than all that was found. ``depth`` is positive;
+    inverse depth is linear along a plane.
     """
     inverse = 1 / depth
     source = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
     found = torch.zeros_like(source)
-    height, width = depth.shape
+    (height, width), farthest = depth.shape, inverse.amin()
     for _ in range(reach):
         around = F.pad(source, (1, 1, 1, 1))
         for dy, dx in _AROUND:
             plane = around[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
             here = plane[0] - dx * plane[1] - dy * plane[2]
-            goes_on = (plane[0] > 0) & (here > 0) & (here < (1 - APART) * inverse)
+            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - APART) * inverse)
             new = goes_on & (found[0] == 0)
             found = torch.where(new, torch.stack([here, plane[1], plane[2]]), found)
         source = found
