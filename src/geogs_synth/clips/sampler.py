@@ -21,12 +21,10 @@ from geogs_synth.draw import Draw
 from geogs_synth.raycast.caster import RenderedRooms
 from geogs_synth.raycast.casters import caster_for
 from geogs_synth.scene.batch import moved
-from geogs_synth.scene.rooms import Rooms, room_per_view
+from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, room_per_view
 from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
 
-PLACES = 128
-"""Places for solids in a room, at most; of more some are left out."""
 _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 """Sizes of rooms, metres."""
 
@@ -126,7 +124,7 @@ def draw_plan(
     lights = draw_lights(draw, size, options.views, options.light_change)
     paths = draw_paths(draw, options, size)
     flaws = draw_flaws(draw, batch, options.views, options.clean, options.disturbance)
-    rooms = Rooms(size, layout.solids, surfaces, lights).with_places(PLACES)
+    rooms = Rooms(size, layout.solids, surfaces, lights).with_places(MOST_SOLIDS)
     if options.scenes == only_scene("usual"):
         return Plan(key, rooms, paths, flaws)
     rooms, paths, dynamics = draw_dynamics(draw, options, rooms, paths, materials)

@@ -10,12 +10,11 @@ from geogs.gpu.kernels import kernels_for
 from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.raycast.caster import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.raycast.rays import Hit
-from geogs_synth.scene.rooms import Rooms, packed_solids
+from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, packed_solids
 from geogs_synth.scene.solids import SolidBatch
 from geogs_synth.textures.pyramids import TextureBank
 
 SOURCE = Path(__file__).with_name("rooms.cu")
-MOST_SOLIDS = 128
 _BLOCK = (16, 8)
 
 

@@ -14,6 +14,9 @@ from torch import Tensor
 from geogs_synth.scene.batch import each, gathered
 from geogs_synth.scene.solids import NONE, SolidBatch
 
+MOST_SOLIDS = 128
+"""Places for solids in a room that kernels take."""
+
 
 @dataclass(frozen=True)
 class Surfaces:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.network.plane_views import cell_rays
+from geogs.depth.network.plane_views import cell_rays, plane_step
 from geogs.depth.network.stereo_views import DepthPrediction
 from geogs.depth.network.surface_normals import normals_of
 from geogs_train.depth.depth_options import DepthLossOptions
@@ -152,7 +152,7 @@ def _log_likelihood(
 ) -> tuple[Float[Tensor, "b h w"], Bool[Tensor, "b h w"]]:
     """Between the logarithms of the planes before and after a depth; where it is among them."""
     planes = log_planes.shape[1]
-    step = torch.diff(log_planes, dim=1).mean(1)[:, None, None]
+    step = plane_step(log_planes)[:, None, None]
     place = ((depth - log_planes[:, :1, None]) / step).nan_to_num(-1.0)
     below = place.floor().clamp(0, planes - 2)
     fraction = (place - below).clamp(0, 1)

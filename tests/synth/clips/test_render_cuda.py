@@ -17,9 +17,9 @@ from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
 from geogs_synth.raycast.cpu_caster import CpuCaster
-from geogs_synth.raycast.cuda_caster import MOST_SOLIDS, SOURCE, CudaCaster
+from geogs_synth.raycast.cuda_caster import SOURCE, CudaCaster
 from geogs_synth.scene.batch import moved
-from geogs_synth.scene.rooms import Rooms
+from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms
 from random_rooms import small_bank
 
 HOST = torch.device("cpu")

@@ -8,8 +8,9 @@ import torch
 from geogs_synth.clips import thin_things
 from geogs_synth.clips.furnishing import draw_furnishing
 from geogs_synth.clips.room_options import RoomOptions
-from geogs_synth.clips.sampler import PLACES, draw_plan
+from geogs_synth.clips.sampler import draw_plan
 from geogs_synth.draw import Draw
+from geogs_synth.scene.rooms import MOST_SOLIDS
 from geogs_synth.scene.solids import NONE
 
 SIZE = torch.tensor([[4.0, 5.0, 2.5], [6.0, 3.0, 3.0]])
@@ -61,8 +62,8 @@ def test_rooms_have_no_more_places_than_the_kernels_take_and_keep_their_looks():
     options = replace(OPTIONS, least_density=0.1, most_density=0.3, thin=1.0)
     rooms = draw_plan(options, 4, 0, 3, 6, 0).rooms
     kind = rooms.solids.kind
-    assert kind.shape == (6, PLACES)
-    assert rooms.surfaces.contrast.shape == (6, 6 + 2 * PLACES)
+    assert kind.shape == (6, MOST_SOLIDS)
+    assert rooms.surfaces.contrast.shape == (6, 6 + 2 * MOST_SOLIDS)
     assert (kind != NONE).sum(1).float().mean() > 30
 
 
@@ -78,7 +79,7 @@ def test_a_solid_keeps_its_surfaces_where_others_leave():
             own = fewer.surfaces.tint[b, 6 + side : 6 + 2 * there : 2]
             torch.testing.assert_close(own, rooms.surfaces.tint[b, 6 + 2 * kept + side])
     assert torch.equal(fewer.surfaces.texture[:, :6], rooms.surfaces.texture[:, :6])
-    assert rooms.with_places(PLACES) is rooms
+    assert rooms.with_places(MOST_SOLIDS) is rooms
 
 
 @pytest.mark.parametrize("make", [thin_things.lattices, thin_things.bushes])

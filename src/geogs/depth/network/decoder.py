@@ -12,7 +12,7 @@ from torch.nn import functional
 from geogs.depth.network.close_search import COUNT, chosen, close_depths, plane_modes
 from geogs.depth.network.layers import Block, Residual, doubled, upsampled
 from geogs.depth.network.network_sizes import DepthNetworkOptions
-from geogs.depth.network.plane_views import cell_rays
+from geogs.depth.network.plane_views import cell_rays, plane_step
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.surface_normals import normals_of
 from geogs.depth.network.volume import PlaneVolume
@@ -93,7 +93,7 @@ class DepthReadout(nn.Module):
     ) -> DepthPrediction:
         """``fine`` is what is matched at 1/2: that of the keyframe first."""
         with torch.autocast(features.device.type, enabled=False):
-            step = torch.diff(log_planes, dim=1).mean(1)
+            step = plane_step(log_planes)
         logits = self.planes(features).float()
         to_half = self.to_half(features)
         with torch.autocast(features.device.type, enabled=False):
@@ -111,9 +111,17 @@ class DepthReadout(nn.Module):
             depths = depths + (coarse - coarse.detach())
             aside = MOST_RESIDUAL * step[:, None, None] * raw[:, 0].tanh()
             at_half = chosen(choice, depths, step) + aside
-        fine_maps = self._at_full(x, at_half, raw[:, 1:], views.intrinsics)
+        fine = self._at_full(x, at_half, raw[:, 1:], views.intrinsics)
+        height, width = fine.shape[-2:]
+        with torch.autocast(features.device.type, enabled=False):
+            own = cell_rays(views.intrinsics, height, width, 1).unflatten(2, (height, width))
+            normal = facing(fine[:, 3:6], own)
         return DepthPrediction(
-            **fine_maps,
+            log_depth=fine[:, 0],
+            log_scale=bounded(fine[:, 1]),
+            outlier=fine[:, 2] + _LIKELY,
+            normal=normal,
+            concentration=concentration(fine[:, 6]),
             at_half=at_half,
             at_quarter=modes.first,
             tried=depths,
@@ -129,8 +137,9 @@ class DepthReadout(nn.Module):
         at_half: Float[Tensor, "b h2 w2"],
         raw: Float[Tensor, "b 2 h2 w2"],
         intrinsics: Float[Tensor, "b 4"],
-    ) -> dict[str, Tensor]:
-        """The prediction's maps of the image's size, by their names."""
+    ) -> Float[Tensor, "b 7 h w"]:
+        """Log depth, what scale and outliers are read from, normal, and what its concentration is,
+        at the image's size."""
         height, width = at_half.shape[-2:]
         rays = cell_rays(intrinsics, height, width, 2).unflatten(2, (height, width))
         with torch.autocast(x.device.type, enabled=False):
@@ -140,15 +149,7 @@ class DepthReadout(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             normal = facing(tilt[:, :3] + bent, rays)
             numbers = torch.cat([at_half[:, None], raw, normal, tilt[:, 3:]], 1)
-            fine = upsampled(numbers, to_full, APART)
-            own = cell_rays(intrinsics, 2 * height, 2 * width, 1).unflatten(2, (2 * height, -1))
-            return {
-                "log_depth": fine[:, 0],
-                "log_scale": bounded(fine[:, 1]),
-                "outlier": fine[:, 2] + _LIKELY,
-                "normal": facing(fine[:, 3:6], own),
-                "concentration": concentration(fine[:, 6]),
-            }
+            return upsampled(numbers, to_full, APART)
 
 
 def bounded(raw: Tensor) -> Tensor:

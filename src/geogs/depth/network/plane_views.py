@@ -33,8 +33,7 @@ class TriedDepths:
     @staticmethod
     def planes(log_planes: Float[Tensor, "b d"]) -> "TriedDepths":
         """Evenly spaced planes."""
-        step = torch.diff(log_planes, dim=1).mean(1)
-        return TriedDepths(log_planes[..., None], log_planes, step)
+        return TriedDepths(log_planes[..., None], log_planes, plane_step(log_planes))
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,11 @@ class PlaneViews:
     """Between the two rays, radians."""
     log_step: Float[Tensor, "b d p"]
     """Logarithm of the pixels that a cell moves from this depth to the next."""
+
+
+def plane_step(log_planes: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:
+    """From one plane to the next, on average."""
+    return torch.diff(log_planes, dim=1).mean(1)
 
 
 def log_planes(
