@@ -13,6 +13,7 @@ from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 from geogs.depth.photo_vote import photo_vote
 from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import minmod_slopes
+from geogs.threads import thread_map
 
 APART = 0.03
 """Relative difference of inverse depth from which what is around is a farther surface."""
@@ -45,14 +46,14 @@ class FarSideSearch(AlternativeSearch):
     ) -> list[DenseDepth]:
         """As in the protocol."""
         searched = self.classical.estimate(references, neighbours, progress, limits)
-        return [
-            self._resolved(view, others, depth) if others else depth
-            for view, others, depth in zip(references, neighbours, searched, strict=True)
-        ]
+        tasks = list(zip(references, neighbours, searched, strict=True))
+        return thread_map(lambda task: self._resolved(*task), tasks)
 
     def _resolved(
         self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
     ) -> DenseDepth:
+        if not others:
+            return searched
         depth, confidence = searched.depth, searched.confidence
         for _ in range(PASSES):
             beyond = farther_surface(depth, round(REACH * max(depth.shape)))
