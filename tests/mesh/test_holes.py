@@ -9,7 +9,8 @@ from geogs.geometry.camera import Camera
 from geogs.mesh import clean
 from geogs.mesh.clean import keep_faces
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.free_space import FreeSpace
+from geogs.mesh.face_kernels import border_edges
+from geogs.mesh.free_space import FreeSpace, SeenFree
 from geogs.mesh.holes import border_loops, close_holes
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, SparseTsdf
@@ -42,9 +43,16 @@ def open_edges(mesh: Mesh) -> int:
 
 
 def test_loops_go_round_every_border_once():
-    loops = list(border_loops(sheet((3, 3, 1), (8, 8, 3)).faces))
-    assert sorted(map(len, loops)) == [4, 12, 80]
-    assert len({vertex for loop in loops for vertex in loop}) == 96
+    mesh = sheet((3, 3, 1), (8, 8, 3), (15, 8, 1))
+    border = border_edges(mesh.faces, len(mesh.vertices))
+    loops = list(border_loops(border, 100))
+    assert [loop.shape for loop in loops] == [(2, 4), (1, 12), (1, 80)]
+    assert len({vertex for loop in loops for vertex in loop.ravel().tolist()}) == 100
+    backwards = {(end, start) for start, end in border.tolist()}
+    for loop in loops:
+        steps = np.stack([loop, np.roll(loop, -1, axis=1)], -1).reshape(-1, 2)
+        assert {tuple(step) for step in steps.tolist()} <= backwards
+    assert [loop.shape for loop in border_loops(border, 8)] == [(2, 4)]
 
 
 def test_small_holes_are_closed_and_turn_the_same_side_up():
@@ -82,7 +90,7 @@ def test_what_is_free_is_asked_of_the_voxel_nearest_to_a_point():
     tsdf.integrate(depth, torch.ones(30, 40), camera, torch.eye(4, dtype=torch.float64))
     random = np.random.default_rng(0)
     points = random.uniform([-1, -1, 1.2], [1, 1, 2.5], (200, 3))
-    free, expected = FreeSpace.of(tsdf, 0.9), []
+    free, asked, expected = FreeSpace.of(tsdf, 0.9), SeenFree(tsdf, 0.9), []
     for point in points:
         voxel = np.rint(point / 0.1).astype(int)
         block = voxel // BLOCK
@@ -93,9 +101,11 @@ def test_what_is_free_is_asked_of_the_voxel_nearest_to_a_point():
             and float(tsdf.weight[slot[0]][place]) >= 0.9
             and float(tsdf.distance[slot[0]][place]) > 0.5
         )
-    assert free(points).tolist() == expected
+    assert free(points).tolist() == asked(points).tolist() == expected
     assert 0.03 < np.mean(expected) < 0.97
-    assert not free(np.array([[1e9, 0.0, 0.0]]))[0]
+    far = np.array([[1e9, 0.0, 0.0]])
+    assert not free(far)[0]
+    assert not asked(far)[0]
 
 
 @pytest.mark.parametrize("looked_through", [False, True])

@@ -24,11 +24,16 @@ def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
         mesh, config.min_component_faces, LEAST_OF_LARGEST, config.max_components
     )
     if not len(mesh.faces):
-        raise InputError(
-            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
-            "or use more views."
-        )
+        raise no_surface(config)
     return close_holes(mesh, CLOSED_HOLES, is_free)
+
+
+def no_surface(config: MeshConfig) -> InputError:
+    """The error that no surface is left."""
+    return InputError(
+        f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
+        "or use more views."
+    )
 
 
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:

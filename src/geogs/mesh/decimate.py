@@ -1,10 +1,16 @@
 """A mesh with as few triangles as its surface needs."""
 
+from dataclasses import replace
+
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from geogs.mesh.clean import remove_degenerate_faces
+from geogs.mesh.collapse import CollapsingMesh
 from geogs.mesh.deviation import deviations
+from geogs.mesh.device.deviation import surface_distances
 from geogs.mesh.triangle_mesh import Mesh, vertex_normals
 from geogs.threads import worker_count
 
@@ -26,36 +32,75 @@ _FEWEST = 200
 def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     """Collapse edges by quadric error for as long as the surface stays where it was.
 
-    99 % of the vertices lie within ``tolerance`` (map units) of the decimated surface, and on
-    average within 15 % of that; borders stay as they are. Colours are the means of those of the
-    vertices that each new one stands for. Of a mesh that this would not make smaller
-    nothing changes.
-
-    Method: Garland and Heckbert (1997), as in fast-simplification. It is given the number of
-    triangles to leave, so it is asked for a quarter, again and again, until that is too few; then
-    for a half, and so on. Deviations grow the faster the fewer triangles are left, so that what
-    would be too few even if they grew as before is not tried: trying takes longest there.
+    Colours are the means of those of the vertices that each new one stands for. Of a mesh that
+    this would not make smaller nothing changes. See :func:`merged`.
     """
-    if tolerance <= 0 or len(mesh.faces) < _FEWEST:
+    few = merged(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces), tolerance)
+    if few is None:
         return mesh
-    samples = mesh.vertices[:: 1 + len(mesh.vertices) // _SAMPLES]
-    vertices, faces = mesh.vertices, mesh.faces
+    vertices, faces, became = few.compact()
+    colours = None
+    if mesh.colours is not None:
+        given = torch.from_numpy(mesh.colours).float()
+        mean, _ = means(given, became >= 0, became, len(vertices))
+        colours = (mean + 0.5).to(torch.uint8).numpy()
+    new = Mesh.from_triangles(vertices.numpy(), faces.numpy())
+    return remove_degenerate_faces(replace(new, colours=colours))
+
+
+def merged(
+    vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"], tolerance: float
+) -> CollapsingMesh | None:
+    """The mesh with as few triangles as its surface needs; None where there is nothing to gain.
+
+    99 % of the vertices lie within ``tolerance`` (map units) of the decimated surface, and on
+    average within 15 % of that; borders stay as they are. Computed on the device of the vertices.
+
+    Edges are collapsed until a quarter of the triangles is left, again and again, until that is too
+    few; then until a half is, and so on. Deviations grow the faster the fewer triangles are left,
+    so that what would be too few even if they grew as before is not tried: trying takes longest
+    there.
+    """
+    if tolerance <= 0 or len(faces) < _FEWEST:
+        return None
+    samples = vertices[:: 1 + len(vertices) // _SAMPLES]
+    start = mesh = CollapsingMesh(vertices, faces)
     allowed, growth = np.array([tolerance, MEAN_FRACTION * tolerance]), np.zeros(2)
     reached = np.zeros(2)
     for fraction in _FRACTIONS:
-        while len(faces) >= _FEWEST and (reached * fraction**-growth <= allowed).all():
-            fewer = _simplified(vertices, faces, fraction)
-            if len(fewer[1]) > 0.97 * len(faces) or not len(fewer[1]):
+        while len(mesh.faces) >= _FEWEST and (reached * fraction**-growth <= allowed).all():
+            fewer = mesh.reduced(int(fraction * len(mesh.faces)))
+            if len(fewer.faces) > 0.97 * len(mesh.faces):
                 break
-            away = deviations(samples, *fewer)
-            deviation = np.array([np.quantile(away, QUANTILE), away.mean()])
+            deviation = _deviation(samples, fewer)
             if (deviation > allowed).any():
                 break
-            growth, reached = _growth(reached, deviation, len(fewer[1]) / len(faces)), deviation
-            vertices, faces = fewer
-    if faces is mesh.faces:
-        return mesh
-    return remove_degenerate_faces(_dressed(mesh, vertices, faces))
+            growth = _growth(reached, deviation, len(fewer.faces) / len(mesh.faces))
+            mesh, reached = fewer, deviation
+    return None if mesh is start else mesh
+
+
+def _deviation(samples: Float[Tensor, "k 3"], mesh: CollapsingMesh) -> Float[np.ndarray, "2"]:
+    """How far points are off a mesh: nearly all of them, and on average."""
+    vertices, faces, _ = mesh.compact()
+    if samples.device.type == "cpu":
+        away = deviations(samples.numpy(), vertices.numpy(), faces.numpy())
+    else:
+        away = surface_distances(samples, vertices, faces).cpu().numpy()
+    return np.array([np.quantile(away, QUANTILE), away.mean()])
+
+
+def means(
+    values: Float[Tensor, "n c"], known: Bool[Tensor, "n"], became: Int[Tensor, "n"], count: int
+) -> tuple[Float[Tensor, "k c"], Bool[Tensor, "k"]]:
+    """Means of the known values of the vertices that became each of ``count``; where there are
+    any."""
+    index = became[known]
+    total = values.new_zeros(count, values.shape[1]).index_add_(0, index, values[known])
+    number = values.new_zeros(count).index_add_(
+        0, index, torch.ones_like(index, dtype=values.dtype)
+    )
+    return total / number.clamp(min=1)[:, None], number > 0
 
 
 def _growth(

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from geogs.threads import worker_count
 
-_NEAREST = 3
+NEAREST = 3
 """Vertices around a point whose faces are looked at."""
 
 
@@ -27,7 +27,7 @@ def deviations(
     used = np.flatnonzero(is_used)
     # Of a tree that is asked once, most of the time would go into balancing it.
     tree = cKDTree(vertices[used], balanced_tree=False, compact_nodes=False)
-    count = min(_NEAREST, len(used))
+    count = min(NEAREST, len(used))
     _, near = tree.query(points, k=count, workers=worker_count())
     first, around = faces_around(len(vertices), faces)
     corners = vertices.astype(np.float64)[faces]

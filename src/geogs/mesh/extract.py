@@ -6,17 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.clean import cleaned
-from geogs.mesh.colour import colour_mesh
-from geogs.mesh.decimate import decimate
-from geogs.mesh.free_space import FreeSpace
+from geogs.mesh.clean import cleaned, remove_degenerate_faces
+from geogs.mesh.colour import filled, seen_colours
+from geogs.mesh.decimate import means, merged
+from geogs.mesh.device.clean import device_cleaned
+from geogs.mesh.device.surface import device_surface
+from geogs.mesh.free_space import SeenFree
 from geogs.mesh.level_set import extract_surface
-from geogs.mesh.triangle_mesh import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh, vertex_normals
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
 from geogs.threads import on_one_torch_thread
 
@@ -127,18 +129,57 @@ def extract_mesh(
             )
         plan = replace(plan, voxel=COARSER * plan.voxel)
         _log.info("too large: voxel %.4g", plan.voxel)
-    mesh = extract_surface(tsdf, config.min_weight)
-    mesh = cleaned(mesh, config, FreeSpace.of(tsdf, config.min_weight))
+    surface = _clean_surface(tsdf, config)
     del tsdf
+    seen = None
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
-        mesh = colour_mesh(mesh, views, 2 * plan.voxel, report)
+        seen = seen_colours(surface.vertices, surface.normals, views, 2 * plan.voxel, report)
     if progress:
         progress("merge", 0, 1)
-    mesh = decimate(mesh, config.detail * plan.voxel)
+    mesh = _merged_mesh(surface, seen, config.detail * plan.voxel)
     if progress:
         progress("merge", 1, 1)
     return mesh
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """A surface on the device where it was fused."""
+
+    vertices: Float[Tensor, "n 3"]
+    faces: Int[Tensor, "m 3"]
+    """int32."""
+    normals: Float[Tensor, "n 3"]
+
+
+def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
+    """The surface in a volume, cleaned. Raises InputError if there is none."""
+    is_free = SeenFree(tsdf, config.min_weight)
+    if tsdf.device.type != "cpu":
+        found, normals = device_cleaned(device_surface(tsdf, config.min_weight), config, is_free)
+        return _Surface(found.vertices, found.faces.to(torch.int32), normals)
+    mesh = cleaned(extract_surface(tsdf, config.min_weight), config, is_free)
+    return _Surface(*map(torch.from_numpy, (mesh.vertices, mesh.faces, mesh.normals)))
+
+
+def _merged_mesh(surface: _Surface, seen: tuple[Tensor, Tensor] | None, tolerance: float) -> Mesh:
+    """A surface on the host, decimated, with the colours of those of its vertices that were seen.
+
+    Others take theirs only now, when there are few.
+    """
+    vertices, faces = surface.vertices, surface.faces
+    few = merged(vertices, faces, tolerance)
+    if few is not None:
+        vertices, faces, became = few.compact()
+        if seen is not None:
+            mean, is_seen = seen
+            seen = means(mean, is_seen & (became >= 0), became, len(vertices))
+    colours = None if seen is None else filled(vertices, *seen).cpu().numpy()
+    arrays = vertices.cpu().numpy(), faces.cpu().numpy()
+    if few is None:
+        return Mesh(*arrays, surface.normals.cpu().numpy(), colours)
+    return remove_degenerate_faces(Mesh(*arrays, vertex_normals(*arrays), colours))
 
 
 def fuse(

@@ -14,6 +14,27 @@ FREE = 0.5
 
 
 @dataclass(frozen=True)
+class SeenFree:
+    """Whether points lie where a volume is free, asked of the volume itself."""
+
+    tsdf: SparseTsdf
+    min_weight: float
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Whether the voxel nearest to each point is free; where there is none it is not."""
+        volume, limit = self.tsdf, LIMIT // BLOCK
+        voxel = torch.from_numpy(np.rint(points / volume.voxel)).to(volume.device).long()
+        block = torch.div(voxel, BLOCK, rounding_mode="floor")
+        slot = volume.slots_of(block.clamp(-limit, limit))
+        known = (slot >= 0) & (voxel.abs() < LIMIT).all(-1)
+        x, y, z = (voxel - block * BLOCK).unbind(-1)
+        slot, x, y, z = slot[known], x[known], y[known], z[known]
+        is_seen = volume.weight[slot, x, y, z] >= self.min_weight
+        known[known.clone()] = is_seen & (volume.distance[slot, x, y, z] > FREE)
+        return known.cpu().numpy()
+
+
+@dataclass(frozen=True)
 class FreeSpace:
     """A bit for every voxel of a volume, which takes a 64th of the volume's memory."""
 

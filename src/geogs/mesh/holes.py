@@ -1,17 +1,27 @@
 """Small holes of a mesh, closed where nobody looked through them."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from geogs.mesh.triangle_mesh import Mesh, cross
+from geogs.mesh.triangle_mesh import Mesh
 
 IsFree = Callable[[Float[np.ndarray, "k 3"]], Bool[np.ndarray, "k"]]
 """Which points lie in space that was seen to be free."""
+Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Positions and normals of vertices."""
 
-Loop = list[int]
-"""Vertices around a hole, in the order in which faces that close it go round."""
+
+@dataclass(frozen=True)
+class Fans:
+    """Vertices and faces that close holes."""
+
+    vertices: Float[np.ndarray, "k 3"]
+    """float32."""
+    normals: Float[np.ndarray, "k 3"]
+    faces: Int[np.ndarray, "m 3"]
 
 
 def close_holes(mesh: Mesh, most_edges: int, is_free: IsFree) -> Mesh:
@@ -20,50 +30,78 @@ def close_holes(mesh: Mesh, most_edges: int, is_free: IsFree) -> Mesh:
     A hole stays open where its middle is free, or where the fan would fold over: such an edge is
     one of the surface, no gap in it. Colours are made later.
     """
-    loops = [loop for loop in border_loops(mesh.faces) if 3 <= len(loop) <= most_edges]
-    loops = [loop for loop in loops if _is_flat(mesh, loop)]
-    if not loops:
-        return mesh
-    middles = np.array([mesh.vertices[loop].astype(np.float64).mean(axis=0) for loop in loops])
-    closed = np.flatnonzero(~is_free(middles))
-    vertices, faces, normals = [mesh.vertices], [mesh.faces], [mesh.normals]
-    count = len(mesh.vertices)
-    for number in closed.tolist():
-        loop = loops[number]
-        middle = np.full(len(loop), count)
-        faces.append(np.stack([loop, np.roll(loop, -1), middle], -1).astype(np.int32))
-        vertices.append(middles[number : number + 1].astype(np.float32))
-        mean = mesh.normals[loop].astype(np.float64).sum(axis=0)
-        normals.append((mean / np.linalg.norm(mean))[None].astype(np.float32))
-        count += 1
-    return Mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
-
-
-def border_loops(faces: Int[np.ndarray, "m 3"]) -> Iterator[Loop]:
-    """Closed chains of edges that one face has, against the direction in which it has them.
-
-    Chains through a vertex where two borders meet are left out.
-    """
     from geogs.mesh.face_kernels import border_edges
 
-    border = border_edges(np.ascontiguousarray(faces), int(faces.max(initial=-1)) + 1)
-    starts, counts = np.unique(border[:, 1], return_counts=True)
-    single = set(starts[counts == 1].tolist())
-    following = {end: start for start, end in border.tolist() if end in single}
-    while following:
-        first, vertex = following.popitem()
-        loop = [first]
-        while vertex in following:
-            loop.append(vertex)
-            vertex = following.pop(vertex)
-        if vertex == first:
-            yield loop
+    border = border_edges(np.ascontiguousarray(mesh.faces), len(mesh.vertices))
+
+    def look(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return mesh.vertices[vertices], mesh.normals[vertices]
+
+    fans = closing_fans(border, len(mesh.vertices), look, most_edges, is_free)
+    if not len(fans.faces):
+        return mesh
+    return Mesh(
+        np.concatenate([mesh.vertices, fans.vertices]),
+        np.concatenate([mesh.faces, fans.faces.astype(np.int32)]),
+        np.concatenate([mesh.normals, fans.normals]),
+    )
 
 
-def _is_flat(mesh: Mesh, loop: Loop) -> bool:
-    """Whether all triangles of the fan turn the same side up as the surface around."""
-    corners = mesh.vertices[loop].astype(np.float64)
-    middle, up = corners.mean(axis=0), mesh.normals[loop].astype(np.float64).sum(axis=0)
-    normals = cross(np.roll(corners, -1, axis=0) - corners, middle - corners)
-    length = np.linalg.norm(normals, axis=1) * np.linalg.norm(up)
-    return bool((normals @ up > 0.2 * length).all() and (length > 0).all())
+def closing_fans(
+    border: Int[np.ndarray, "e 2"], count: int, look: Look, most_edges: int, is_free: IsFree
+) -> Fans:
+    """The fans of :func:`close_holes`, their vertices numbered from ``count`` on.
+
+    ``border`` are the edges (start, end) that one face has.
+    """
+    vertices, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+    faces = [np.zeros((0, 3), np.int64)]
+    for loops in border_loops(border, most_edges):
+        corners, around = (values.astype(np.float64) for values in look(loops))
+        middle, up = corners.mean(axis=1), around.sum(axis=1)
+        closed = np.flatnonzero(_are_flat(corners, middle, up))
+        closed = closed[~is_free(middle[closed])]
+        number = np.broadcast_to(count + np.arange(len(closed))[:, None], loops[closed].shape)
+        turned = np.roll(loops[closed], -1, axis=1)
+        faces.append(np.stack([loops[closed], turned, number], -1).reshape(-1, 3))
+        vertices.append(middle[closed].astype(np.float32))
+        length = np.linalg.norm(up[closed], axis=1, keepdims=True)
+        normals.append((up[closed] / length).astype(np.float32))
+        count += len(closed)
+    return Fans(np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
+
+
+def border_loops(
+    border: Int[np.ndarray, "e 2"], most_edges: int
+) -> Iterator[Int[np.ndarray, "n k"]]:
+    """Closed chains of three to ``most_edges`` edges that one face has, against their direction.
+
+    Those of each number of edges come together, each from its lowest vertex on. Chains through a
+    vertex where two borders meet are left out.
+    """
+    ends, first, counts = np.unique(border[:, 1], return_index=True, return_counts=True)
+    ends, starts = ends[counts == 1], border[first[counts == 1], 0]
+    place = np.searchsorted(ends, starts).clip(max=max(len(ends) - 1, 0))
+    # One more, which chains that end lead to, leads to itself.
+    following = np.append(np.where(ends[place] == starts, place, len(ends)), len(ends))
+    paths = np.arange(len(ends))[:, None]
+    for edges in range(1, most_edges + 1):
+        last = following[paths[:, -1]]
+        is_closed = last == paths[:, 0]
+        if edges >= 3 and is_closed.any():
+            yield ends[paths[is_closed]]
+        # A loop is followed from its lowest vertex alone.
+        goes_on = ~is_closed & (last > paths[:, 0]) & (last < len(ends))
+        paths = np.column_stack([paths[goes_on], last[goes_on]])
+
+
+def _are_flat(
+    corners: Float[np.ndarray, "n k 3"],
+    middle: Float[np.ndarray, "n 3"],
+    up: Float[np.ndarray, "n 3"],
+) -> Bool[np.ndarray, "n"]:
+    """Whether all triangles of a fan turn the same side up as the surface around."""
+    normals = np.cross(np.roll(corners, -1, axis=1) - corners, middle[:, None] - corners)
+    length = np.linalg.norm(normals, axis=-1) * np.linalg.norm(up, axis=-1)[:, None]
+    turn = (normals * up[:, None]).sum(-1)
+    return np.asarray(((turn > 0.2 * length) & (length > 0)).all(axis=1))

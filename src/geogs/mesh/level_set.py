@@ -98,16 +98,21 @@ def _chunks(tsdf: SparseTsdf, min_weight: float) -> Iterator[_VoxelChunk]:
         if min(crop) < 2:
             continue
         place = blocks[member] - first
-        distance = _off_zero(_dense(tsdf.distance[member], place, extent, 1.0, crop))
+        distance = off_zero(_dense(tsdf.distance[member], place, extent, 1.0, crop))
         weight = _dense(tsdf.weight[member], place, extent, 0.0, crop)
-        cell = _seen_cells(weight >= max(min_weight, 1e-6))
+        cell = _seen_cells(weight >= least_weight(min_weight))
         if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
             x, y, z = chunk.tolist()
             origin = first.cpu().numpy() * BLOCK
             yield _VoxelChunk((x, y, z), origin, distance.cpu().numpy(), cell.cpu().numpy())
 
 
-def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
+def least_weight(min_weight: float) -> float:
+    """The weight from which on a voxel was seen."""
+    return max(min_weight, 1e-6)
+
+
+def off_zero(distance: Float[Tensor, "*v"]) -> Float[Tensor, "*v"]:
     """No value quite zero, so that a vertex lies strictly inside its edge."""
     away = distance.abs().clamp(min=_SMALLEST)
     return torch.where(distance < 0, -away, away)

@@ -149,6 +149,14 @@ class SparseTsdf:
         low, high = (block.new_tensor(side) for side in (self.box.low, self.box.high))
         return ((block >= low) & (block < high)).all(-1)
 
+    def slots_of(self, blocks: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
+        """Places of blocks in :attr:`coordinates`, -1 where the volume has none."""
+        if not len(self):
+            return torch.full(blocks.shape[:-1], -1, device=self.device)
+        keys = pack(blocks)
+        place = torch.searchsorted(self._keys, keys).clamp(max=len(self) - 1)
+        return torch.where(self._keys[place] == keys, self._slots[place], -1)
+
     def integrate(
         self,
         depth: Float[Tensor, "h w"],

@@ -1,0 +1,224 @@
+// Parallel edge collapse: what collapse_kernels.py does for a CPU, one thread per vertex or face.
+// Corner 3 f + k is that of face f at its k-th vertex, and stands for the edge from there to the
+// next vertex of the face. The corners at vertex v are corners[first[v]] to corners[first[v + 1]].
+#include "common.cuh"
+
+#define NONE (1ll << 62)
+#define LEVEL 21
+#define TOWARDS_MIDDLE 1e-3
+#define FLATTEST 0.01
+#define SHORT_FIRST 1e-4
+#define LEAST_COSINE 0.2
+
+struct Vec {
+  double x, y, z;
+};
+
+__device__ __forceinline__ Vec at(const double* p, int v) {
+  return Vec{p[3 * v], p[3 * v + 1], p[3 * v + 2]};
+}
+
+__device__ __forceinline__ Vec minus(Vec a, Vec b) { return Vec{a.x - b.x, a.y - b.y, a.z - b.z}; }
+
+__device__ __forceinline__ double dot(Vec a, Vec b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+__device__ __forceinline__ Vec normal(Vec a, Vec b, Vec c) {
+  const Vec u = minus(b, a), v = minus(c, a);
+  return Vec{u.y * v.z - u.z * v.y, u.z * v.x - u.x * v.z, u.x * v.y - u.y * v.x};
+}
+
+__device__ __forceinline__ int after(const int* faces, int corner) {
+  return faces[corner % 3 == 2 ? corner - 2 : corner + 1];
+}
+
+__device__ __forceinline__ int before(const int* faces, int corner) {
+  return faces[corner % 3 == 0 ? corner + 2 : corner - 1];
+}
+
+__device__ __forceinline__ void add_plane(const double* position, const int* face, double* q) {
+  const Vec a = at(position, face[0]);
+  Vec n = normal(a, at(position, face[1]), at(position, face[2]));
+  const double length = sqrt(dot(n, n));
+  if (!(length > 0)) return;
+  const double area = 0.5 * length;
+  n = Vec{n.x / length, n.y / length, n.z / length};
+  const double d = -dot(n, a);
+  q[0] += area * n.x * n.x;
+  q[1] += area * n.x * n.y;
+  q[2] += area * n.x * n.z;
+  q[3] += area * n.x * d;
+  q[4] += area * n.y * n.y;
+  q[5] += area * n.y * n.z;
+  q[6] += area * n.y * d;
+  q[7] += area * n.z * n.z;
+  q[8] += area * n.z * d;
+  q[9] += area * d * d;
+}
+
+extern "C" __global__ void begin(int count, const double* __restrict__ position,
+                                 const int* __restrict__ faces, const int* __restrict__ first,
+                                 const int* __restrict__ corners, double* __restrict__ quadric,
+                                 bool* __restrict__ fixed) {
+  const int v = blockIdx.x * blockDim.x + threadIdx.x;
+  if (v >= count) return;
+  double q[10] = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
+  bool is_fixed = false;
+  for (int i = first[v]; i < first[v + 1]; ++i) {
+    add_plane(position, faces + corners[i] / 3 * 3, q);
+    const int next = after(faces, corners[i]), last = before(faces, corners[i]);
+    int twins = 0;
+    for (int j = first[v]; j < first[v + 1]; ++j) {
+      const int other_next = after(faces, corners[j]), other_last = before(faces, corners[j]);
+      twins += (other_last == next) + (other_next == last);
+      is_fixed |= j != i && (other_next == next || other_last == last);
+    }
+    is_fixed |= twins != 2;
+  }
+  for (int n = 0; n < 10; ++n) quadric[10 * v + n] = q[n];
+  fixed[v] = is_fixed;
+}
+
+// Where two vertices are merged; what that costs.
+__device__ double merged(const double* position, const double* quadric, int a, int b, Vec* place) {
+  double q[10];
+  for (int n = 0; n < 10; ++n) q[n] = quadric[10 * a + n] + quadric[10 * b + n];
+  const double xx = q[0], xy = q[1], xz = q[2], x1 = q[3], yy = q[4], yz = q[5], y1 = q[6];
+  const double zz = q[7], z1 = q[8], one = q[9];
+  const Vec p = at(position, a), r = at(position, b);
+  double x = 0.5 * (p.x + r.x), y = 0.5 * (p.y + r.y), z = 0.5 * (p.z + r.z);
+  const double gx = xx * x + xy * y + xz * z + x1, gy = xy * x + yy * y + yz * z + y1;
+  const double gz = xz * x + yz * y + zz * z + z1;
+  const double damping = TOWARDS_MIDDLE * (xx + yy + zz);
+  const double a0 = xx + damping, b0 = yy + damping, c0 = zz + damping;
+  const double i00 = b0 * c0 - yz * yz, i01 = xz * yz - xy * c0, i02 = xy * yz - xz * b0;
+  const double i11 = a0 * c0 - xz * xz, i12 = xy * xz - a0 * yz, i22 = a0 * b0 - xy * xy;
+  const double det = a0 * i00 + xy * i01 + xz * i02;
+  if (det > 0) {
+    x -= (i00 * gx + i01 * gy + i02 * gz) / det;
+    y -= (i01 * gx + i11 * gy + i12 * gz) / det;
+    z -= (i02 * gx + i12 * gy + i22 * gz) / det;
+  }
+  *place = Vec{x, y, z};
+  const double cost = x * (xx * x + 2 * (xy * y + xz * z + x1)) +
+                      y * (yy * y + 2 * (yz * z + y1)) + z * (zz * z + 2 * z1) + one;
+  const Vec edge = minus(p, r);
+  return (cost > 0 ? cost : 0.0) + SHORT_FIRST * (xx + yy + zz) * dot(edge, edge);
+}
+
+extern "C" __global__ void update_costs(int count, const double* __restrict__ position,
+                                        const int* __restrict__ faces,
+                                        const double* __restrict__ quadric,
+                                        const bool* __restrict__ fixed,
+                                        const bool* __restrict__ moved, float* __restrict__ cost) {
+  const int f = blockIdx.x * blockDim.x + threadIdx.x;
+  if (f >= count) return;
+  for (int k = 0; k < 3; ++k) {
+    const int c = 3 * f + k, a = faces[c], b = after(faces, c);
+    if (!moved[a] && !moved[b]) continue;
+    float found = __int_as_float(0x7f800000);
+    Vec place;
+    if (a < b && !fixed[a] && !fixed[b]) found = (float)merged(position, quadric, a, b, &place);
+    cost[c] = found;
+  }
+}
+
+extern "C" __global__ void rank_edges(int count, const float* __restrict__ cost,
+                                      const float* __restrict__ limit,
+                                      long long* __restrict__ rank) {
+  const int f = blockIdx.x * blockDim.x + threadIdx.x;
+  if (f >= count) return;
+  for (int k = 0; k < 3; ++k) {
+    const int c = 3 * f + k;
+    long long found = NONE;
+    if (cost[c] <= limit[0])
+      found = ((long long)(__float_as_int(cost[c]) >> LEVEL) << 32) | (u32)((u32)c * 2654435769u);
+    rank[c] = found;
+  }
+}
+
+extern "C" __global__ void best_edges(int count, const int* __restrict__ first,
+                                      const int* __restrict__ corners,
+                                      const long long* __restrict__ rank,
+                                      long long* __restrict__ best) {
+  const int v = blockIdx.x * blockDim.x + threadIdx.x;
+  if (v >= count) return;
+  long long found = NONE;
+  for (int i = first[v]; i < first[v + 1]; ++i) {
+    const int c = corners[i];
+    found = min(found, min(rank[c], rank[c % 3 == 0 ? c + 2 : c - 1]));
+  }
+  best[v] = found;
+}
+
+extern "C" __global__ void best_around(int count, const int* __restrict__ faces,
+                                       const int* __restrict__ first,
+                                       const int* __restrict__ corners,
+                                       const long long* __restrict__ best,
+                                       long long* __restrict__ around) {
+  const int v = blockIdx.x * blockDim.x + threadIdx.x;
+  if (v >= count) return;
+  long long found = NONE;
+  for (int i = first[v]; i < first[v + 1]; ++i) {
+    const int* face = faces + corners[i] / 3 * 3;
+    for (int k = 0; k < 3; ++k) found = min(found, best[face[k]]);
+  }
+  around[v] = found;
+}
+
+// Whether no face at v without the other vertex turns over or becomes a needle if v moves.
+__device__ bool keeps_sides(const int* faces, const int* first, const int* corners,
+                            const double* position, int v, int other, Vec place) {
+  for (int i = first[v]; i < first[v + 1]; ++i) {
+    const int b = after(faces, corners[i]), c = before(faces, corners[i]);
+    if (b == other || c == other) continue;
+    const Vec pb = at(position, b), pc = at(position, c);
+    const Vec old = normal(at(position, v), pb, pc), now = normal(place, pb, pc);
+    const double turn = dot(old, now), size = dot(now, now);
+    if (!(turn > 0 && turn * turn > LEAST_COSINE * LEAST_COSINE * dot(old, old) * size))
+      return false;
+    const Vec u = minus(pb, place), w = minus(pc, place), e = minus(u, w);
+    const double edges = FLATTEST * (dot(u, u) + dot(w, w) + dot(e, e));
+    if (size < edges * edges) return false;
+  }
+  return true;
+}
+
+// Neighbours that two vertices share.
+__device__ int common(const int* faces, const int* first, const int* corners, int a, int b) {
+  int count = 0;
+  for (int i = first[a]; i < first[a + 1]; ++i)
+    for (int j = first[b]; j < first[b + 1]; ++j)
+      count += after(faces, corners[i]) == after(faces, corners[j]);
+  return count;
+}
+
+extern "C" __global__ void collapse(int count, const int* __restrict__ faces,
+                                    const int* __restrict__ first,
+                                    const int* __restrict__ corners,
+                                    const long long* __restrict__ rank,
+                                    const long long* __restrict__ best,
+                                    const long long* __restrict__ around, double* position,
+                                    double* quadric, float* cost, int* parent, bool* moved) {
+  const int a = blockIdx.x * blockDim.x + threadIdx.x;
+  if (a >= count || around[a] == NONE || best[a] != around[a]) return;
+  int c = -1;
+  for (int i = first[a]; i < first[a + 1]; ++i)
+    if (rank[corners[i]] == around[a]) c = corners[i];
+  if (c < 0) return;
+  const int b = after(faces, c);
+  if (around[b] != around[a]) return;
+  Vec place;
+  merged(position, quadric, a, b, &place);
+  if (common(faces, first, corners, a, b) != 2 ||
+      !keeps_sides(faces, first, corners, position, a, b, place) ||
+      !keeps_sides(faces, first, corners, position, b, a, place)) {
+    cost[c] = __int_as_float(0x7f800000);
+    return;
+  }
+  position[3 * a] = place.x;
+  position[3 * a + 1] = place.y;
+  position[3 * a + 2] = place.z;
+  for (int n = 0; n < 10; ++n) quadric[10 * a + n] += quadric[10 * b + n];
+  parent[b] = a;
+  moved[a] = true;
+}

@@ -1,0 +1,42 @@
+"""How far points lie from a mesh on its device."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.geometry.neighbors import nearest_neighbors
+from geogs.mesh.deviation import NEAREST
+
+
+def surface_distances(
+    points: Float[Tensor, "k 3"], vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]
+) -> Float[Tensor, "k"]:
+    """What :func:`geogs.mesh.deviation.deviations` gives; every vertex has to have a face."""
+    _, near = nearest_neighbors(points, vertices, NEAREST)
+    vertex, corners = faces.flatten().sort(stable=True)
+    first = torch.searchsorted(vertex, near.flatten().to(vertex.dtype))
+    count = torch.searchsorted(vertex, near.flatten().to(vertex.dtype), right=True) - first
+    pair = torch.arange(len(count), device=faces.device).repeat_interleave(count)
+    number = torch.arange(len(pair), device=faces.device) - (count.cumsum(0) - count)[pair]
+    face, point = corners[first[pair] + number] // 3, pair // near.shape[1]
+    triangles = vertices.double()[faces[face].long()]
+    away = triangle_distances(points.double()[point], triangles)
+    return away.new_full((len(points),), torch.inf).scatter_reduce(0, point, away, "amin")
+
+
+def triangle_distances(
+    points: Float[Tensor, "k 3"], triangles: Float[Tensor, "k 3 3"]
+) -> Float[Tensor, "k"]:
+    """Distance of each point to a triangle of its own (its corners in rows)."""
+    edges = triangles.roll(-1, 1) - triangles
+    normal = torch.linalg.cross(edges[:, 0], -edges[:, 2])
+    length = normal.norm(dim=-1)
+    offset = points[:, None] - triangles
+    turn = (torch.linalg.cross(edges, offset) * normal[:, None]).sum(-1)
+    inside = (turn >= 0).all(-1) & (length > 0)
+    squared = edges.square().sum(-1)
+    fraction = (offset * edges).sum(-1) / torch.where(squared > 0, squared, 1.0)
+    foot = fraction.clamp(0, 1)[..., None] * edges
+    to_edges = (offset - foot).norm(dim=-1).amin(-1)
+    to_plane = (offset[:, 0] * normal).sum(-1).abs() / torch.where(length > 0, length, 1.0)
+    return torch.where(inside, to_plane, to_edges)

@@ -1,0 +1,45 @@
+"""A mesh on the device where it was made."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.mesh.triangle_mesh import Mesh
+
+
+@dataclass(frozen=True)
+class TensorMesh:
+    """Triangles in the world frame; faces turn counter-clockwise seen from free space."""
+
+    vertices: Float[Tensor, "n 3"]
+    """float32, map units."""
+    faces: Int[Tensor, "m 3"]
+    """int64."""
+
+    @staticmethod
+    def of(mesh: Mesh, device: torch.device | str) -> "TensorMesh":
+        """A mesh of the host, on a device."""
+        vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
+        return TensorMesh(vertices.to(device), faces.to(device).long())
+
+    def normals(self) -> Float[Tensor, "n 3"]:
+        """Unit normals in float32, the mean of a vertex's faces weighted by area."""
+        a, b, c = self.corners()
+        normal = torch.linalg.cross(b - a, c - a)
+        total = torch.zeros_like(self.vertices, dtype=torch.float64)
+        for corner in self.faces.unbind(1):
+            total.index_add_(0, corner, normal)
+        return torch.nn.functional.normalize(total, dim=-1, eps=1e-300).float()
+
+    def corners(self) -> tuple[Tensor, ...]:
+        """The three corners of each face, float64."""
+        return self.vertices.double()[self.faces].unbind(1)
+
+    def kept(self, keep: Bool[Tensor, "m"]) -> "TensorMesh":
+        """Some of the faces and the vertices that they use."""
+        faces = self.faces[keep]
+        used = torch.zeros(len(self.vertices), dtype=torch.bool, device=faces.device)
+        used[faces.flatten()] = True
+        return TensorMesh(self.vertices[used], (used.cumsum(0) - 1)[faces])
