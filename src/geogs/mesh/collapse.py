@@ -4,7 +4,7 @@ from copy import copy
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
@@ -18,15 +18,16 @@ _SHARE = 0.5
 """Part of the edges that may be collapsed next, the cheapest."""
 _SAMPLES = 20_000
 _MOST_ROUNDS = 300
-_LEAST_PROGRESS = 0.002
+_LEAST_PROGRESS = 0.008
 """Part of the faces that a round has to take away."""
 
 
 class CollapsingMesh:
     """A mesh whose edges are collapsed, on the device where it lies; those at borders are not.
 
-    In a round every edge is collapsed that is among the cheapest of the whole mesh and costs least
-    of all near. Neither threads nor the device's order of work change what comes out.
+    In a round every edge is collapsed that is among the cheapest of the whole mesh and the cheapest
+    at both of its ends, unless a cheaper such edge is near. Neither threads nor the device's order
+    of work change what comes out.
 
     Method: quadric error (Garland and Heckbert 1997), each plane weighted by its face's area.
     """
@@ -34,64 +35,56 @@ class CollapsingMesh:
     def __init__(self, vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> None:
         """``vertices`` in map units; ``faces`` of int32. Neither is changed."""
         device, count = vertices.device, len(vertices)
+        self.became = torch.arange(count, device=device)
+        """What each of the vertices given is now, -1 where it has no face."""
         self.position = vertices.double()
+        """float64."""
         self.faces = faces.contiguous()
-        self.parent = torch.arange(count, dtype=torch.int32, device=device)
-        """A vertex that each was merged into, itself where it is left."""
+        self._parent = torch.arange(count, dtype=torch.int32, device=device)
         self._quadric = torch.empty((count, 10), dtype=torch.float64, device=device)
-        self._cost = torch.empty((len(faces), 3), device=device)
         self._fixed = torch.empty(count, dtype=torch.bool, device=device)
-        self._moved = torch.ones(count, dtype=torch.bool, device=device)
-        self._rings = self._find_rings()
-        mesh = (self.position, self.faces, *self._rings)
-        self._over(count, "begin", *mesh, self._quadric, self._fixed)
+        self._cost = torch.empty((len(faces), 3), device=device)
+        mesh = (self.position, self.faces)
+        self._over(count, "begin", *mesh, *self._rings(), self._quadric, self._fixed)
+        self._over(len(faces), "edge_costs", *mesh, self._quadric, self._fixed, self._cost)
 
     def reduced(self, count: int) -> "CollapsingMesh":
         """The mesh with at most so many faces, if there are so many edges to collapse."""
         new = copy(self)
-        for name in ("position", "parent", "_quadric", "_cost", "_moved"):
+        for name in ("position", "faces", "_quadric", "_cost", "_parent"):
             setattr(new, name, getattr(self, name).clone())
         for _ in range(_MOST_ROUNDS):
             before = len(new.faces)
-            if before <= count:
-                break
             new._round()
-            if len(new.faces) > (1 - _LEAST_PROGRESS) * before:
+            if len(new.faces) < len(new.position):  # half of the vertices are left
+                new._renumber()
+            if len(new.faces) <= count or len(new.faces) > (1 - _LEAST_PROGRESS) * before:
                 break
+        new._renumber()
         return new
 
-    def compact(self) -> tuple[Float[Tensor, "k 3"], Int[Tensor, "l 3"], Int[Tensor, "n"]]:
-        """Vertices in float32 and faces that are left, and which vertex each of old became.
-
-        That is -1 where it belongs to no face any more.
-        """
-        root = self.parent.long()
-        while not torch.equal(further := root[root], root):
-            root = further
-        used = torch.zeros(len(root), dtype=torch.bool, device=root.device)
-        used[self.faces.flatten().long()] = True
-        number = torch.where(used, used.cumsum(0) - 1, -1)
-        faces = number[self.faces.long()].to(torch.int32)
-        return self.position[used].float(), faces, number[root]
+    def means(
+        self, values: Float[Tensor, "n c"], known: Bool[Tensor, "n"]
+    ) -> tuple[Float[Tensor, "k c"], Bool[Tensor, "k"]]:
+        """Means of the known values of the vertices given that became each of those now; where
+        there are any."""
+        known = known & (self.became >= 0)
+        index, count = self.became[known], len(self.position)
+        total = values.new_zeros(count, values.shape[1]).index_add_(0, index, values[known])
+        number = torch.bincount(index, minlength=count)
+        return total / number.clamp(min=1)[:, None], number > 0
 
     def _round(self) -> None:
-        faces, count, size = self.faces, len(self.position), len(self.faces)
+        faces, count, rings = self.faces, len(self.position), self._rings()
+        best = torch.empty(count, dtype=torch.int64, device=faces.device)
+        matched = torch.empty_like(best)
+        self._over(count, "best_edges", *rings, self._cost, self._limit(), best)
+        self._over(count, "match_vertices", faces, best, matched)
         self._over(
-            size, "update_costs", self.position, faces, self._quadric, self._fixed, self._moved,
-            self._cost,
-        )  # fmt: skip
-        self._moved.zero_()
-        rank = torch.empty(3 * size, dtype=torch.int64, device=faces.device)
-        best, around = (rank.new_empty(count) for _ in range(2))
-        self._over(size, "rank_edges", self._cost, self._limit(), rank)
-        self._over(count, "best_edges", *self._rings, rank, best)
-        self._over(count, "best_around", faces, *self._rings, best, around)
-        self._over(
-            count, "collapse", faces, *self._rings, rank, best, around, self.position,
-            self._quadric, self._cost, self.parent, self._moved,
+            count, "collapse", faces, *rings, matched, self._fixed, self.position, self._quadric,
+            self._cost, self._parent,
         )  # fmt: skip
         self._squeeze()
-        self._rings = self._find_rings()
 
     def _limit(self) -> Float[Tensor, "1"]:
         """The cost of the dearest edge that may be collapsed now."""
@@ -107,16 +100,29 @@ class CollapsingMesh:
             from geogs.mesh.collapse_kernels import squeeze
 
             faces, cost = torch.empty_like(self.faces), torch.empty_like(self._cost)
-            arrays = (self.faces, self._cost, self.parent, faces, cost)
-            left = squeeze(*(array.numpy() for array in arrays))
+            left = squeeze(*(x.numpy() for x in (self.faces, self._cost, faces, cost)))
             self.faces, self._cost = faces[:left], cost[:left]
             return
-        faces = self.parent[self.faces.long()]
-        a, b, c = faces.unbind(1)
-        left = ((a != b) & (b != c) & (c != a)).nonzero()[:, 0]
-        self.faces, self._cost = faces[left], self._cost[left]
+        a, b, c = self.faces.unbind(1)
+        kept = ((a != b) & (b != c) & (c != a)).nonzero()[:, 0]
+        self.faces, self._cost = self.faces[kept], self._cost[kept]
 
-    def _find_rings(self) -> tuple[Tensor, Tensor]:
+    def _renumber(self) -> None:
+        """Leave out vertices without a face."""
+        root = self._parent.long()
+        while not torch.equal(further := root[root], root):
+            root = further
+        used = torch.zeros(len(root), dtype=torch.bool, device=root.device)
+        used[self.faces.flatten().long()] = True
+        number = torch.where(used, used.cumsum(0) - 1, -1)
+        now = number[root]
+        self.became = torch.where(self.became >= 0, now[self.became], -1)
+        self.faces = number[self.faces.long()].to(torch.int32)
+        self.position, self._quadric = self.position[used], self._quadric[used]
+        self._fixed = self._fixed[used]
+        self._parent = torch.arange(len(self.position), dtype=torch.int32, device=root.device)
+
+    def _rings(self) -> tuple[Tensor, Tensor]:
         """Where the corners at each vertex begin in the list of them, and that list.
 
         Corner 3 f + k is that of face f at its k-th vertex.

@@ -17,6 +17,8 @@ _SHORT_FIRST = 1e-4
 """A hundredth, squared: an edge is as dear as if its vertices moved by that part of its length, so
 that in planes short edges come first."""
 _LEAST_COSINE = 0.2
+_SCATTER, _GATHER = 2654435769, 340573321
+"""Their product is one, of 32 bits."""
 _LEVEL = 21
 """Bits of a cost that ranks leave out; what is left tells costs apart by a quarter or less."""
 
@@ -145,93 +147,123 @@ def merged(position, quadric, a, b):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def update_costs(low, high, position, faces, quadric, fixed, moved, cost):
-    """Costs of the edges of faces ``low`` to ``high`` that have a vertex that moved."""
-    for f in range(low, high):
-        for k in range(3):
-            a, b = faces[f, k], faces[f, (k + 1) % 3]
-            if not (moved[a] or moved[b]):
-                continue
-            cost[f, k] = np.inf
-            if a < b and not fixed[a] and not fixed[b]:
-                _, _, _, found = merged(position, quadric, a, b)
-                cost[f, k] = found
+def edge_cost(position, faces, quadric, fixed, f, k):
+    """Cost of the edge that a corner stands for; infinite where it stands for none."""
+    a, b = faces[f, k], faces[f, (k + 1) % 3]
+    if a >= b or fixed[a] or fixed[b]:
+        return np.inf
+    return merged(position, quadric, a, b)[3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_edges(low, high, first, corners, rank, best):
-    """The lowest rank of the edges at each of the vertices."""
+def edge_costs(low, high, position, faces, quadric, fixed, cost):
+    """Costs of the edges of faces ``low`` to ``high``."""
+    for f in range(low, high):
+        for k in range(3):
+            cost[f, k] = edge_cost(position, faces, quadric, fixed, f, k)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rank(bits, limit, f, k):
+    if bits[f, k] > limit:
+        return NONE
+    scattered = np.uint32(np.uint32(3 * f + k) * np.uint32(_SCATTER))
+    return (np.int64(bits[f, k] >> _LEVEL) << 32) | np.int64(scattered)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def best_edges(low, high, first, corners, cost, limit, best):
+    """The lowest rank of the edges at each of the vertices that cost no more than a limit.
+
+    Ranks are in the order of costs, scattered among those that are about the same; no two edges
+    have the same, and it tells the corner (:func:`ranked_corner`).
+    """
+    # Numbers that are not negative are in the order of their bits.
+    bits, limit = cost.view(np.int32), limit.view(np.int32)[0]
     for v in range(low, high):
         found = NONE
         for i in range(first[v], first[v + 1]):
-            c = corners[i]
-            before = c - 1 if c % 3 else c + 2
-            found = min(found, rank[c], rank[before])
+            f, k = corners[i] // 3, corners[i] % 3
+            found = min(found, _rank(bits, limit, f, k), _rank(bits, limit, f, (k + 2) % 3))
         best[v] = found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_around(low, high, faces, first, corners, best, around):
-    """The lowest rank of the edges at each of the vertices and those next to it."""
+def ranked_corner(rank):
+    """The corner of an edge of some rank."""
+    return np.int64(np.uint32(np.uint32(rank & 0xFFFFFFFF) * np.uint32(_GATHER)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def match_vertices(low, high, faces, best, matched):
+    """The best edges of vertices that are so for both of their ends; each has one at most."""
     for v in range(low, high):
-        found = NONE
-        for i in range(first[v], first[v + 1]):
-            f = corners[i] // 3
-            found = min(found, best[faces[f, 0]], best[faces[f, 1]], best[faces[f, 2]])
-        around[v] = found
+        matched[v] = NONE
+        if best[v] != NONE:
+            c = ranked_corner(best[v])
+            f, k = c // 3, c % 3
+            if best[faces[f, k]] == best[faces[f, (k + 1) % 3]]:
+                matched[v] = best[v]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rank_edges(low, high, cost, limit, rank):
-    """Ranks of the edges of faces whose cost is at most a limit.
+def collapse(low, high, faces, first, corners, matched, fixed, position, quadric, cost, parent):
+    """Merge the ends of matched edges that rank lower than all others near.
 
-    Each has a rank of its own: by cost, and in no order where that is about the same.
+    No two of them have a face in common, nor does one have an end next to another's: each changes
+    faces that no other looks at. Faces that two corners of are one are left for
+    :func:`squeeze`.
     """
-    bits = cost.view(np.int32)
-    for f in range(low, high):
-        for k in range(3):
-            c = 3 * f + k
-            rank[c] = NONE
-            if cost[f, k] <= limit[0]:
-                scattered = np.uint32(np.uint32(c) * np.uint32(2654435769))
-                rank[c] = (np.int64(bits[f, k] >> _LEVEL) << 32) | np.int64(scattered)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def collapse(
-    low, high, faces, first, corners, rank, best, around, position, quadric, cost, parent, moved
-):
-    """Merge the vertices of edges that rank lowest among all near; the number of them.
-
-    No two of them have a face in common, nor does one have a vertex next to another.
-    """
-    count = 0
     for a in range(low, high):
-        if around[a] == NONE or best[a] != around[a]:
+        if matched[a] == NONE:
             continue
-        for i in range(first[a], first[a + 1]):
-            c = corners[i]
-            if rank[c] != around[a]:
-                continue
-            b = faces[c // 3, (c % 3 + 1) % 3]
-            if around[b] != around[a]:
-                break
-            x, y, z, _ = merged(position, quadric, a, b)
-            if (
-                _common(faces, first, corners, a, b) == 2
-                and _keeps_sides(faces, first, corners, position, a, b, x, y, z)
-                and _keeps_sides(faces, first, corners, position, b, a, x, y, z)
-            ):
-                position[a, 0], position[a, 1], position[a, 2] = x, y, z
-                for n in range(10):
-                    quadric[a, n] += quadric[b, n]
-                parent[b] = a
-                moved[a] = True
-                count += 1
-            else:
-                cost[c // 3, c % 3] = np.inf
-            break
-    return count
+        c = ranked_corner(matched[a])
+        f, k = c // 3, c % 3
+        b = faces[f, (k + 1) % 3]
+        if faces[f, k] != a or not (
+            _is_first(faces, first, corners, matched, a)
+            and _is_first(faces, first, corners, matched, b)
+        ):
+            continue
+        x, y, z, _ = merged(position, quadric, a, b)
+        if (
+            _common(faces, first, corners, a, b) != 2
+            or not _keeps_sides(faces, first, corners, position, a, b, x, y, z)
+            or not _keeps_sides(faces, first, corners, position, b, a, x, y, z)
+        ):
+            cost[f, k] = np.inf
+            continue
+        position[a, 0], position[a, 1], position[a, 2] = x, y, z
+        for n in range(10):
+            quadric[a, n] += quadric[b, n]
+        parent[b] = a
+        for i in range(first[b], first[b + 1]):
+            faces[corners[i] // 3, corners[i] % 3] = a
+        _update_costs(position, faces, first, corners, quadric, fixed, cost, a)
+        _update_costs(position, faces, first, corners, quadric, fixed, cost, b)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _update_costs(position, faces, first, corners, quadric, fixed, cost, v):
+    """Costs anew of the edges that were at a vertex, now that its place and its number changed."""
+    for i in range(first[v], first[v + 1]):
+        f, k = corners[i] // 3, corners[i] % 3
+        cost[f, k] = edge_cost(position, faces, quadric, fixed, f, k)
+        k = (k + 2) % 3
+        cost[f, k] = edge_cost(position, faces, quadric, fixed, f, k)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_first(faces, first, corners, matched, v):
+    """Whether no vertex next to a matched one is matched by an edge that ranks lower."""
+    for i in range(first[v], first[v + 1]):
+        f, k = corners[i] // 3, corners[i] % 3
+        if (
+            matched[faces[f, (k + 1) % 3]] < matched[v]
+            or matched[faces[f, (k + 2) % 3]] < matched[v]
+        ):
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -273,11 +305,11 @@ def _keeps_sides(faces, first, corners, position, v, other, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def squeeze(faces, cost, parent, left_faces, left_cost):
-    """Write the faces, with their edges' costs, that merged vertices leave; how many these are."""
+def squeeze(faces, cost, left_faces, left_cost):
+    """Write the faces with three different corners, with their edges' costs; how many these are."""
     left = 0
     for f in range(len(faces)):
-        a, b, c = parent[faces[f, 0]], parent[faces[f, 1]], parent[faces[f, 2]]
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if a == b or b == c or c == a:
             continue
         left_faces[left, 0], left_faces[left, 1], left_faces[left, 2] = a, b, c

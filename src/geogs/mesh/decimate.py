@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.mesh.clean import remove_degenerate_faces
@@ -23,7 +23,7 @@ _SAMPLES = 10_000
 _FRACTIONS = (0.25, 0.5, 0.75, 0.88)
 """Fractions of its triangles that a mesh is brought to next; a later
 one where those before leave too few."""
-_USUAL_GROWTH = 1.0
+_USUAL_GROWTH = 2.2
 """Power of one over the fraction of triangles, by which deviations grow."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
@@ -38,13 +38,12 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     few = merged(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces), tolerance)
     if few is None:
         return mesh
-    vertices, faces, became = few.compact()
     colours = None
     if mesh.colours is not None:
         given = torch.from_numpy(mesh.colours).float()
-        mean, _ = means(given, became >= 0, became, len(vertices))
+        mean, _ = few.means(given, torch.ones(len(given), dtype=torch.bool))
         colours = (mean + 0.5).to(torch.uint8).numpy()
-    new = Mesh.from_triangles(vertices.numpy(), faces.numpy())
+    new = Mesh.from_triangles(few.position.numpy(), few.faces.numpy())
     return remove_degenerate_faces(replace(new, colours=colours))
 
 
@@ -82,25 +81,12 @@ def merged(
 
 def _deviation(samples: Float[Tensor, "k 3"], mesh: CollapsingMesh) -> Float[np.ndarray, "2"]:
     """How far points are off a mesh: nearly all of them, and on average."""
-    vertices, faces, _ = mesh.compact()
+    vertices, faces = mesh.position.float(), mesh.faces
     if samples.device.type == "cpu":
         away = deviations(samples.numpy(), vertices.numpy(), faces.numpy())
     else:
         away = surface_distances(samples, vertices, faces).cpu().numpy()
     return np.array([np.quantile(away, QUANTILE), away.mean()])
-
-
-def means(
-    values: Float[Tensor, "n c"], known: Bool[Tensor, "n"], became: Int[Tensor, "n"], count: int
-) -> tuple[Float[Tensor, "k c"], Bool[Tensor, "k"]]:
-    """Means of the known values of the vertices that became each of ``count``; where there are
-    any."""
-    index = became[known]
-    total = values.new_zeros(count, values.shape[1]).index_add_(0, index, values[known])
-    number = values.new_zeros(count).index_add_(
-        0, index, torch.ones_like(index, dtype=values.dtype)
-    )
-    return total / number.clamp(min=1)[:, None], number > 0
 
 
 def _growth(

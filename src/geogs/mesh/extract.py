@@ -13,7 +13,7 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.mesh.clean import cleaned, remove_degenerate_faces
 from geogs.mesh.colour import filled, seen_colours
-from geogs.mesh.decimate import means, merged
+from geogs.mesh.decimate import merged
 from geogs.mesh.device.clean import device_cleaned
 from geogs.mesh.device.surface import device_surface
 from geogs.mesh.free_space import SeenFree
@@ -171,10 +171,8 @@ def _merged_mesh(surface: _Surface, seen: tuple[Tensor, Tensor] | None, toleranc
     vertices, faces = surface.vertices, surface.faces
     few = merged(vertices, faces, tolerance)
     if few is not None:
-        vertices, faces, became = few.compact()
-        if seen is not None:
-            mean, is_seen = seen
-            seen = means(mean, is_seen & (became >= 0), became, len(vertices))
+        vertices, faces = few.position.float(), few.faces
+        seen = None if seen is None else few.means(*seen)
     colours = None if seen is None else filled(vertices, *seen).cpu().numpy()
     arrays = vertices.cpu().numpy(), faces.cpu().numpy()
     if few is None:

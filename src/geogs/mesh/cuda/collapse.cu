@@ -4,6 +4,8 @@
 #include "common.cuh"
 
 #define NONE (1ll << 62)
+#define SCATTER 2654435769u
+#define GATHER 340573321u
 #define LEVEL 21
 #define TOWARDS_MIDDLE 1e-3
 #define FLATTEST 0.01
@@ -105,64 +107,67 @@ __device__ double merged(const double* position, const double* quadric, int a, i
   return (cost > 0 ? cost : 0.0) + SHORT_FIRST * (xx + yy + zz) * dot(edge, edge);
 }
 
-extern "C" __global__ void update_costs(int count, const double* __restrict__ position,
-                                        const int* __restrict__ faces,
-                                        const double* __restrict__ quadric,
-                                        const bool* __restrict__ fixed,
-                                        const bool* __restrict__ moved, float* __restrict__ cost) {
-  const int f = blockIdx.x * blockDim.x + threadIdx.x;
-  if (f >= count) return;
-  for (int k = 0; k < 3; ++k) {
-    const int c = 3 * f + k, a = faces[c], b = after(faces, c);
-    if (!moved[a] && !moved[b]) continue;
-    float found = __int_as_float(0x7f800000);
-    Vec place;
-    if (a < b && !fixed[a] && !fixed[b]) found = (float)merged(position, quadric, a, b, &place);
-    cost[c] = found;
-  }
+// Cost of the edge that a corner stands for; infinite where it stands for none.
+__device__ float edge_cost(const double* position, const int* faces, const double* quadric,
+                           const bool* fixed, int corner) {
+  const int a = faces[corner], b = after(faces, corner);
+  if (a >= b || fixed[a] || fixed[b]) return __int_as_float(0x7f800000);
+  Vec place;
+  return (float)merged(position, quadric, a, b, &place);
 }
 
-extern "C" __global__ void rank_edges(int count, const float* __restrict__ cost,
-                                      const float* __restrict__ limit,
-                                      long long* __restrict__ rank) {
+extern "C" __global__ void edge_costs(int count, const double* __restrict__ position,
+                                      const int* __restrict__ faces,
+                                      const double* __restrict__ quadric,
+                                      const bool* __restrict__ fixed, float* __restrict__ cost) {
   const int f = blockIdx.x * blockDim.x + threadIdx.x;
   if (f >= count) return;
-  for (int k = 0; k < 3; ++k) {
-    const int c = 3 * f + k;
-    long long found = NONE;
-    if (cost[c] <= limit[0])
-      found = ((long long)(__float_as_int(cost[c]) >> LEVEL) << 32) | (u32)((u32)c * 2654435769u);
-    rank[c] = found;
-  }
+  for (int c = 3 * f; c < 3 * f + 3; ++c)
+    cost[c] = edge_cost(position, faces, quadric, fixed, c);
 }
 
 extern "C" __global__ void best_edges(int count, const int* __restrict__ first,
                                       const int* __restrict__ corners,
-                                      const long long* __restrict__ rank,
+                                      const float* __restrict__ cost,
+                                      const float* __restrict__ limit,
                                       long long* __restrict__ best) {
   const int v = blockIdx.x * blockDim.x + threadIdx.x;
   if (v >= count) return;
   long long found = NONE;
   for (int i = first[v]; i < first[v + 1]; ++i) {
-    const int c = corners[i];
-    found = min(found, min(rank[c], rank[c % 3 == 0 ? c + 2 : c - 1]));
+    const int ends[2] = {corners[i], corners[i] % 3 == 0 ? corners[i] + 2 : corners[i] - 1};
+    for (int n = 0; n < 2; ++n) {
+      const int c = ends[n];
+      if (!(cost[c] <= limit[0])) continue;
+      const long long level = __float_as_int(cost[c]) >> LEVEL;
+      found = min(found, (level << 32) | ((u32)c * SCATTER));
+    }
   }
   best[v] = found;
 }
 
-extern "C" __global__ void best_around(int count, const int* __restrict__ faces,
-                                       const int* __restrict__ first,
-                                       const int* __restrict__ corners,
-                                       const long long* __restrict__ best,
-                                       long long* __restrict__ around) {
+// The corner of an edge of some rank.
+__device__ __forceinline__ int ranked_corner(long long rank) { return (int)((u32)rank * GATHER); }
+
+extern "C" __global__ void match_vertices(int count, const int* __restrict__ faces,
+                                          const long long* __restrict__ best,
+                                          long long* __restrict__ matched) {
   const int v = blockIdx.x * blockDim.x + threadIdx.x;
   if (v >= count) return;
-  long long found = NONE;
-  for (int i = first[v]; i < first[v + 1]; ++i) {
-    const int* face = faces + corners[i] / 3 * 3;
-    for (int k = 0; k < 3; ++k) found = min(found, best[face[k]]);
-  }
-  around[v] = found;
+  matched[v] = NONE;
+  if (best[v] == NONE) return;
+  const int c = ranked_corner(best[v]);
+  if (best[faces[c]] == best[after(faces, c)]) matched[v] = best[v];
+}
+
+// Whether no vertex next to a matched one is matched by an edge that ranks lower.
+__device__ bool is_first(const int* faces, const int* first, const int* corners,
+                         const long long* matched, int v) {
+  for (int i = first[v]; i < first[v + 1]; ++i)
+    if (matched[after(faces, corners[i])] < matched[v] ||
+        matched[before(faces, corners[i])] < matched[v])
+      return false;
+  return true;
 }
 
 // Whether no face at v without the other vertex turns over or becomes a needle if v moves.
@@ -192,21 +197,19 @@ __device__ int common(const int* faces, const int* first, const int* corners, in
   return count;
 }
 
-extern "C" __global__ void collapse(int count, const int* __restrict__ faces,
-                                    const int* __restrict__ first,
+// Those that are collapsed at once share no face, and none has an end next to another's: what one
+// writes no other reads but to find that it comes later, as it does of what was there before, too.
+extern "C" __global__ void collapse(int count, int* faces, const int* __restrict__ first,
                                     const int* __restrict__ corners,
-                                    const long long* __restrict__ rank,
-                                    const long long* __restrict__ best,
-                                    const long long* __restrict__ around, double* position,
-                                    double* quadric, float* cost, int* parent, bool* moved) {
+                                    const long long* __restrict__ matched,
+                                    const bool* __restrict__ fixed, double* position,
+                                    double* quadric, float* cost, int* parent) {
   const int a = blockIdx.x * blockDim.x + threadIdx.x;
-  if (a >= count || around[a] == NONE || best[a] != around[a]) return;
-  int c = -1;
-  for (int i = first[a]; i < first[a + 1]; ++i)
-    if (rank[corners[i]] == around[a]) c = corners[i];
-  if (c < 0) return;
-  const int b = after(faces, c);
-  if (around[b] != around[a]) return;
+  if (a >= count || matched[a] == NONE) return;
+  const int c = ranked_corner(matched[a]), b = after(faces, c);
+  if (faces[c] != a || !is_first(faces, first, corners, matched, a) ||
+      !is_first(faces, first, corners, matched, b))
+    return;
   Vec place;
   merged(position, quadric, a, b, &place);
   if (common(faces, first, corners, a, b) != 2 ||
@@ -220,5 +223,12 @@ extern "C" __global__ void collapse(int count, const int* __restrict__ faces,
   position[3 * a + 2] = place.z;
   for (int n = 0; n < 10; ++n) quadric[10 * a + n] += quadric[10 * b + n];
   parent[b] = a;
-  moved[a] = true;
+  for (int i = first[b]; i < first[b + 1]; ++i) faces[corners[i]] = a;
+  const int ends[2] = {a, b};
+  for (int n = 0; n < 2; ++n)
+    for (int i = first[ends[n]]; i < first[ends[n] + 1]; ++i) {
+      const int leaving = corners[i], coming = leaving % 3 == 0 ? leaving + 2 : leaving - 1;
+      cost[leaving] = edge_cost(position, faces, quadric, fixed, leaving);
+      cost[coming] = edge_cost(position, faces, quadric, fixed, coming);
+    }
 }
