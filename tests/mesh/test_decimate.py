@@ -10,21 +10,7 @@ from geogs.mesh.deviation import deviations
 from geogs.mesh.deviation_kernels import triangle_distance
 from geogs.mesh.mesh_file import read_mesh
 from geogs.mesh.triangle_mesh import Mesh
-
-
-def hills(n: int = 60) -> Mesh:
-    """A square with a bump in the middle; sides are straight, half of it is flat."""
-    line = np.linspace(-1, 1, n)
-    y, x = np.meshgrid(line, line, indexing="ij")
-    z = 0.3 * np.exp(-8 * (x**2 + y**2))
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    faces = np.concatenate([
-        np.stack([corner, corner + 1, corner + n], -1),
-        np.stack([corner + 1, corner + n + 1, corner + n], -1),
-    ])  # fmt: skip
-    mesh = Mesh.from_triangles(np.stack([x, y, z], -1).reshape(-1, 3), faces)
-    colours = np.stack([127 * (x + 1), 127 * (y + 1), 0 * x], -1).reshape(-1, 3)
-    return Mesh(mesh.vertices, mesh.faces, mesh.normals, colours.astype(np.uint8))
+from surface_shapes import hills
 
 
 def border(mesh: Mesh) -> set[tuple[float, ...]]:

@@ -40,7 +40,7 @@ class BlockBox:
     """The first beyond it along each axis."""
 
 
-def pack(coordinates: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+def pack(coordinates: Int[Tensor, "*n 3"]) -> Int[Tensor, "*n"]:
     """One sortable key of integer coordinates in [-2^20, 2^20)."""
     x, y, z = (coordinates.long() + 2**_BITS).unbind(-1)
     return (((x << (_BITS + 1)) + y) << (_BITS + 1)) + z
