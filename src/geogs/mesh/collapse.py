@@ -14,11 +14,11 @@ _SOURCE = Path(__file__).parent / "cuda" / "collapse.cu"
 _THREADS = 128
 _SPAN = 16384
 """Vertices or faces that a thread of the CPU takes at a time."""
-_SHARE = 0.5
+_SHARE = 0.8
 """Part of the edges that may be collapsed next, the cheapest."""
 _SAMPLES = 20_000
 _MOST_ROUNDS = 300
-_LEAST_PROGRESS = 0.008
+_LEAST_PROGRESS = 0.002
 """Part of the faces that a round has to take away."""
 
 
@@ -39,26 +39,38 @@ class CollapsingMesh:
         """What each of the vertices given is now, -1 where it has no face."""
         self.position = vertices.double()
         """float64."""
-        self.faces = faces.contiguous()
+        self._corners = faces.flatten()
         self._parent = torch.arange(count, dtype=torch.int32, device=device)
         self._quadric = torch.empty((count, 10), dtype=torch.float64, device=device)
         self._fixed = torch.empty(count, dtype=torch.bool, device=device)
-        self._cost = torch.empty((len(faces), 3), device=device)
-        mesh = (self.position, self.faces)
-        self._over(count, "begin", *mesh, *self._rings(), self._quadric, self._fixed)
-        self._over(len(faces), "edge_costs", *mesh, self._quadric, self._fixed, self._cost)
+        self._cost = torch.empty(len(self._corners), device=device)
+        self._bound = self.position.new_zeros(1)
+        mesh = (self.position, self._corners, *self._rings())
+        self._over(count, "begin", *mesh, self._quadric, self._fixed)
 
-    def reduced(self, count: int) -> "CollapsingMesh":
-        """The mesh with at most so many faces, if there are so many edges to collapse."""
+    @property
+    def faces(self) -> Int[Tensor, "l 3"]:
+        """int32."""
+        return self._corners.view(-1, 3)
+
+    def reduced(self, bound: float) -> "CollapsingMesh":
+        """The mesh after nearly all edges were collapsed that cost no more than a bound (map units).
+
+        That is the root of what an edge costs by area: of the mean square of the merged vertex's
+        distances to the planes of all faces that it stands for, and of a hundredth of the length.
+        """
         new = copy(self)
-        for name in ("position", "faces", "_quadric", "_cost", "_parent"):
+        for name in ("position", "_corners", "_quadric", "_cost", "_parent"):
             setattr(new, name, getattr(self, name).clone())
+        new._bound = self.position.new_tensor([bound])
+        state = (new._quadric, new._fixed, new._bound, new._cost)
+        new._over(len(new._corners), "edge_costs", new.position, new._corners, *state)
         for _ in range(_MOST_ROUNDS):
-            before = len(new.faces)
+            before = len(new._corners)
             new._round()
             if len(new.faces) < len(new.position):  # half of the vertices are left
                 new._renumber()
-            if len(new.faces) <= count or len(new.faces) > (1 - _LEAST_PROGRESS) * before:
+            if len(new._corners) > (1 - _LEAST_PROGRESS) * before:
                 break
         new._renumber()
         return new
@@ -75,37 +87,37 @@ class CollapsingMesh:
         return total / number.clamp(min=1)[:, None], number > 0
 
     def _round(self) -> None:
-        faces, count, rings = self.faces, len(self.position), self._rings()
-        best = torch.empty(count, dtype=torch.int64, device=faces.device)
+        corners, count, rings = self._corners, len(self.position), self._rings()
+        best = torch.empty(count, dtype=torch.int64, device=corners.device)
         matched = torch.empty_like(best)
         self._over(count, "best_edges", *rings, self._cost, self._limit(), best)
-        self._over(count, "match_vertices", faces, best, matched)
+        self._over(count, "match_vertices", corners, best, matched)
         self._over(
-            count, "collapse", faces, *rings, matched, self._fixed, self.position, self._quadric,
-            self._cost, self._parent,
+            count, "collapse", corners, *rings, matched, self._fixed, self._bound, self.position,
+            self._quadric, self._cost, self._parent,
         )  # fmt: skip
         self._squeeze()
 
     def _limit(self) -> Float[Tensor, "1"]:
         """The cost of the dearest edge that may be collapsed now."""
-        costs = self._cost.flatten()
-        some = costs[:: 1 + len(costs) // _SAMPLES].sort().values
+        some = self._cost[:: 1 + len(self._cost) // _SAMPLES].sort().values
         finite = torch.isfinite(some).sum()
         place = (finite * _SHARE).long().clamp(max=len(some) - 1)
         return some.index_select(0, place[None]).clamp(max=torch.finfo(torch.float32).max)
 
     def _squeeze(self) -> None:
         """Leave out faces of which two corners were merged."""
-        if self.faces.device.type == "cpu":
+        corners, cost = self._corners, self._cost
+        if corners.device.type == "cpu":
             from geogs.mesh.collapse_kernels import squeeze
 
-            faces, cost = torch.empty_like(self.faces), torch.empty_like(self._cost)
-            left = squeeze(*(x.numpy() for x in (self.faces, self._cost, faces, cost)))
-            self.faces, self._cost = faces[:left], cost[:left]
+            left = torch.empty_like(corners), torch.empty_like(cost)
+            count = squeeze(*(x.numpy() for x in (corners, cost, *left)))
+            self._corners, self._cost = (x[:count] for x in left)
             return
         a, b, c = self.faces.unbind(1)
         kept = ((a != b) & (b != c) & (c != a)).nonzero()[:, 0]
-        self.faces, self._cost = self.faces[kept], self._cost[kept]
+        self._corners, self._cost = (x.view(-1, 3)[kept].flatten() for x in (corners, cost))
 
     def _renumber(self) -> None:
         """Leave out vertices without a face."""
@@ -113,11 +125,11 @@ class CollapsingMesh:
         while not torch.equal(further := root[root], root):
             root = further
         used = torch.zeros(len(root), dtype=torch.bool, device=root.device)
-        used[self.faces.flatten().long()] = True
+        used[self._corners.long()] = True
         number = torch.where(used, used.cumsum(0) - 1, -1)
         now = number[root]
         self.became = torch.where(self.became >= 0, now[self.became], -1)
-        self.faces = number[self.faces.long()].to(torch.int32)
+        self._corners = number[self._corners.long()].to(torch.int32)
         self.position, self._quadric = self.position[used], self._quadric[used]
         self._fixed = self._fixed[used]
         self._parent = torch.arange(len(self.position), dtype=torch.int32, device=root.device)
@@ -128,19 +140,19 @@ class CollapsingMesh:
         Corner 3 f + k is that of face f at its k-th vertex.
         """
         count = len(self.position)
-        if self.faces.device.type == "cpu":
+        if self._corners.device.type == "cpu":
             from geogs.mesh.collapse_kernels import rings
 
-            first, corners = rings(self.faces.numpy(), count)
+            first, corners = rings(self._corners.numpy(), count)
             return torch.from_numpy(first), torch.from_numpy(corners)
-        vertex, corners = self.faces.flatten().sort(stable=True)
+        vertex, corners = self._corners.sort(stable=True)
         steps = torch.arange(count + 1, dtype=vertex.dtype, device=vertex.device)
         return torch.searchsorted(vertex, steps, out_int32=True), corners.to(torch.int32)
 
     def _over(self, count: int, name: str, *arrays: Tensor) -> None:
         """Run a kernel of the device for each of so many vertices or faces."""
-        if self.faces.device.type == "cuda":
-            kernel = kernels_for(_SOURCE, self.faces.device)[name]
+        if self._corners.device.type == "cuda":
+            kernel = kernels_for(_SOURCE, self._corners.device)[name]
             kernel(-(-count // _THREADS), _THREADS, count, *arrays)
             return
         from geogs.mesh import collapse_kernels

@@ -27,19 +27,28 @@ _LEVEL = 21
 def rings(faces, count):
     """Where the corners at each of ``count`` vertices begin in the list of them, and that list."""
     first = np.zeros(count + 1, np.int32)
-    for f in range(len(faces)):
-        for k in range(3):
-            first[faces[f, k] + 1] += 1
+    for c in range(len(faces)):
+        first[faces[c] + 1] += 1
     for v in range(count):
         first[v + 1] += first[v]
     place = first[:-1].copy()
-    corners = np.empty(3 * len(faces), np.int32)
-    for f in range(len(faces)):
-        for k in range(3):
-            v = faces[f, k]
-            corners[place[v]] = 3 * f + k
-            place[v] += 1
+    corners = np.empty(len(faces), np.int32)
+    for c in range(len(faces)):
+        corners[place[faces[c]]] = c
+        place[faces[c]] += 1
     return first, corners
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _after(faces, corner):
+    """The vertex that follows in the face of a corner."""
+    return faces[corner - 2 if corner % 3 == 2 else corner + 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _before(faces, corner):
+    """The vertex that comes before in the face of a corner."""
+    return faces[corner + 2 if corner % 3 == 0 else corner - 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,13 +62,12 @@ def begin(low, high, position, faces, first, corners, quadric, fixed):
         quadric[v] = 0.0
         is_fixed = False
         for i in range(first[v], first[v + 1]):
-            f, k = corners[i] // 3, corners[i] % 3
-            _add_plane(position, faces, f, quadric, v)
-            after, before = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            c = corners[i]
+            _add_plane(position, faces, c - c % 3, quadric, v)
+            after, before = _after(faces, c), _before(faces, c)
             twins = 0
             for j in range(first[v], first[v + 1]):
-                g, m = corners[j] // 3, corners[j] % 3
-                next_one, last_one = faces[g, (m + 1) % 3], faces[g, (m + 2) % 3]
+                next_one, last_one = _after(faces, corners[j]), _before(faces, corners[j])
                 twins += (last_one == after) + (next_one == before)
                 if j != i and (next_one == after or last_one == before):
                     is_fixed = True
@@ -83,9 +91,9 @@ def _normal(position, a, b, c):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_plane(position, faces, f, quadric, v):
-    a = faces[f, 0]
-    nx, ny, nz = _normal(position, a, faces[f, 1], faces[f, 2])
+def _add_plane(position, faces, c, quadric, v):
+    a = faces[c]
+    nx, ny, nz = _normal(position, a, faces[c + 1], faces[c + 2])
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     if not length > 0:
         return
@@ -106,10 +114,8 @@ def _add_plane(position, faces, f, quadric, v):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def merged(position, quadric, a, b):
-    """Where two vertices are merged and what that costs: the least of their quadrics' sum.
-
-    Where the planes around leave the place open, it is near the middle.
-    """
+    """Where two vertices are merged: nearest to all planes of both, in the middle where these leave
+    it open. Also the squared distance to these, summed up by area, and the area."""
     xx, xy = quadric[a, 0] + quadric[b, 0], quadric[a, 1] + quadric[b, 1]
     xz, x1 = quadric[a, 2] + quadric[b, 2], quadric[a, 3] + quadric[b, 3]
     yy, yz = quadric[a, 4] + quadric[b, 4], quadric[a, 5] + quadric[b, 5]
@@ -130,45 +136,47 @@ def merged(position, quadric, a, b):
     i11, i12, i22 = a0 * c0 - xz * xz, xy * xz - a0 * yz, a0 * b0 - xy * xy
     det = a0 * i00 + xy * i01 + xz * i02
     if det > 0:
-        x -= (i00 * gx + i01 * gy + i02 * gz) / det
-        y -= (i01 * gx + i11 * gy + i12 * gz) / det
-        z -= (i02 * gx + i12 * gy + i22 * gz) / det
-    cost = (
+        step = 1 / det
+        x -= (i00 * gx + i01 * gy + i02 * gz) * step
+        y -= (i01 * gx + i11 * gy + i12 * gz) * step
+        z -= (i02 * gx + i12 * gy + i22 * gz) * step
+    error = (
         x * (xx * x + 2 * (xy * y + xz * z + x1))
         + y * (yy * y + 2 * (yz * z + y1))
         + z * (zz * z + 2 * z1)
         + one
     )
+    return x, y, z, max(error, 0.0), xx + yy + zz
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def edge_cost(position, faces, quadric, fixed, bound, corner):
+    """Cost of the edge that a corner stands for; infinite where it stands for none or costs, by
+    area, more than the square of a bound."""
+    a, b = faces[corner], _after(faces, corner)
+    if a >= b or fixed[a] or fixed[b]:
+        return np.inf
+    _, _, _, error, area = merged(position, quadric, a, b)
     dx = position[a, 0] - position[b, 0]
     dy = position[a, 1] - position[b, 1]
     dz = position[a, 2] - position[b, 2]
-    length = dx * dx + dy * dy + dz * dz
-    return x, y, z, max(cost, 0.0) + _SHORT_FIRST * (xx + yy + zz) * length
+    cost = error + _SHORT_FIRST * area * (dx * dx + dy * dy + dz * dz)
+    return cost if cost <= bound * bound * area else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def edge_cost(position, faces, quadric, fixed, f, k):
-    """Cost of the edge that a corner stands for; infinite where it stands for none."""
-    a, b = faces[f, k], faces[f, (k + 1) % 3]
-    if a >= b or fixed[a] or fixed[b]:
-        return np.inf
-    return merged(position, quadric, a, b)[3]
+def edge_costs(low, high, position, faces, quadric, fixed, bound, cost):
+    """Costs of the edges of corners ``low`` to ``high``."""
+    for c in range(low, high):
+        cost[c] = edge_cost(position, faces, quadric, fixed, bound[0], c)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def edge_costs(low, high, position, faces, quadric, fixed, cost):
-    """Costs of the edges of faces ``low`` to ``high``."""
-    for f in range(low, high):
-        for k in range(3):
-            cost[f, k] = edge_cost(position, faces, quadric, fixed, f, k)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _rank(bits, limit, f, k):
-    if bits[f, k] > limit:
+def _rank(bits, limit, corner):
+    if bits[corner] > limit:
         return NONE
-    scattered = np.uint32(np.uint32(3 * f + k) * np.uint32(_SCATTER))
-    return (np.int64(bits[f, k] >> _LEVEL) << 32) | np.int64(scattered)
+    scattered = np.uint32(np.uint32(corner) * np.uint32(_SCATTER))
+    return (np.int64(bits[corner] >> _LEVEL) << 32) | np.int64(scattered)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -183,8 +191,9 @@ def best_edges(low, high, first, corners, cost, limit, best):
     for v in range(low, high):
         found = NONE
         for i in range(first[v], first[v + 1]):
-            f, k = corners[i] // 3, corners[i] % 3
-            found = min(found, _rank(bits, limit, f, k), _rank(bits, limit, f, (k + 2) % 3))
+            c = corners[i]
+            coming = c + 2 if c % 3 == 0 else c - 1
+            found = min(found, _rank(bits, limit, c), _rank(bits, limit, coming))
         best[v] = found
 
 
@@ -201,13 +210,14 @@ def match_vertices(low, high, faces, best, matched):
         matched[v] = NONE
         if best[v] != NONE:
             c = ranked_corner(best[v])
-            f, k = c // 3, c % 3
-            if best[faces[f, k]] == best[faces[f, (k + 1) % 3]]:
+            if best[faces[c]] == best[_after(faces, c)]:
                 matched[v] = best[v]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def collapse(low, high, faces, first, corners, matched, fixed, position, quadric, cost, parent):
+def collapse(
+    low, high, faces, first, corners, matched, fixed, bound, position, quadric, cost, parent
+):
     """Merge the ends of matched edges that rank lower than all others near.
 
     No two of them have a face in common, nor does one have an end next to another's: each changes
@@ -218,50 +228,46 @@ def collapse(low, high, faces, first, corners, matched, fixed, position, quadric
         if matched[a] == NONE:
             continue
         c = ranked_corner(matched[a])
-        f, k = c // 3, c % 3
-        b = faces[f, (k + 1) % 3]
-        if faces[f, k] != a or not (
+        b = _after(faces, c)
+        if faces[c] != a or not (
             _is_first(faces, first, corners, matched, a)
             and _is_first(faces, first, corners, matched, b)
         ):
             continue
-        x, y, z, _ = merged(position, quadric, a, b)
+        x, y, z, _, _ = merged(position, quadric, a, b)
         if (
             _common(faces, first, corners, a, b) != 2
             or not _keeps_sides(faces, first, corners, position, a, b, x, y, z)
             or not _keeps_sides(faces, first, corners, position, b, a, x, y, z)
         ):
-            cost[f, k] = np.inf
+            cost[c] = np.inf
             continue
         position[a, 0], position[a, 1], position[a, 2] = x, y, z
         for n in range(10):
             quadric[a, n] += quadric[b, n]
         parent[b] = a
         for i in range(first[b], first[b + 1]):
-            faces[corners[i] // 3, corners[i] % 3] = a
-        _update_costs(position, faces, first, corners, quadric, fixed, cost, a)
-        _update_costs(position, faces, first, corners, quadric, fixed, cost, b)
+            faces[corners[i]] = a
+        _update_costs(position, faces, first, corners, quadric, fixed, bound, cost, a)
+        _update_costs(position, faces, first, corners, quadric, fixed, bound, cost, b)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _update_costs(position, faces, first, corners, quadric, fixed, cost, v):
+def _update_costs(position, faces, first, corners, quadric, fixed, bound, cost, v):
     """Costs anew of the edges that were at a vertex, now that its place and its number changed."""
     for i in range(first[v], first[v + 1]):
-        f, k = corners[i] // 3, corners[i] % 3
-        cost[f, k] = edge_cost(position, faces, quadric, fixed, f, k)
-        k = (k + 2) % 3
-        cost[f, k] = edge_cost(position, faces, quadric, fixed, f, k)
+        leaving = corners[i]
+        coming = leaving + 2 if leaving % 3 == 0 else leaving - 1
+        cost[leaving] = edge_cost(position, faces, quadric, fixed, bound[0], leaving)
+        cost[coming] = edge_cost(position, faces, quadric, fixed, bound[0], coming)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_first(faces, first, corners, matched, v):
     """Whether no vertex next to a matched one is matched by an edge that ranks lower."""
     for i in range(first[v], first[v + 1]):
-        f, k = corners[i] // 3, corners[i] % 3
-        if (
-            matched[faces[f, (k + 1) % 3]] < matched[v]
-            or matched[faces[f, (k + 2) % 3]] < matched[v]
-        ):
+        after, before = _after(faces, corners[i]), _before(faces, corners[i])
+        if matched[after] < matched[v] or matched[before] < matched[v]:
             return False
     return True
 
@@ -271,9 +277,9 @@ def _common(faces, first, corners, a, b):
     """Neighbours that two vertices share."""
     count = 0
     for i in range(first[a], first[a + 1]):
-        x = faces[corners[i] // 3, (corners[i] % 3 + 1) % 3]
+        x = _after(faces, corners[i])
         for j in range(first[b], first[b + 1]):
-            count += faces[corners[j] // 3, (corners[j] % 3 + 1) % 3] == x
+            count += _after(faces, corners[j]) == x
     return count
 
 
@@ -281,8 +287,7 @@ def _common(faces, first, corners, a, b):
 def _keeps_sides(faces, first, corners, position, v, other, x, y, z):
     """Whether no face at ``v`` without ``other`` turns over or becomes a needle if ``v`` moves."""
     for i in range(first[v], first[v + 1]):
-        f, k = corners[i] // 3, corners[i] % 3
-        b, c = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+        b, c = _after(faces, corners[i]), _before(faces, corners[i])
         if b == other or c == other:
             continue
         ox, oy, oz = _normal(position, v, b, c)
@@ -306,14 +311,15 @@ def _keeps_sides(faces, first, corners, position, v, other, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def squeeze(faces, cost, left_faces, left_cost):
-    """Write the faces with three different corners, with their edges' costs; how many these are."""
+    """Write the faces with three different corners, with their edges' costs; how many corners these
+    have."""
     left = 0
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+    for f in range(0, len(faces), 3):
+        a, b, c = faces[f], faces[f + 1], faces[f + 2]
         if a == b or b == c or c == a:
             continue
-        left_faces[left, 0], left_faces[left, 1], left_faces[left, 2] = a, b, c
         for k in range(3):
-            left_cost[left, k] = cost[f, k]
-        left += 1
+            left_faces[left + k] = faces[f + k]
+            left_cost[left + k] = cost[f + k]
+        left += 3
     return left

@@ -20,11 +20,10 @@ MEAN_FRACTION = 0.15
 """Fraction of what is allowed that they may be off on average: else what is smooth becomes facets,
 all of it as far away as may be."""
 _SAMPLES = 10_000
-_FRACTIONS = (0.25, 0.5, 0.75, 0.88)
-"""Fractions of its triangles that a mesh is brought to next; a later
-one where those before leave too few."""
-_USUAL_GROWTH = 2.2
-"""Power of one over the fraction of triangles, by which deviations grow."""
+_BOUNDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 1.0)
+"""Fractions of what is allowed to which costs of edges are held, one after the other."""
+_WORTH_A_LOOK = 0.98
+"""Part of the triangles to which a wider bound has to bring a mesh, if that is to be checked."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
 
@@ -55,48 +54,33 @@ def merged(
     99 % of the vertices lie within ``tolerance`` (map units) of the decimated surface, and on
     average within 15 % of that; borders stay as they are. Computed on the device of the vertices.
 
-    Edges are collapsed until a quarter of the triangles is left, again and again, until that is too
-    few; then until a half is, and so on. Deviations grow the faster the fewer triangles are left,
-    so that what would be too few even if they grew as before is not tried: trying takes longest
-    there.
+    Edges are collapsed up to some cost, and then up to higher ones, until the surface is off by
+    more than it may be.
     """
     if tolerance <= 0 or len(faces) < _FEWEST:
         return None
-    samples = vertices[:: 1 + len(vertices) // _SAMPLES]
-    start = mesh = CollapsingMesh(vertices, faces)
-    allowed, growth = np.array([tolerance, MEAN_FRACTION * tolerance]), np.zeros(2)
-    reached = np.zeros(2)
-    for fraction in _FRACTIONS:
-        while len(mesh.faces) >= _FEWEST and (reached * fraction**-growth <= allowed).all():
-            fewer = mesh.reduced(int(fraction * len(mesh.faces)))
-            if len(fewer.faces) > 0.97 * len(mesh.faces):
-                break
-            deviation = _deviation(samples, fewer)
-            if (deviation > allowed).any():
-                break
-            growth = _growth(reached, deviation, len(fewer.faces) / len(mesh.faces))
-            mesh, reached = fewer, deviation
-    return None if mesh is start else mesh
+    allowed = np.array([tolerance, MEAN_FRACTION * tolerance])
+    found, mesh = None, CollapsingMesh(vertices, faces)
+    for bound in _BOUNDS:
+        mesh = mesh.reduced(bound * tolerance)
+        if len(mesh.faces) > _WORTH_A_LOOK * len(faces if found is None else found.faces):
+            continue
+        if not len(mesh.faces) or (_deviation(mesh, vertices) > allowed).any():
+            break
+        found = mesh
+    return found
 
 
-def _deviation(samples: Float[Tensor, "k 3"], mesh: CollapsingMesh) -> Float[np.ndarray, "2"]:
-    """How far points are off a mesh: nearly all of them, and on average."""
-    vertices, faces = mesh.position.float(), mesh.faces
+def _deviation(mesh: CollapsingMesh, before: Float[Tensor, "n 3"]) -> Float[np.ndarray, "2"]:
+    """How far vertices before are off a mesh: nearly all of them, and on average."""
+    step = 1 + len(before) // _SAMPLES
+    samples, became = before[::step], mesh.became[::step].clamp(min=0)
+    arrays = samples, mesh.position.float(), mesh.faces, became
     if samples.device.type == "cpu":
-        away = deviations(samples.numpy(), vertices.numpy(), faces.numpy())
+        away = deviations(*(array.numpy() for array in arrays))
     else:
-        away = surface_distances(samples, vertices, faces).cpu().numpy()
+        away = surface_distances(*arrays).cpu().numpy()
     return np.array([np.quantile(away, QUANTILE), away.mean()])
-
-
-def _growth(
-    before: Float[np.ndarray, "2"], after: Float[np.ndarray, "2"], fraction: float
-) -> Float[np.ndarray, "2"]:
-    """The power of one over the fraction of triangles that deviations grew by; after the first,
-    what is usual."""
-    if not (before > 0).all():
-        return np.full(2, _USUAL_GROWTH)
-    return np.log(np.maximum(after / before, 1.0)) / -np.log(fraction)
 
 
 def with_at_most(mesh: Mesh, faces: int) -> Mesh:

@@ -13,8 +13,10 @@ def deviations(
     points: Float[np.ndarray, "k 3"],
     vertices: Float[np.ndarray, "n 3"],
     faces: Int[np.ndarray, "m 3"],
+    known: Int[np.ndarray, "k"] | None = None,
 ) -> Float[np.ndarray, "k"]:
-    """Distance of each point to the nearest face of those around the vertices nearest to it.
+    """Distance of each point to the nearest face of those around the vertices nearest to it, and
+    around one that is known to be near.
 
     So it is the distance to the mesh, or a little more where faces differ much in size.
     """
@@ -32,4 +34,6 @@ def deviations(
     first, around = faces_around(len(vertices), faces)
     corners = vertices.astype(np.float64)[faces]
     near = used[near.reshape(len(points), -1)]
+    if known is not None:
+        near = np.column_stack([near, known])
     return nearest_faces(points.astype(np.float64), near, first, around, corners)

@@ -80,8 +80,9 @@ extern "C" __global__ void begin(int count, const double* __restrict__ position,
   fixed[v] = is_fixed;
 }
 
-// Where two vertices are merged; what that costs.
-__device__ double merged(const double* position, const double* quadric, int a, int b, Vec* place) {
+// Where two vertices are merged; squared distances to the planes of both, summed up by area.
+__device__ double merged(const double* position, const double* quadric, int a, int b, Vec* place,
+                         double* area) {
   double q[10];
   for (int n = 0; n < 10; ++n) q[n] = quadric[10 * a + n] + quadric[10 * b + n];
   const double xx = q[0], xy = q[1], xz = q[2], x1 = q[3], yy = q[4], yz = q[5], y1 = q[6];
@@ -96,34 +97,41 @@ __device__ double merged(const double* position, const double* quadric, int a, i
   const double i11 = a0 * c0 - xz * xz, i12 = xy * xz - a0 * yz, i22 = a0 * b0 - xy * xy;
   const double det = a0 * i00 + xy * i01 + xz * i02;
   if (det > 0) {
-    x -= (i00 * gx + i01 * gy + i02 * gz) / det;
-    y -= (i01 * gx + i11 * gy + i12 * gz) / det;
-    z -= (i02 * gx + i12 * gy + i22 * gz) / det;
+    const double step = 1 / det;
+    x -= (i00 * gx + i01 * gy + i02 * gz) * step;
+    y -= (i01 * gx + i11 * gy + i12 * gz) * step;
+    z -= (i02 * gx + i12 * gy + i22 * gz) * step;
   }
   *place = Vec{x, y, z};
-  const double cost = x * (xx * x + 2 * (xy * y + xz * z + x1)) +
-                      y * (yy * y + 2 * (yz * z + y1)) + z * (zz * z + 2 * z1) + one;
-  const Vec edge = minus(p, r);
-  return (cost > 0 ? cost : 0.0) + SHORT_FIRST * (xx + yy + zz) * dot(edge, edge);
+  *area = xx + yy + zz;
+  const double error = x * (xx * x + 2 * (xy * y + xz * z + x1)) +
+                       y * (yy * y + 2 * (yz * z + y1)) + z * (zz * z + 2 * z1) + one;
+  return error > 0 ? error : 0.0;
 }
 
-// Cost of the edge that a corner stands for; infinite where it stands for none.
+// Cost of the edge that a corner stands for; infinite where it stands for none or costs, by area,
+// more than the square of a bound.
 __device__ float edge_cost(const double* position, const int* faces, const double* quadric,
-                           const bool* fixed, int corner) {
+                           const bool* fixed, double bound, int corner) {
+  const float none = __int_as_float(0x7f800000);
   const int a = faces[corner], b = after(faces, corner);
-  if (a >= b || fixed[a] || fixed[b]) return __int_as_float(0x7f800000);
+  if (a >= b || fixed[a] || fixed[b]) return none;
   Vec place;
-  return (float)merged(position, quadric, a, b, &place);
+  double area;
+  const double error = merged(position, quadric, a, b, &place, &area);
+  const Vec edge = minus(at(position, a), at(position, b));
+  const double cost = error + SHORT_FIRST * area * dot(edge, edge);
+  return cost <= bound * bound * area ? (float)cost : none;
 }
 
 extern "C" __global__ void edge_costs(int count, const double* __restrict__ position,
                                       const int* __restrict__ faces,
                                       const double* __restrict__ quadric,
-                                      const bool* __restrict__ fixed, float* __restrict__ cost) {
-  const int f = blockIdx.x * blockDim.x + threadIdx.x;
-  if (f >= count) return;
-  for (int c = 3 * f; c < 3 * f + 3; ++c)
-    cost[c] = edge_cost(position, faces, quadric, fixed, c);
+                                      const bool* __restrict__ fixed,
+                                      const double* __restrict__ bound,
+                                      float* __restrict__ cost) {
+  const int c = blockIdx.x * blockDim.x + threadIdx.x;
+  if (c < count) cost[c] = edge_cost(position, faces, quadric, fixed, bound[0], c);
 }
 
 extern "C" __global__ void best_edges(int count, const int* __restrict__ first,
@@ -202,7 +210,8 @@ __device__ int common(const int* faces, const int* first, const int* corners, in
 extern "C" __global__ void collapse(int count, int* faces, const int* __restrict__ first,
                                     const int* __restrict__ corners,
                                     const long long* __restrict__ matched,
-                                    const bool* __restrict__ fixed, double* position,
+                                    const bool* __restrict__ fixed,
+                                    const double* __restrict__ bound, double* position,
                                     double* quadric, float* cost, int* parent) {
   const int a = blockIdx.x * blockDim.x + threadIdx.x;
   if (a >= count || matched[a] == NONE) return;
@@ -211,7 +220,8 @@ extern "C" __global__ void collapse(int count, int* faces, const int* __restrict
       !is_first(faces, first, corners, matched, b))
     return;
   Vec place;
-  merged(position, quadric, a, b, &place);
+  double area;
+  merged(position, quadric, a, b, &place, &area);
   if (common(faces, first, corners, a, b) != 2 ||
       !keeps_sides(faces, first, corners, position, a, b, place) ||
       !keeps_sides(faces, first, corners, position, b, a, place)) {
@@ -228,7 +238,7 @@ extern "C" __global__ void collapse(int count, int* faces, const int* __restrict
   for (int n = 0; n < 2; ++n)
     for (int i = first[ends[n]]; i < first[ends[n] + 1]; ++i) {
       const int leaving = corners[i], coming = leaving % 3 == 0 ? leaving + 2 : leaving - 1;
-      cost[leaving] = edge_cost(position, faces, quadric, fixed, leaving);
-      cost[coming] = edge_cost(position, faces, quadric, fixed, coming);
+      cost[leaving] = edge_cost(position, faces, quadric, fixed, bound[0], leaving);
+      cost[coming] = edge_cost(position, faces, quadric, fixed, bound[0], coming);
     }
 }

@@ -9,10 +9,15 @@ from geogs.mesh.deviation import NEAREST
 
 
 def surface_distances(
-    points: Float[Tensor, "k 3"], vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]
+    points: Float[Tensor, "k 3"],
+    vertices: Float[Tensor, "n 3"],
+    faces: Int[Tensor, "m 3"],
+    known: Int[Tensor, "k"] | None = None,
 ) -> Float[Tensor, "k"]:
     """What :func:`geogs.mesh.deviation.deviations` gives; every vertex has to have a face."""
     _, near = nearest_neighbors(points, vertices, NEAREST)
+    if known is not None:
+        near = torch.cat([near, known[:, None]], 1)
     vertex, corners = faces.flatten().sort(stable=True)
     first = torch.searchsorted(vertex, near.flatten().to(vertex.dtype))
     count = torch.searchsorted(vertex, near.flatten().to(vertex.dtype), right=True) - first
