@@ -54,9 +54,9 @@ class CollapsingMesh:
         return self._corners.view(-1, 3)
 
     def reduced(self, bound: float) -> "CollapsingMesh":
-        """The mesh after nearly all edges were collapsed that cost no more than a bound (map units).
+        """The mesh after nearly all edges up to a cost were collapsed, in map units.
 
-        That is the root of what an edge costs by area: of the mean square of the merged vertex's
+        A cost is the root of what an edge costs by area: of the mean square of the merged vertex's
         distances to the planes of all faces that it stands for, and of a hundredth of the length.
         """
         new = copy(self)

@@ -11,7 +11,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import transform
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.threads import on_one_torch_thread, run_chunks, worker_count
+from geogs.threads import on_one_torch_thread, thread_map
 
 _GREY = 128
 _SPAN = 32768
@@ -63,7 +63,7 @@ def seen_colours(
                 total[part].index_add_(0, index, w[:, None] * colour)
                 weight[part].index_add_(0, index, w)
 
-            run_chunks(add, -(-len(vertices) // span), worker_count())
+            thread_map(add, range(-(-len(vertices) // span)))
         if progress:
             progress(number + 1, len(views))
     return total / torch.where(weight > 0, weight, 1.0)[:, None], weight > 0

@@ -46,8 +46,13 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
 
 def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
     """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
-    parts = ordered_map(_part, _chunks(tsdf, min_weight), worker_count())
-    return (part for part in parts if len(part.faces))
+
+    def part(place: tuple[Tensor, Tensor]) -> SurfacePart | None:
+        chunk = _voxel_chunk(tsdf, min_weight, *place)
+        return None if chunk is None else _part(chunk)
+
+    parts = ordered_map(part, _chunks(tsdf), worker_count())
+    return (part for part in parts if part is not None and len(part.faces))
 
 
 def _part(chunk: "_VoxelChunk") -> SurfacePart:
@@ -81,30 +86,36 @@ class _VoxelChunk:
     """True at a cell's upper corner if all its eight voxels were seen."""
 
 
-def _chunks(tsdf: SparseTsdf, min_weight: float) -> Iterator[_VoxelChunk]:
-    """Boxes that overlap by one voxel layer, but for those without a cell or without a zero."""
+def _chunks(tsdf: SparseTsdf) -> Iterator[tuple[Int[Tensor, "3"], Int[Tensor, "k"]]]:
+    """The chunks in the box of a volume, with the blocks that each needs."""
     blocks = tsdf.coordinates
     chunk_of = torch.div(blocks, CHUNK, rounding_mode="floor")
     # A cell reaches one voxel up, so a chunk also needs the first layer of the next blocks.
     for chunk in torch.unique(chunk_of, dim=0):
         low = chunk * CHUNK
-        if not tsdf.owns(low):
-            continue
-        member = ((blocks >= low) & (blocks <= low + CHUNK)).all(-1).nonzero()[:, 0]
-        first = blocks[member].amin(0)
-        extent = blocks[member].amax(0) - first + 1
-        last = low + CHUNK
-        crop = torch.minimum(extent * BLOCK, (last - first) * BLOCK + 1).tolist()
-        if min(crop) < 2:
-            continue
-        place = blocks[member] - first
-        distance = off_zero(_dense(tsdf.distance[member], place, extent, 1.0, crop))
-        weight = _dense(tsdf.weight[member], place, extent, 0.0, crop)
-        cell = _seen_cells(weight >= least_weight(min_weight))
-        if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
-            x, y, z = chunk.tolist()
-            origin = first.cpu().numpy() * BLOCK
-            yield _VoxelChunk((x, y, z), origin, distance.cpu().numpy(), cell.cpu().numpy())
+        if tsdf.owns(low):
+            yield chunk, ((blocks >= low) & (blocks <= low + CHUNK)).all(-1).nonzero()[:, 0]
+
+
+def _voxel_chunk(
+    tsdf: SparseTsdf, min_weight: float, chunk: Int[Tensor, "3"], member: Int[Tensor, "k"]
+) -> _VoxelChunk | None:
+    """A box that has one voxel layer of the next ones; None without a cell or without a zero."""
+    blocks = tsdf.coordinates[member]
+    first = blocks.amin(0)
+    extent = blocks.amax(0) - first + 1
+    crop = torch.minimum(extent * BLOCK, ((chunk + 1) * CHUNK - first) * BLOCK + 1).tolist()
+    if min(crop) < 2:
+        return None
+    place = blocks - first
+    distance = off_zero(_dense(tsdf.distance[member], place, extent, 1.0, crop))
+    weight = _dense(tsdf.weight[member], place, extent, 0.0, crop)
+    cell = _seen_cells(weight >= least_weight(min_weight))
+    if not bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
+        return None
+    x, y, z = chunk.tolist()
+    origin = first.cpu().numpy() * BLOCK
+    return _VoxelChunk((x, y, z), origin, distance.cpu().numpy(), cell.cpu().numpy())
 
 
 def least_weight(min_weight: float) -> float:
