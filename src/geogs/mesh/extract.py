@@ -11,14 +11,15 @@ from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.clean import cleaned, remove_degenerate_faces
+from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
 from geogs.mesh.decimate import merged
 from geogs.mesh.device.clean import device_cleaned
 from geogs.mesh.device.surface import device_surface
+from geogs.mesh.device.tensor_mesh import TensorMesh
 from geogs.mesh.free_space import SeenFree
 from geogs.mesh.level_set import extract_surface
-from geogs.mesh.triangle_mesh import DepthMapView, Mesh, vertex_normals
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
 from geogs.threads import on_one_torch_thread
 
@@ -174,10 +175,8 @@ def _merged_mesh(surface: _Surface, seen: tuple[Tensor, Tensor] | None, toleranc
         vertices, faces = few.position.float(), few.faces
         seen = None if seen is None else few.means(*seen)
     colours = None if seen is None else filled(vertices, *seen).cpu().numpy()
-    arrays = vertices.cpu().numpy(), faces.cpu().numpy()
-    if few is None:
-        return Mesh(*arrays, surface.normals.cpu().numpy(), colours)
-    return remove_degenerate_faces(Mesh(*arrays, vertex_normals(*arrays), colours))
+    normals = surface.normals if few is None else TensorMesh(vertices, faces.long()).normals()
+    return Mesh(vertices.cpu().numpy(), faces.cpu().numpy(), normals.cpu().numpy(), colours)
 
 
 def fuse(
