@@ -18,7 +18,7 @@ _SHARE = 0.8
 """Part of the edges that may be collapsed next, the cheapest."""
 _SAMPLES = 20_000
 _MOST_ROUNDS = 300
-_LEAST_PROGRESS = 0.002
+_LEAST_PROGRESS = 0.0005
 """Part of the faces that a round has to take away."""
 
 
