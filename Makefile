@@ -9,6 +9,7 @@
 # make docs     build the site of docs/ in site/; the rest is not set up for it
 # make workflows  lint .github/workflows; needs Node.js
 # make tag      see whether TAG (v1.2.3) is the version that the sources, CITATION.cff and CHANGELOG.md name
+# make binaries compile the kernels for GPUs, which needs no GPU: part of `make dist`
 # make dist     build the wheel and the sources in dist/
 # make try-wheel  run what is in dist/ in an environment with nothing else
 # make sbom     list what that environment consists of
@@ -29,7 +30,7 @@ SITE    := .venv-docs
 RELEASE := .venv-release
 TRIED   := out/wheel-environment
 
-.PHONY: demo quick test test-all pytest fuzz lint kernels format setup lock docs workflows tag dist try-wheel sbom clean
+.PHONY: demo quick test test-all pytest fuzz lint kernels format setup lock docs workflows tag binaries dist try-wheel sbom clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
@@ -100,14 +101,18 @@ workflows:
 tag:
 	$(PYTHON) .github/check_tag.py $(TAG)
 
-dist: $(RELEASE)/bin/twine
+# The oldest NVRTC of its major version, whose machine code all drivers of that version load.
+binaries: $(RELEASE)/bin/twine
+	PYTHONPATH=src $(RELEASE)/bin/python -m geogs.gpu.build_binaries
+
+dist: binaries
 	rm -rf dist
 	$(RELEASE)/bin/python -m build
 	$(RELEASE)/bin/twine check --strict dist/*
 
 $(RELEASE)/bin/twine:
 	$(PYTHON) -m venv $(RELEASE)
-	$(RELEASE)/bin/python -m pip install --quiet build==1.6.1 twine==7.0.0 cyclonedx-bom==7.5.0
+	$(RELEASE)/bin/python -m pip install --quiet build==1.6.1 twine==7.0.0 cyclonedx-bom==7.5.0 nvidia-cuda-nvrtc==13.0.88
 
 try-wheel:
 	$(PYTHON) .github/try_wheel.py dist $(TRIED)
@@ -117,4 +122,4 @@ sbom: $(RELEASE)/bin/twine
 	  --output-file dist/geogs.cdx.json $(TRIED)
 
 clean:
-	rm -rf $(VENV) $(SITE) $(RELEASE) dist site .cache out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(SITE) $(RELEASE) dist src/geogs/gpu/compiled site .cache out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

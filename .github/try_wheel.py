@@ -12,15 +12,19 @@ import subprocess
 import sys
 import tempfile
 import venv
+import zipfile
 from pathlib import Path
 
 _CPU = "https://download.pytorch.org/whl/cpu" if sys.platform == "linux" else ""
+_BINARIES = "geogs/gpu/compiled/sm_"
 _DEMO = ("demo", "-o", "demo", "--frames", "40", "--width", "160", "--height", "120")
 
 
 def main(dist: Path, environment: Path) -> None:
     """Install it and run it from elsewhere than the sources; raises where something fails."""
     (wheel,) = dist.resolve().glob("geogs-*.whl")
+    if not any(name.startswith(_BINARIES) for name in zipfile.ZipFile(wheel).namelist()):
+        raise SystemExit(f"{wheel.name} has no compiled kernels; make dist compiles them.")
     venv.create(environment, with_pip=True, clear=True)
     programs = environment.resolve() / ("Scripts" if sys.platform == "win32" else "bin")
     pip = [programs / "python", "-m", "pip", "install", "--quiet"]

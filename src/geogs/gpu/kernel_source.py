@@ -1,4 +1,4 @@
-"""Kernel sources: what they include and which kernels they define."""
+"""Kernel sources: where they are, what they include and which kernels they define."""
 
 import re
 from dataclasses import dataclass
@@ -8,6 +8,8 @@ PACKAGE = Path(__file__).parents[1]
 """Below which all kernel sources of ours lie."""
 INCLUDE_FOLDER = Path(__file__).parent
 """Where ``#include "common.cuh"`` is found."""
+OPTIONS = ("--use_fast_math", "--std=c++17")
+"""With which all are compiled; what else a kernel needs to know it is given when it is launched."""
 
 _KERNEL = re.compile(
     r'extern\s+"C"\s+__global__\s+void\s+(?:__launch_bounds__\([^)]*\)\s*)?(\w+)\s*\(([^)]*)\)',
@@ -22,6 +24,11 @@ class KernelSignature:
 
     name: str
     parameters: tuple[str, ...]
+
+
+def kernel_sources(folder: Path) -> list[Path]:
+    """Every file below a folder that is compiled."""
+    return sorted(folder.rglob("*.cu"))
 
 
 def read_source(path: Path) -> str:

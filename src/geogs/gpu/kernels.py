@@ -1,5 +1,6 @@
-"""Kernels of a source file for a device: from the cache, or compiled now."""
+"""Kernels of a source file for a device: as they came, from the cache, or compiled now."""
 
+import contextlib
 import functools
 import os
 from collections.abc import Callable, Mapping
@@ -10,16 +11,15 @@ from typing import TYPE_CHECKING
 import torch
 
 from geogs.errors import DeviceError
+from geogs.gpu.binaries import shipped_code
 from geogs.gpu.cache import cache_key, read_cubin, write_cubin
-from geogs.gpu.kernel_source import kernel_signatures, read_source
+from geogs.gpu.kernel_source import OPTIONS, kernel_signatures, kernel_sources, read_source
 
 if TYPE_CHECKING:
     from geogs.gpu.nvrtc import Nvrtc
 
 Kernel = Callable[..., None]
 """``kernel(grid, block, *arguments, shared=0)``; grid and block are ints or tuples of ints."""
-
-OPTIONS = ("--use_fast_math", "--std=c++17")
 
 
 def kernels_for(source: Path, device: torch.device) -> Mapping[str, Kernel]:
@@ -38,7 +38,7 @@ def prepare_kernels(folder: Path, device: torch.device) -> int:
 
     Otherwise each would be compiled when it is first used. Raises as :func:`kernels_for` does.
     """
-    sources = sorted(folder.rglob("*.cu"))
+    sources = kernel_sources(folder)
     torch.cuda.init()
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
         return sum(pool.map(lambda source: len(kernels_for(source, device)), sources))
@@ -51,6 +51,9 @@ def _device_kernels(source: Path, index: int) -> Mapping[str, Kernel]:
     text = read_source(source)
     signatures = list(kernel_signatures(text).values())
     major, minor = torch.cuda.get_device_capability(index)
+    for code in shipped_code(text, (major, minor)):
+        with contextlib.suppress(DeviceError):  # the driver is older than what compiled it
+            return load_kernels(code, signatures, index)
     cubin, key = find_cubin(text, source.name, f"sm_{major}{minor}")
     try:
         return load_kernels(cubin, signatures, index)
@@ -73,8 +76,7 @@ def find_cubin(text: str, name: str, architecture: str) -> tuple[bytes, str]:
 
 def compile_cubin(text: str, name: str, architecture: str) -> bytes:
     """Compile a source whatever the cache holds."""
-    options = [f"--gpu-architecture={architecture}", *OPTIONS]
-    return compiler().compile(text, name, options)
+    return compiler().compile(text, name, architecture, OPTIONS)
 
 
 def compiler() -> "Nvrtc":

@@ -6,13 +6,14 @@ import glob
 import importlib.util
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from geogs.errors import DeviceError
 
 
 class Nvrtc:
-    """CUDA C++ in, machine code (cubin) out."""
+    """CUDA C++ in, machine code (cubin) or PTX out."""
 
     def __init__(self, path: str) -> None:
         library = ctypes.CDLL(path)
@@ -23,8 +24,11 @@ class Nvrtc:
         self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
         self.version = f"{major.value}.{minor.value}"
 
-    def compile(self, source: str, name: str, options: list[str]) -> bytes:
-        """The cubin of a source; raises DeviceError with the compiler's words if it has errors."""
+    def compile(self, source: str, name: str, architecture: str, options: Sequence[str]) -> bytes:
+        """The cubin of a source for ``sm_90``, its PTX for ``compute_90``.
+
+        Raises DeviceError with the compiler's words if it has errors.
+        """
         rtc, program = self._library, ctypes.c_void_p()
         self._check(
             rtc.nvrtcCreateProgram(
@@ -32,10 +36,13 @@ class Nvrtc:
             )
         )
         try:
-            flags = (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
-            if rtc.nvrtcCompileProgram(program, len(options), flags):
+            words = [f"--gpu-architecture={architecture}".encode(), *(o.encode() for o in options)]
+            flags = (ctypes.c_char_p * len(words))(*words)
+            if rtc.nvrtcCompileProgram(program, len(words), flags):
                 log = self._text(program, rtc.nvrtcGetProgramLogSize, rtc.nvrtcGetProgramLog)
                 raise DeviceError(f"The CUDA kernels in {name} do not compile: {log.decode()}")
+            if architecture.startswith("compute"):
+                return self._text(program, rtc.nvrtcGetPTXSize, rtc.nvrtcGetPTX)
             return self._text(program, rtc.nvrtcGetCUBINSize, rtc.nvrtcGetCUBIN)
         finally:
             rtc.nvrtcDestroyProgram(ctypes.byref(program))

@@ -12,8 +12,8 @@ import torch
 from geogs.application.machine import compilation
 from geogs.application.machine.self_test import check_renderer, time_renderer
 from geogs.errors import DeviceError
-from geogs.gpu import cache, installation, kernels
-from geogs.gpu.kernel_source import PACKAGE
+from geogs.gpu import binaries, cache, installation, kernels
+from geogs.gpu.kernel_source import PACKAGE, kernel_sources
 from geogs.networks.weights_files import CATALOGUE, checksum, locate
 from geogs.threads import worker_count
 from geogs.version import __version__
@@ -39,6 +39,7 @@ def examine(device_name: str = "auto") -> Iterator[Finding]:
     yield from _versions()
     device = installation.require_device(device_name)
     yield from _gpus()
+    yield _binaries()
     yield _cache(device.type == "cuda")
     yield _weights()
     if device.type == "cuda":
@@ -84,6 +85,14 @@ def _gpus() -> Iterator[Finding]:
         yield Finding(f"GPU {index}", text)
     newest = ".".join(map(str, supported)) if supported else "?"
     yield Finding("driver", f"{installation.driver_release() or '?'}, supports CUDA {newest}")
+
+
+def _binaries() -> Finding:
+    """Which kernels for GPUs came compiled; those of a clone are compiled at their first use."""
+    sources = kernel_sources(PACKAGE)
+    came = [a for a, n in binaries.shipped_sources(sources).items() if n == len(sources)]
+    text = f"of all {len(sources)} sources for {', '.join(came)}" if came else "none came along"
+    return Finding("binaries", text)
 
 
 def _cache(is_needed: bool) -> Finding:

@@ -1,0 +1,61 @@
+"""Kernels that came compiled with the package: machine code of several architectures, and PTX.
+
+:mod:`geogs.gpu.build_binaries` makes them for a release; a clone of the sources has none.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from geogs.gpu.cache import cache_key
+from geogs.gpu.kernel_source import OPTIONS, read_source
+
+FOLDER = Path(__file__).with_name("compiled")
+"""An archive for each architecture, in which a source has the name that its text gives it."""
+MACHINE_CODE = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+"""Runs on what has the same number before the last digit, and the last digit or a higher one."""
+PTX = "compute_75"
+"""What the driver of every later GPU translates."""
+
+
+def shipped_code(text: str, capability: tuple[int, int]) -> Iterator[bytes]:
+    """What came for a source (with its includes) and a GPU: machine code, then PTX, or nothing."""
+    for architecture in usable_by(capability):
+        archive = FOLDER / f"{architecture}.zip"
+        try:
+            with zipfile.ZipFile(archive) as codes:
+                yield codes.read(name_of(text))
+        except (OSError, KeyError, zipfile.BadZipFile, zlib.error):  # none, of others, or damaged
+            continue
+
+
+def usable_by(capability: tuple[int, int]) -> list[str]:
+    """The architectures that a GPU can use, the best first; at most one is machine code."""
+    major, minor = capability
+    number = 10 * major + minor
+    same = [a for a in MACHINE_CODE if 10 * major <= _number(a) <= number]
+    return [*same[-1:], *([PTX] if _number(PTX) <= number else [])]
+
+
+def name_of(text: str) -> str:
+    """Under which a source is kept: another text, or other options, have another name."""
+    return cache_key(text, *OPTIONS)
+
+
+def shipped_sources(sources: Iterable[Path]) -> dict[str, int]:
+    """How many of the sources, as they are now, came for each architecture."""
+    names = [name_of(read_source(source)) for source in sources]
+    counts = {}
+    for architecture in (*MACHINE_CODE, PTX):
+        try:
+            with zipfile.ZipFile(FOLDER / f"{architecture}.zip") as codes:
+                kept = set(codes.namelist())
+        except (OSError, zipfile.BadZipFile):
+            kept = set()
+        counts[architecture] = sum(name in kept for name in names)
+    return counts
+
+
+def _number(architecture: str) -> int:
+    return int(architecture.split("_")[1])
