@@ -9,6 +9,7 @@ from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, reconstruct_preset
+from geogs.gpu.early_start import start_gpu
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ def _preset_name(given: Given) -> Preset:
         return cast(Preset, given["preset"])
     device = given.get("device", "auto")
     if device == "auto":
+        start_gpu(device)
         from geogs.gpu.installation import gpu_problem
 
         device = "cpu" if gpu_problem() else "cuda"

@@ -14,6 +14,7 @@ from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, preset
 from geogs.errors import InputError
+from geogs.gpu.early_start import start_gpu
 from geogs.io.sources.address import live_address
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def main(argv: Sequence[str]) -> int:
     if options.offline and options.map is not None:
         raise InputError("--map is gone on with by tracking; leave out --offline.")
 
+    start_gpu(options.device)
     from geogs.application.interrupt import Interruption
     from geogs.application.run import resume, run
 

@@ -1,0 +1,37 @@
+"""A GPU made ready while Python still imports PyTorch, which waits for neither."""
+
+import contextlib
+import ctypes
+import importlib.util
+import threading
+from pathlib import Path
+
+
+def start_gpu(name: str) -> None:
+    """Have the driver make the GPU of a device's name ready, in a thread; ``auto`` is the first.
+
+    PyTorch finds it as it is, or makes it ready itself. Nothing is done where PyTorch has no CUDA,
+    and nothing is said where it fails: who uses the GPU says it.
+    """
+    device, _, index = name.partition(":")
+    if device in ("auto", "cuda") and (index or "0").isdecimal() and _has_cuda():
+        number = int(index or 0)
+        threading.Thread(target=_make_ready, args=(number,), name="gpu", daemon=True).start()
+
+
+def _has_cuda() -> bool:
+    """Whether PyTorch was built with CUDA, without importing it."""
+    spec = importlib.util.find_spec("torch")
+    return spec is not None and any(
+        Path(folder, "lib", "libtorch_cuda.so").exists()
+        for folder in spec.submodule_search_locations or ()
+    )
+
+
+def _make_ready(index: int) -> None:
+    """Make the context that PyTorch is going to use; the interpreter goes on meanwhile."""
+    with contextlib.suppress(OSError, AttributeError):
+        cuda = ctypes.CDLL("libcuda.so.1")
+        device, context = ctypes.c_int(), ctypes.c_void_p()
+        if not (cuda.cuInit(0) or cuda.cuDeviceGet(ctypes.byref(device), index)):
+            cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
