@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geogs.application.machine import compilation, rehearsal
-from geogs.application.machine.compilation import OF_SEARCH, Compilation, compiling
+from geogs.application.machine.compilation import OF_MAP, OF_SEARCH, Compilation, compiling
 
 USED = """
 import sys
@@ -15,7 +15,7 @@ from pathlib import Path
 from dataclasses import replace
 from numba.core.dispatcher import Dispatcher
 import geogs
-from geogs.application.machine.compilation import KERNELS
+from geogs.application.machine.compilation import KERNELS, PARTS
 from geogs.application.machine.rehearsal import rehearse
 
 def used():
@@ -23,7 +23,8 @@ def used():
     found = [value for value in named if isinstance(value, Dispatcher)]
     return {(d.py_func.__qualname__, str(s)) for d in found for s in d.signatures}
 
-rehearse()
+for part in PARTS:
+    rehearse(part)
 rehearsed = used()
 assert len({name for name, _ in rehearsed}) == KERNELS, rehearsed
 c = geogs.Config()
@@ -48,7 +49,7 @@ def other(code: str) -> "subprocess.Popen[str]":
 
 def test_what_is_not_compiled_yet_is_waited_for_and_said():
     code = "import time\nfor n in range(4): print(n, flush=True); time.sleep(0.2)"
-    kernels, said = Compilation(other(code), 4), []
+    kernels, said = Compilation([(other(code), 4)]), []
     kernels.wait(lambda stage, part: said.append((stage, part)), 2)
     assert said == [("compiling, once", 0.5), ("compiling, once", 1.0)]
     assert kernels.wait(lambda stage, part: said.append(part)) > 0.1
@@ -58,20 +59,44 @@ def test_what_is_not_compiled_yet_is_waited_for_and_said():
     assert not kernels.is_working
 
 
+def test_a_part_that_is_needed_later_is_compiled_beside_and_awaited_later():
+    later = "import time\nfor n in range(3): print(n, flush=True)\ntime.sleep(60)"
+    first = "for n in range(2): print(n, flush=True)\nimport time; time.sleep(60)"
+    kernels, said = Compilation([(other(first), 2), (other(later), 3)]), []
+    kernels.wait(lambda stage, part: said.append(part), 1)
+    kernels.wait(lambda stage, part: said.append(part), 2)
+    assert said == [1.0, 1.0]
+    kernels.wait(lambda stage, part: said.append(part))
+    assert said[2:] == [0.6, 0.8, 1.0]
+    assert kernels.is_working
+    kernels.stop()
+    assert not kernels.is_working
+
+
+def test_the_mesh_of_a_gpu_is_not_waited_for_before_there_is_a_map():
+    code = "import time\nfor n in range(9): print(n, flush=True)\ntime.sleep(60)"
+    kernels, said = Compilation([(other(code), 9)], OF_MAP), []
+    for first in (OF_SEARCH, OF_MAP):
+        kernels.wait(lambda stage, part: pytest.fail("a GPU has its own"), first)
+    kernels.wait(lambda stage, part: said.append(part))
+    assert len(said) == 9
+    kernels.stop()
+
+
 def test_a_process_that_fails_or_lasts_holds_nobody_up():
-    failed = Compilation(other("import sys; sys.exit(1)"), 4)
+    failed = Compilation([(other("import sys; sys.exit(1)"), 4)])
     failed.wait(lambda stage, part: pytest.fail("nothing is compiled"))
     failed.stop()
     process = other("import time; time.sleep(60)")
-    Compilation(process, 4).stop()
+    Compilation([(process, 4)]).stop()
     assert process.returncode not in (0, None)
 
 
 def test_what_is_compiled_is_known_until_a_source_changes(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
-    monkeypatch.setattr(rehearsal, "rehearse", lambda with_map: None)
+    monkeypatch.setattr(rehearsal, "rehearse", lambda part: None)
     assert not compilation.is_compiled()
-    compilation.compile_now(with_map=False)
+    compilation.compile_now(["mesh"])
     assert not compilation.is_compiled()
     assert compilation.is_compiled(with_map=False)
     compilation.compile_now()

@@ -1,7 +1,7 @@
-"""Kernels for the CPU, compiled once on a machine, by another process while the first images come.
+"""Kernels for the CPU, compiled once on a machine, by other processes while the first images come.
 
 ``python -m geogs.application.machine.compilation`` compiles them at once. Numba keeps them where
-:mod:`geogs.kernel_folder` says; a file beside them tells of what they are.
+:mod:`geogs.kernel_folder` says; files beside them tell of what they are.
 """
 
 import contextlib
@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -23,43 +23,60 @@ from geogs.stopwatch import StageProgress
 OF_SEARCH, OF_MAP, KERNELS = 8, 25, 34
 """How many a rehearsal compiles, those counted that are called from Python: first what depths are
 searched by, up to what a map needs, up to a mesh, for which a GPU needs them, too."""
+PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}
+"""What is compiled side by side, and how many kernels that are; what is needed first goes first."""
 _POLITELY = 5
-"""Niceness of the other process: images go first."""
+"""By which each part is nicer than what goes before it, images first of all."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 
 
 class Compilation:
-    """What another process compiles; nothing where all is there."""
+    """What other processes compile, each a part; nothing where all is there."""
 
-    def __init__(self, process: "subprocess.Popen[str] | None" = None, kernels: int = 0) -> None:
-        self._process, self._kernels, self._done = process, kernels, 0
+    def __init__(
+        self, parts: "Sequence[tuple[subprocess.Popen[str], int]]" = (), before: int = 0
+    ) -> None:
+        """Processes in the order in which their kernels are needed, and how many each compiles.
+
+        ``before`` these come so many that nobody needs, as there is a GPU.
+        """
+        self._before = before
+        self._processes = [process for process, _ in parts]
+        self._kernels = [kernels for _, kernels in parts]
+        self._done = [0] * len(parts)
 
     @property
     def is_working(self) -> bool:
         """Whether something has still to be compiled."""
-        return self._process is not None and self._process.poll() is None
+        return any(process.poll() is None for process in self._processes)
 
     def wait(self, report: StageProgress, first: int | None = None) -> float:
         """Until all is compiled, or the ``first`` so many; how many seconds that took from now on.
 
         What ``report`` raises ends it early; what has failed is compiled when it is used.
         """
-        start, needed = time.perf_counter(), self._kernels if first is None else first
-        while self._process is not None and self._done < needed:
-            assert self._process.stdout is not None
-            is_working = self.is_working
-            if not self._process.stdout.readline():
-                break
-            self._done += 1
-            if is_working:
-                report("compiling, once", min(self._done / needed, 1.0))
+        start = time.perf_counter()
+        needed = sum(self._kernels) if first is None else max(first - self._before, 0)
+        left = needed
+        for part, process in enumerate(self._processes):
+            assert process.stdout is not None
+            wanted = min(left, self._kernels[part])
+            left -= wanted
+            while self._done[part] < wanted:
+                is_working = process.poll() is None
+                if not process.stdout.readline():
+                    break
+                self._done[part] += 1
+                if is_working:
+                    report("compiling, once", min(sum(self._done) / needed, 1.0))
         return time.perf_counter() - start
 
     def stop(self) -> None:
-        """End the process if it still works."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.communicate()
+        """End the processes that still work."""
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            process.communicate()
 
 
 @contextmanager
@@ -69,14 +86,14 @@ def compiling(device: torch.device) -> Iterator[Compilation]:
     if is_compiled(with_map) or not sys.executable:
         yield Compilation()
         return
-    command = [sys.executable, "-m", __name__, *(() if with_map else ("mesh",))]
     none, pipe = subprocess.DEVNULL, subprocess.PIPE
-    try:
-        process = subprocess.Popen(command, stdin=none, stdout=pipe, stderr=none, text=True)
-    except OSError:  # no memory, no more processes: compiled when it is used
-        yield Compilation()
-        return
-    compilation = Compilation(process, KERNELS if with_map else KERNELS - OF_MAP)
+    begun = []
+    for part in PARTS if with_map else ("mesh",):
+        command = [sys.executable, "-m", __name__, part]
+        with contextlib.suppress(OSError):  # no memory, no more processes: compiled when it is used
+            process = subprocess.Popen(command, stdin=none, stdout=pipe, stderr=none, text=True)
+            begun.append((process, PARTS[part]))
+    compilation = Compilation(begun, 0 if with_map else OF_MAP)
     try:
         yield compilation
     finally:
@@ -86,11 +103,14 @@ def compiling(device: torch.device) -> Iterator[Compilation]:
 def is_compiled(with_map: bool = True) -> bool:
     """Whether the kernels that are there were made by this version for this processor."""
     with contextlib.suppress(OSError):
-        return _record(with_map).read_text() == _made_of()
+        parts = PARTS if with_map else ("mesh",)
+        return all(_record(part).read_text() == _made_of() for part in parts)
     return False
 
 
-def compile_now(with_map: bool = True, report: Callable[[str], None] = lambda name: None) -> int:
+def compile_now(
+    parts: Iterable[str] = PARTS, report: Callable[[str], None] = lambda name: None
+) -> int:
     """Compile what is not; ``report`` gets the name of each. Returns how many kernels that were."""
     from numba.core import event
 
@@ -114,16 +134,17 @@ def compile_now(with_map: bool = True, report: Callable[[str], None] = lambda na
                 report(compiled[-1])
 
     with event.install_listener("numba:compile", Listener()):
-        rehearse(with_map)
+        for part in parts:
+            rehearse(part)
     with contextlib.suppress(OSError):
-        for record in {_record(with_map), _record(False)}:
+        for record in map(_record, parts):
             record.parent.mkdir(parents=True, exist_ok=True)
             record.write_text(_made_of())
     return len(compiled)
 
 
-def _record(with_map: bool) -> Path:
-    return kernel_folder() / f"geogs-compiled-{'all' if with_map else 'mesh'}.txt"
+def _record(part: str) -> Path:
+    return kernel_folder() / f"geogs-compiled-{part}.txt"
 
 
 def _made_of() -> str:
@@ -137,11 +158,12 @@ def _made_of() -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Compile all, or what a mesh needs, with a line for each kernel."""
+    """Compile all, or the parts that are named, with a line for each kernel."""
+    parts = arguments or [*PARTS]
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_POLITELY)
-    if not is_compiled(with_map := "mesh" not in arguments):
-        compile_now(with_map, lambda name: print(name, flush=True))
+        os.nice(_POLITELY * (1 + [*PARTS].index(parts[0])))
+    if not is_compiled("map" in parts):
+        compile_now(parts, lambda name: print(name, flush=True))
 
 
 if __name__ == "__main__":

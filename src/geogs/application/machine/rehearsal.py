@@ -22,13 +22,15 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 
 @on_one_torch_thread
-def rehearse(with_map: bool = True) -> None:
-    """Map the wall on the CPU and extract its mesh, or only the latter; leaves nothing."""
-    views = _mapped() if with_map else [_seen(number) for number in range(VIEWS)]
-    extract_mesh(views, MeshConfig(triangle_budget=500))
+def rehearse(part: str) -> None:
+    """``map`` maps the wall on the CPU, ``mesh`` extracts its mesh; leaves nothing."""
+    if part == "map":
+        _map()
+    else:
+        extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
 
 
-def _mapped() -> list[DepthMapView]:
+def _map() -> None:
     config = ReconstructConfig()
     mapping = replace(config.mapping, render_long_edge=48)
     search = replace(config.search, least_steps=4, steps_per_view=1)
@@ -37,7 +39,7 @@ def _mapped() -> list[DepthMapView]:
         scene.add(picture, _pose(number))
     points = DEPTH * CAMERA.rays(torch.float64).numpy()[::4, ::4].reshape(-1, 3)
     scene.finish(points)
-    return [DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image) for r in scene.renders()]
+    list(scene.renders())
 
 
 def _seen(number: int) -> DepthMapView:
