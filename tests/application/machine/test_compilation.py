@@ -73,14 +73,12 @@ def test_a_part_that_is_needed_later_is_compiled_beside_and_awaited_later():
     assert not kernels.is_working
 
 
-def test_the_mesh_of_a_gpu_is_not_waited_for_before_there_is_a_map():
-    code = "import time\nfor n in range(9): print(n, flush=True)\ntime.sleep(60)"
-    kernels, said = Compilation([(other(code), 9)], OF_MAP), []
-    for first in (OF_SEARCH, OF_MAP):
-        kernels.wait(lambda stage, part: pytest.fail("a GPU has its own"), first)
-    kernels.wait(lambda stage, part: said.append(part))
-    assert len(said) == 9
-    kernels.stop()
+def test_with_a_gpu_nothing_is_compiled_or_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    with compiling(torch.device("cuda")) as kernels:
+        assert not kernels.is_working
+        for first in (OF_SEARCH, OF_MAP, None):
+            kernels.wait(lambda stage, part: pytest.fail("a GPU has its own"), first)
 
 
 def test_a_process_that_fails_or_lasts_holds_nobody_up():
@@ -98,7 +96,6 @@ def test_what_is_compiled_is_known_until_a_source_changes(tmp_path, monkeypatch)
     assert not compilation.is_compiled()
     compilation.compile_now(["mesh"])
     assert not compilation.is_compiled()
-    assert compilation.is_compiled(with_map=False)
     compilation.compile_now()
     assert compilation.is_compiled()
     with compiling(torch.device("cpu")) as kernels:

@@ -20,9 +20,9 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-OF_SEARCH, OF_MAP, KERNELS = 8, 25, 34
+OF_SEARCH, OF_MAP, KERNELS = 8, 25, 41
 """How many a rehearsal compiles, those counted that are called from Python: first what depths are
-searched by, up to what a map needs, up to a mesh, for which a GPU needs them, too."""
+searched by, up to what a map needs, up to a mesh. With a GPU nearly nothing of it is called."""
 PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
 _POLITELY = 5
@@ -33,14 +33,8 @@ _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 class Compilation:
     """What other processes compile, each a part; nothing where all is there."""
 
-    def __init__(
-        self, parts: "Sequence[tuple[subprocess.Popen[str], int]]" = (), before: int = 0
-    ) -> None:
-        """Processes in the order in which their kernels are needed, and how many each compiles.
-
-        ``before`` these come so many that nobody needs, as there is a GPU.
-        """
-        self._before = before
+    def __init__(self, parts: "Sequence[tuple[subprocess.Popen[str], int]]" = ()) -> None:
+        """Processes in the order in which their kernels are needed, and how many each compiles."""
         self._processes = [process for process, _ in parts]
         self._kernels = [kernels for _, kernels in parts]
         self._done = [0] * len(parts)
@@ -56,7 +50,7 @@ class Compilation:
         What ``report`` raises ends it early; what has failed is compiled when it is used.
         """
         start = time.perf_counter()
-        needed = sum(self._kernels) if first is None else max(first - self._before, 0)
+        needed = sum(self._kernels) if first is None else first
         left = needed
         for part, process in enumerate(self._processes):
             assert process.stdout is not None
@@ -81,30 +75,28 @@ class Compilation:
 
 @contextmanager
 def compiling(device: torch.device) -> Iterator[Compilation]:
-    """Inside, what a command on a device needs for the CPU is compiled beside it, if it is not."""
-    with_map = device.type == "cpu"
-    if is_compiled(with_map) or not sys.executable:
+    """Inside, what a command needs on a CPU is compiled beside it, if it is not."""
+    if device.type != "cpu" or is_compiled() or not sys.executable:
         yield Compilation()
         return
     none, pipe = subprocess.DEVNULL, subprocess.PIPE
     begun = []
-    for part in PARTS if with_map else ("mesh",):
+    for part in PARTS:
         command = [sys.executable, "-m", __name__, part]
         with contextlib.suppress(OSError):  # no memory, no more processes: compiled when it is used
             process = subprocess.Popen(command, stdin=none, stdout=pipe, stderr=none, text=True)
             begun.append((process, PARTS[part]))
-    compilation = Compilation(begun, 0 if with_map else OF_MAP)
+    compilation = Compilation(begun)
     try:
         yield compilation
     finally:
         compilation.stop()
 
 
-def is_compiled(with_map: bool = True) -> bool:
+def is_compiled() -> bool:
     """Whether the kernels that are there were made by this version for this processor."""
     with contextlib.suppress(OSError):
-        parts = PARTS if with_map else ("mesh",)
-        return all(_record(part).read_text() == _made_of() for part in parts)
+        return all(_record(part).read_text() == _made_of() for part in PARTS)
     return False
 
 
@@ -162,7 +154,7 @@ def main(arguments: list[str]) -> None:
     parts = arguments or [*PARTS]
     with contextlib.suppress(AttributeError, OSError):
         os.nice(_POLITELY * (1 + [*PARTS].index(parts[0])))
-    if not is_compiled("map" in parts):
+    if not is_compiled():
         compile_now(parts, lambda name: print(name, flush=True))
 
 
