@@ -24,7 +24,7 @@ from posed_scene import SMALL
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
 LOST = replace(GOOD, is_reliable=False, lost=0.3)
 TURNED = Verdict(False, "Rotation only.", 0.0, 1.0, np.inf, np.inf, np.inf)
-FRAMES = 14
+FRAMES = 16
 
 
 def test_another_way_is_wanted_where_frames_are_missing_or_nothing_is_to_be_relied_on():
@@ -133,7 +133,7 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     video, tmp_path, monkeypatch, capfd
 ):
     def fails(*_: object) -> None:
-        raise RuntimeError("Of 14 sharp frames no three tell where they were taken.")
+        raise RuntimeError("Of 16 sharp frames no three tell where they were taken.")
 
     for module in (fallback, remedy):
         monkeypatch.setattr(module, "has_pycolmap", lambda: False)
@@ -150,6 +150,25 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     assert summary["verdict"] == plain["verdict"]
     one, other = (tmp_path / name / "trajectory.tum" for name in ("plain", "out"))
     assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.system
+def test_what_turns_the_camera_otherwise_is_not_taken(video, tmp_path, monkeypatch, capfd):
+    judged = PlacedOffline.judged
+
+    def turned(self: PlacedOffline) -> Verdict:
+        """As if it had taken every second step for none."""
+        T = self.trajectory.T_wc.copy()
+        T[1::2, :3, :3] = T[::2, :3, :3] @ np.diag([1.0, -1.0, -1.0])
+        self.trajectory = replace(self.trajectory, T_wc=T)
+        return judged(self)
+
+    monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
+    monkeypatch.setattr(fallback, "is_better", lambda *_: True)
+    monkeypatch.setattr(PlacedOffline, "judged", turned)
+    summary = run(video, tmp_path / "out")
+    assert "turns the camera otherwise than tracking saw it" in capfd.readouterr().err
+    assert "offline" not in summary
 
 
 @pytest.mark.system

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from geogs.application.agreement import turn_alike
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.photos import has_pycolmap
@@ -102,10 +103,14 @@ class TrackedOrPlaced(Work):
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
         found = placed.judged()
-        is_taken = is_better(found, tracked)
+        is_other = tracked is not None and not turn_alike(
+            self._tracked.scene.trajectory(), placed.trajectory
+        )
+        is_taken = is_better(found, tracked) and not is_other
         say(
             f"Structure from motion places {_placed_part(found):.0%} of the frames, tracking "
             f"{_placed_part(tracked):.0%}: "
+            + ("it turns the camera otherwise than tracking saw it, so " if is_other else "")
             + ("that is mapped now." if is_taken else "what was tracked stays.")
         )
         placed.scene.instead_of = _in_words(tracked)
