@@ -26,7 +26,8 @@ def turn_alike(first: Trajectory, second: Trajectory) -> bool:
     Frames are known by their times; those count whose places both know.
     """
     known = first.of("tracked"), second.of("tracked")
-    _, *rows = np.intersect1d(*(k.timestamps for k in known), return_indices=True)
+    times = [k.timestamps for k in known]
+    _, *rows = np.intersect1d(times[0], times[1], return_indices=True)
     turns = [_turns(k.T_wc[row, :3, :3]) for k, row in zip(known, rows, strict=True)]
     if len(turns[0]) < FEWEST:
         return True
