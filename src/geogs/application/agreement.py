@@ -6,8 +6,8 @@ scale and drift. So a second way that turns otherwise, however well it knows its
 """
 
 import numpy as np
-from jaxtyping import Float
 
+from geogs.evaluation.rotation_errors import relative_rotation_error, rotation_angle
 from geogs.types import Trajectory
 
 APART = 5
@@ -28,19 +28,10 @@ def turn_alike(first: Trajectory, second: Trajectory) -> bool:
     known = first.of("tracked"), second.of("tracked")
     times = [k.timestamps for k in known]
     _, *rows = np.intersect1d(times[0], times[1], return_indices=True)
-    turns = [_turns(k.T_wc[row, :3, :3]) for k, row in zip(known, rows, strict=True)]
-    if len(turns[0]) < FEWEST:
+    R = [k.T_wc[row, :3, :3] for k, row in zip(known, rows, strict=True)]
+    begin = np.arange(len(R[0]) - APART)
+    if len(begin) < FEWEST:
         return True
-    apart = _degrees(turns[0].swapaxes(1, 2) @ turns[1])
-    allowed = TOLERANCE + OF_TURN * _degrees(turns[0])
+    apart = relative_rotation_error(R[1], R[0], begin, begin + APART)
+    allowed = TOLERANCE + OF_TURN * rotation_angle(R[0][begin], R[0][begin + APART])
     return bool((apart <= allowed).mean() > 0.5)
-
-
-def _turns(R_wc: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "m 3 3"]:
-    """Rotation from each frame to the one that is so many later, in the axes of the first."""
-    return R_wc[:-APART].swapaxes(1, 2) @ R_wc[APART:]
-
-
-def _degrees(R: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m"]:
-    """Angles of rotations."""
-    return np.degrees(np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1) / 2, -1, 1)))

@@ -22,13 +22,13 @@ class SeenFree:
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Whether the voxel nearest to each point is free; where there is none it is not."""
-        volume, limit = self.tsdf, LIMIT // BLOCK
-        voxel = torch.from_numpy(np.rint(points / volume.voxel)).to(volume.device).long()
-        block = torch.div(voxel, BLOCK, rounding_mode="floor")
-        slot = volume.slots_of(block.clamp(-limit, limit))
-        known = (slot >= 0) & (voxel.abs() < LIMIT).all(-1)
-        x, y, z = (voxel - block * BLOCK).unbind(-1)
-        slot, x, y, z = slot[known], x[known], y[known], z[known]
+        volume = self.tsdf
+        block, inner, is_within = (
+            torch.from_numpy(part).to(volume.device) for part in _nearest(points, volume.voxel)
+        )
+        slot = volume.slots_of(block)
+        known = (slot >= 0) & is_within
+        slot, (x, y, z) = slot[known], inner[known].unbind(-1)
         is_seen = volume.weight[slot, x, y, z] >= self.min_weight
         known[known.clone()] = is_seen & (volume.distance[slot, x, y, z] > FREE)
         return known.cpu().numpy()
@@ -66,13 +66,22 @@ class FreeSpace:
         """Whether the voxel nearest to each point is free; where there is none it is not."""
         if not len(self.keys) or not len(points):
             return np.zeros(len(points), bool)
-        voxel = np.rint(points / self.voxel).astype(np.int64)
-        block = np.floor_divide(voxel, BLOCK)
-        limit = LIMIT // BLOCK
-        keys = pack(torch.from_numpy(block.clip(-limit, limit))).numpy()
+        block, inner, is_within = _nearest(points, self.voxel)
+        keys = pack(torch.from_numpy(block)).numpy()
         place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
-        known = (self.keys[place] == keys) & (np.abs(voxel) < LIMIT).all(axis=1)
-        x, y, z = (voxel - block * BLOCK).T
-        inner = (x * BLOCK + y) * BLOCK + z
-        bit = self.bits[place, inner >> 3] >> (7 - (inner & 7)) & 1
+        known = (self.keys[place] == keys) & is_within
+        x, y, z = inner.T
+        number = (x * BLOCK + y) * BLOCK + z
+        bit = self.bits[place, number >> 3] >> (7 - (number & 7)) & 1
         return known & (bit == 1)
+
+
+def _nearest(
+    points: Float[np.ndarray, "n 3"], size: float
+) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    """Of the voxel nearest to each point: its block, held to what can be packed, its place in its
+    own block, and whether a volume reaches so far."""
+    voxel, limit = np.rint(points / size).astype(np.int64), LIMIT // BLOCK
+    block = np.floor_divide(voxel, BLOCK)
+    is_within = np.asarray((np.abs(voxel) < LIMIT).all(axis=1))
+    return block.clip(-limit, limit), voxel - block * BLOCK, is_within
