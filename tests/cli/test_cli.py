@@ -12,10 +12,10 @@ import pytest
 
 from geogs import __version__
 from geogs.cli import main as cli
-from geogs.cli import reconstruct
+from geogs.cli import reconstruct, run
 from geogs.cli.command import COMMANDS, Command, all_commands
 from geogs.cli.options import parse_options
-from geogs.config import Config, InputConfig, reconstruct_preset
+from geogs.config import Config, InputConfig, preset_of, reconstruct_preset
 from geogs.config.setting import Positional
 from geogs.errors import InputError, OutputError, TrackingLost
 
@@ -211,6 +211,19 @@ def test_known_poses_take_the_preset_of_the_device_unless_one_is_given() -> None
     small, large = (reconstruct_preset(name) for name in ("default", "accurate"))
     assert small.mapping.render_long_edge < large.mapping.render_long_edge == 800
     assert small.mapping.loss == large.mapping.loss != Config().mapping.loss
+
+
+def test_a_run_takes_larger_images_on_a_gpu_unless_they_are_live_or_a_preset_is_given() -> None:
+    def edges(*words: str) -> tuple[int, int, int]:
+        config = run.parse(words).config
+        return config.input.long_edge, config.mapping.render_long_edge, config.mapping.disk.stride
+
+    assert edges("a.mp4", "--device", "cpu") == (512, 320, 3)
+    assert edges("a.mp4", "--device", "cuda:0") == (640, 640, 6)
+    assert edges("a.mp4", "--device", "cuda", "--long-edge", "400") == (400, 640, 6)
+    assert edges("a.mp4", "--device", "cuda", "--preset", "fast") == (512, 192, 3)
+    assert edges("camera:0", "--device", "cuda") == (512, 320, 3)
+    assert preset_of(run.parse(["a.mp4", "--device", "cuda"]).config) == "default"
 
 
 @pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])

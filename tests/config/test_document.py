@@ -22,7 +22,7 @@ def test_every_setting_has_a_row_with_its_default_its_range_and_its_meaning():
         assert f"`{name}`" in text
     assert "| `loop.close-every` | `5` | a whole number from 1 to 1000000 | Keyframes" in text
     assert "| `mapping.photo.per-step` | `2`, `4` in `reconstruct` | a whole number from 1" in text
-    assert "| `mapping.final-depth` | `on` | `off` | `on` | `on` |" in text
+    assert "| `mapping.final-depth` | `on` | `on` | `off` | `on` | `on` |" in text
     explained = [row for row in rows if " only) |" in row]
     lag = next(row for row in explained if row.startswith("| `mapping.lag`"))
     assert lag.endswith("(`run` only) |")

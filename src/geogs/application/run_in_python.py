@@ -7,7 +7,8 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.result import Result
 from geogs.application.run import run as run_to_folder
 from geogs.application.run_settings import RunSettings
-from geogs.config import Config
+from geogs.config import Config, preset
+from geogs.gpu.early_start import is_gpu
 
 
 def run(
@@ -22,7 +23,7 @@ def run(
 
     Args:
         source: a video, a folder, a data set, a bag, or several of one place.
-        config: all settings; the defaults if none.
+        config: all settings; if none those of the preset ``default`` on the device.
         output: folder of the result; out/NAME if none is given, as ``Result.folder`` says.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
         progress: follows the work.
@@ -35,5 +36,6 @@ def run(
     """
     several = (source,) if isinstance(source, str | Path) else source
     folder = None if output is None else Path(output)
-    settings = RunSettings(tuple(map(Path, several)), config or Config(), folder, device)
+    config = config or preset("default", is_gpu(device))
+    settings = RunSettings(tuple(map(Path, several)), config, folder, device)
     return run_to_folder(settings, progress).result

@@ -9,7 +9,7 @@ from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, reconstruct_preset
-from geogs.gpu.early_start import start_gpu
+from geogs.gpu.early_start import is_gpu, start_gpu
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     begin = time.perf_counter()
     options = parse(argv)
+    start_gpu(options.device)
     settings = record(ReconstructSettings, options)
 
     from geogs.application.interrupt import Interruption
@@ -63,10 +64,4 @@ def _preset_name(given: Given) -> Preset:
     """The preset asked for, else the one that suits the device."""
     if "preset" in given:
         return cast(Preset, given["preset"])
-    device = given.get("device", "auto")
-    if device == "auto":
-        start_gpu(device)
-        from geogs.gpu.installation import gpu_problem
-
-        device = "cpu" if gpu_problem() else "cuda"
-    return "accurate" if device.startswith("cuda") else "default"
+    return "accurate" if is_gpu(given.get("device", "auto")) else "default"

@@ -14,7 +14,7 @@ from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, preset
 from geogs.errors import InputError
-from geogs.gpu.early_start import start_gpu
+from geogs.gpu.early_start import is_gpu, start_gpu
 from geogs.io.sources.address import live_address
 
 if TYPE_CHECKING:
@@ -108,7 +108,9 @@ def _defaults(given: Given) -> RunOptions:
     """The preset asked for, or what the run that is gone on with was begun with."""
     if "resume" not in given:
         name = cast(Preset, given.get("preset", "default"))
-        return RunOptions(config=preset(name), preset=name)
+        is_live = live_address(Path(given.get("source", ""))) is not None
+        on_gpu = name == "default" and not is_live and is_gpu(given.get("device", "auto"))
+        return RunOptions(config=preset(name, on_gpu), preset=name)
 
     from geogs.application.checkpoints.run_state import SavedRun
 

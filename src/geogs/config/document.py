@@ -1,7 +1,7 @@
 """Writes docs/configuration.md: ``python -m geogs.config.document > docs/configuration.md``."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import get_args
 
 from geogs.config.leaves import Leaf, default_text, leaves
@@ -26,6 +26,12 @@ them. Settings that only one of the two commands heeds say so, and the other doe
 Groups named `ablation` are there to be compared with.
 """
 
+_ON_A_DEVICE = """\
+Where no preset is given, `geogs run` takes `default`, on a GPU with the sizes of the second column
+unless the images come live, and `geogs reconstruct` takes `accurate` on a GPU, `default` on a CPU.
+Where `auto` stands, the setting's own line says what that is on either.
+"""
+
 
 def document() -> str:
     """The page: presets, then a table for every group of settings."""
@@ -37,8 +43,11 @@ def document() -> str:
         row = _row(leaf, both.get(leaf.name), other.get(leaf.name))
         groups.setdefault(leaf.group, []).append(row)
     words = {kind.group: kind.__doc__ or "" for kind in _classes(run) + _classes(known_poses)}
-    parts = [_INTRODUCTION, "## Presets\n", _presets("run", preset)]
-    parts.append(_presets("reconstruct", reconstruct_preset))
+    named = {name: preset(name) for name in get_args(Preset)}
+    named = {"default": preset("default"), "default, GPU": preset("default", on_gpu=True), **named}
+    parts = [_INTRODUCTION, "## Presets\n", _presets("run", named)]
+    named_known = {name: reconstruct_preset(name) for name in get_args(Preset)}
+    parts.append(_presets("reconstruct", named_known) + "\n" + _ON_A_DEVICE)
     for group, rows in groups.items():
         where = [
             command
@@ -63,15 +72,14 @@ def _row(leaf: Leaf, run: Leaf | None, known_poses: Leaf | None) -> list[str]:
     return [name, default, str(leaf.kind), leaf.help + beside]
 
 
-def _presets(command: str, make: Callable[[Preset], Settings]) -> str:
+def _presets(command: str, named: Mapping[str, Settings]) -> str:
     """What each preset has that is not usual."""
-    names = get_args(Preset)
     rows = []
-    for some in zip(*(leaves(make(name)) for name in names), strict=True):
+    for some in zip(*map(leaves, named.values()), strict=True):
         texts = [_code(default_text(leaf)) for leaf in some]
         if len(set(texts)) > 1:
             rows.append([_code(some[0].name), *texts])
-    return _table((f"`geogs {command}`", *names), rows)
+    return _table((f"`geogs {command}`", *named), rows)
 
 
 def _classes(tree: Settings) -> list[type[Settings]]:

@@ -41,14 +41,18 @@ def preset_of(config: Config) -> Preset:
     return next(mapped, "default")
 
 
-def preset(name: Preset) -> Config:
+def preset(name: Preset, on_gpu: bool = False) -> Config:
     """The settings of a preset.
 
-    ``fast`` matches all keyframes at half resolution in the end and maps at a smaller size;
-    ``accurate``, for a GPU, works on larger images, renders at their size and trains longer;
-    ``paper`` does what the GeoGS-SLAM paper does.
+    ``default`` takes larger images on a GPU and renders at their size; ``accurate`` does so
+    anywhere and trains longer; ``fast`` matches all keyframes at half resolution in the end and
+    maps at a smaller size; ``paper`` does what the GeoGS-SLAM paper does.
     """
     base = Config()
+    if name == "accurate" or (name == "default" and on_gpu):
+        disk = replace(base.mapping.disk, stride=6)
+        mapping = replace(base.mapping, render_long_edge=640, disk=disk)
+        base = replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
     if name == "fast":
         mapping = replace(
             base.mapping,
@@ -66,11 +70,7 @@ def preset(name: Preset) -> Config:
             mesh=replace(base.mesh, triangle_budget=500_000),
         )
     if name == "accurate":
-        disk = replace(base.mapping.disk, stride=6)
-        mapping = replace(
-            base.mapping, render_long_edge=640, iterations=15, final_iterations=3000, disk=disk
-        )
-        return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
+        return replace(base, mapping=replace(base.mapping, iterations=15, final_iterations=3000))
     if name == "paper":
         return replace(
             base,

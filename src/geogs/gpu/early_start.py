@@ -19,6 +19,17 @@ def start_gpu(name: str) -> None:
         threading.Thread(target=_make_ready, args=(number,), name="gpu", daemon=True).start()
 
 
+def is_gpu(name: str) -> bool:
+    """Whether the device of that name is a GPU: of ``auto``, whether one can be used, which is made
+    ready meanwhile."""
+    if name != "auto":
+        return name.startswith("cuda")
+    start_gpu(name)
+    from geogs.gpu.installation import gpu_problem
+
+    return gpu_problem() is None
+
+
 def _has_cuda() -> bool:
     """Whether PyTorch was built with CUDA, without importing it."""
     spec = importlib.util.find_spec("torch")
