@@ -3,6 +3,8 @@
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from geogs.errors import InputError
@@ -14,9 +16,11 @@ def load_colmap() -> Any:
     Raises:
         InputError: it is not installed, or cannot be loaded.
     """
-    is_first = "pycolmap" not in sys.modules
+    if loaded := sys.modules.get("pycolmap"):
+        return loaded
     try:
-        import pycolmap
+        with _request_to_end_kept():
+            import pycolmap
     except ImportError as error:
         raise InputError(
             "Finding the poses of photographs needs pycolmap; pip install 'geogs[photos]' brings "
@@ -24,7 +28,20 @@ def load_colmap() -> Any:
         ) from error
     # Failures come back as exceptions; its lines would tear the progress line apart.
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
-    if is_first and threading.current_thread() is threading.main_thread():
-        # It makes a request to end print a stack, so what was there before is put back.
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     return pycolmap
+
+
+@contextmanager
+def _request_to_end_kept() -> Iterator[None]:
+    """Its import makes a request to end print a stack: what was there before is put back, and a
+    request that comes meanwhile waits."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM) or signal.SIG_DFL
+    waiting = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, waiting)
