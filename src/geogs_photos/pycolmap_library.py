@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from geogs.errors import InputError
@@ -16,10 +16,9 @@ def load_colmap() -> Any:
     Raises:
         InputError: it is not installed, or cannot be loaded.
     """
-    if loaded := sys.modules.get("pycolmap"):
-        return loaded
+    is_first = "pycolmap" not in sys.modules
     try:
-        with _request_to_end_kept():
+        with _request_to_end_kept() if is_first else nullcontext():
             import pycolmap
     except ImportError as error:
         raise InputError(

@@ -83,6 +83,7 @@ def run(
             from geogs.application.offline import PlacedOffline, beginning_with
 
             told = self_calibrated(opened, config, device, progress, stop)
+            told = with_shutter_found(told, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened)
         return _completed(driver, settings, work)
