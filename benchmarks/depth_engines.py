@@ -117,11 +117,11 @@ def shoot(
     return Keyframe(view, coarse.depth, coarse.normal, kinds[1])
 
 
-def neighbours_of(keyframes: Sequence[Keyframe], index: int) -> list[int]:
+def neighbours_of(keyframes: Sequence[Keyframe], index: int, render: Camera) -> list[int]:
     """As the mapper chooses them."""
     typical = float(np.median(keyframes[index].depth))
     views = [k.view for k in keyframes]
-    return select_sweep_neighbours(views[index], views, typical)
+    return select_sweep_neighbours(views[index], views, typical, render)
 
 
 def compare(keyframe: Keyframe, dense: DenseDepth, render: Camera) -> Found:
@@ -176,12 +176,13 @@ def searched(
     keyframes: Sequence[Keyframe],
     index: int,
     checked: bool,
+    render: Camera,
 ) -> tuple[DenseDepth, float]:
     """The depth of a keyframe and the seconds of its search; ``checked`` by its neighbours'."""
-    chosen = neighbours_of(keyframes, index)
+    chosen = neighbours_of(keyframes, index, render)
 
     def search(at: int) -> DenseDepth:
-        some = [keyframes[j].view for j in neighbours_of(keyframes, at)]
+        some = [keyframes[j].view for j in neighbours_of(keyframes, at, render)]
         (dense,) = engine.estimate([keyframes[at].view], [some])
         return dense
 
@@ -232,7 +233,7 @@ def main() -> None:
                     keyframes.append(shoot(caster, path[frame], number, working, render))
                     number += 1
                 for name, engine in engines.items():
-                    dense, took = searched(engine, keyframes, AROUND, arguments.checked)
+                    dense, took = searched(engine, keyframes, AROUND, arguments.checked, render)
                     found[name].append(compare(keyframes[AROUND], dense, render))
                     seconds[name].append(took)
         for name in engines:

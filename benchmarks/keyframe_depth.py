@@ -138,7 +138,7 @@ def main() -> None:
         )
         start = time.thread_time()
         candidates = views[: i + arguments.lag + 1]
-        picked = select_sweep_neighbours(view, candidates, typical_depth(view))
+        picked = select_sweep_neighbours(view, candidates, typical_depth(view), render)
         neighbours = [candidates[j] for j in picked]
         estimated.append(estimate_depth(view, neighbours, render, working))
         seconds.append(time.thread_time() - start)
@@ -146,7 +146,7 @@ def main() -> None:
     for n, (i, depth) in enumerate(zip(chosen, estimated, strict=True)):
         known = [v for v in kept if v.id <= i + arguments.lag]
         typical = float(np.median(depth.depth))
-        picked = select_sweep_neighbours(kept[n], known, typical)
+        picked = select_sweep_neighbours(kept[n], known, typical, render)
         others = [estimated[j] for j in picked]
         other_poses = [known[j].T_cw for j in picked]
         checked.append(check_depth(depth, kept[n].T_cw, others, other_poses, render))

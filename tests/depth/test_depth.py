@@ -6,20 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from depth_scene import RENDER, WORKING, DepthScene, make_scene
 from geogs import threads
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
 from geogs.depth.classical import CpuDepthEngine
-from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth, ViewPose
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
-from geogs.depth.sweep_neighbors import (
-    depth_range,
-    parallax_degrees,
-    select_sweep_neighbours,
-)
+from geogs.depth.sweep_neighbors import depth_range, select_sweep_neighbours, view_pairs
 
 
 @pytest.fixture(scope="module")
@@ -173,16 +170,67 @@ def test_the_cpu_engine_is_the_functions(scene, depths):
     assert 0 < int(kept.sum()) < 200
 
 
-def test_parallax_is_the_angle_at_the_point_ahead(scene):
-    view = scene.views[0]
-    aside, turned = np.eye(4), np.eye(4)
-    aside[0, 3] = -2.0
+def test_pairs_are_judged_by_what_both_see(scene):
+    reference = ViewPose(0, np.eye(4))
+    aside, turned, ahead = np.eye(4), np.eye(4), np.eye(4)
+    aside[0, 3] = -0.2
     turned[:3, :3] = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
-    reference = replace(view, T_cw=np.eye(4))
-    others = [replace(view, T_cw=aside), replace(view, T_cw=turned)]
-    parallax, turn = parallax_degrees(reference, others, 2.0)
-    assert np.allclose(parallax, [45.0, 0.0], atol=1e-3)
-    assert np.allclose(turn, [0.0, 90.0], atol=1e-3)
+    ahead[2, 3] = -0.5
+    others = [ViewPose(n + 1, T_cw) for n, T_cw in enumerate((aside, turned, ahead))]
+    pairs = view_pairs(reference, others, 2.0, RENDER)
+    # Seen slantwise, 0.2 aside of 2 m of depth is a little less than its 5.7 degrees ahead.
+    assert pairs.parallax[0] == pytest.approx(np.degrees(np.arctan(0.1)), rel=0.15)
+    assert pairs.overlap[0] >= 0.8
+    assert pairs.zoom[0] == pytest.approx(1.0, abs=0.03)
+    assert pairs.rotation[:2] == pytest.approx([0.0, 90.0], abs=1e-3)
+    assert pairs.overlap[1] == pairs.parallax[1] == 0
+    # A point ahead shows a camera that moves straight on no parallax, those around do.
+    assert pairs.parallax[2] > 2
+    assert pairs.zoom[2] == pytest.approx(2.0 / 1.5, rel=0.05)
+    assert pairs.usable(1.0, 25.0).tolist() == [True, False, True]
+
+
+def test_parallax_agrees_with_the_angle_of_each_point(scene):
+    """The medians against rays that are made and measured one by one."""
+    random = np.random.default_rng(3)
+    axis = random.normal(0, 0.15, 3)
+    T_cw = np.eye(4)
+    T_cw[:3, :3] = Rotation.from_rotvec(axis).as_matrix()
+    T_cw[:3, 3] = random.normal(0, 0.2, 3)
+    pairs = view_pairs(ViewPose(0, np.eye(4)), [ViewPose(1, T_cw)], 3.0, RENDER)
+    angles, zooms, seen = [], [], 0
+    centre = -T_cw[:3, :3].T @ T_cw[:3, 3]
+    for i in range(9):
+        for j in range(9):
+            u, v = (i + 0.5) * RENDER.width / 9 - 0.5, (j + 0.5) * RENDER.height / 9 - 0.5
+            point = 3.0 * np.array([(u - RENDER.cx) / RENDER.fx, (v - RENDER.cy) / RENDER.fy, 1.0])
+            x, y, z = T_cw[:3, :3] @ point + T_cw[:3, 3]
+            px, py = RENDER.fx * x / z + RENDER.cx, RENDER.fy * y / z + RENDER.cy
+            if not (0 <= px <= RENDER.width - 1 and 0 <= py <= RENDER.height - 1):
+                continue
+            seen += 1
+            there = point - centre
+            cosine = point @ there / np.linalg.norm(point) / np.linalg.norm(there)
+            angles.append(np.degrees(np.arccos(cosine)))
+            zooms.append(abs(np.log(np.linalg.norm(there) / np.linalg.norm(point))))
+    assert 20 < seen < 81
+    assert pairs.overlap[0] == pytest.approx(seen / 81)
+    assert pairs.parallax[0] == pytest.approx(sorted(angles)[seen // 2])
+    assert np.log(pairs.zoom[0]) == pytest.approx(sorted(zooms)[seen // 2])
+
+
+def test_a_camera_that_moves_straight_on_is_matched_with_those_next_to_it():
+    """With the angle at the point ahead alone the farthest were taken, up to past what is seen."""
+
+    def at(n: int) -> ViewPose:
+        T_cw = np.eye(4)
+        T_cw[2, 3] = -1.2 * n
+        return ViewPose(n, T_cw)
+
+    views = [at(n) for n in range(40)]
+    chosen = select_sweep_neighbours(views[20], views, 12.0, RENDER)
+    assert len(chosen) == 8
+    assert sorted(chosen) == [15, 16, 17, 18, 19, 21, 22, 23]
 
 
 def test_check_without_others_changes_nothing(scene, depths):
@@ -202,12 +250,12 @@ def test_neighbours_have_parallax_look_the_same_way_and_spread(scene):
 
     reference = moved(0, 0, 0)
     few = [reference, moved(1, 0.005, 0), moved(2, 0.2, 0), moved(3, 0.2, 0, 50), moved(4, 3, 0)]
-    assert select_sweep_neighbours(reference, few, 2.0) == [2]
+    assert select_sweep_neighbours(reference, few, 2.0, RENDER) == [2]
     lonely = [reference, moved(1, 0.001, 0), moved(2, 0.002, 0)]
-    assert len(select_sweep_neighbours(reference, lonely, 2.0)) == 2
+    assert len(select_sweep_neighbours(reference, lonely, 2.0, RENDER)) == 2
     sideways = [moved(i, 0.2 + 0.001 * i, 0) for i in range(1, 5)]
     upwards = moved(9, 0, 0.3)
-    chosen = select_sweep_neighbours(reference, [*sideways, upwards], 2.0, 2)
+    chosen = select_sweep_neighbours(reference, [*sideways, upwards], 2.0, RENDER, 2)
     assert 4 in chosen
 
 

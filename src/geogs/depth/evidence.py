@@ -11,12 +11,13 @@ from geogs.geometry.camera import Camera
 
 CONFIDENT_DEVIATION = 0.05
 """Relative deviation at which the confidence in the tracker is 1/2."""
-TRACKER_SCALE = 0.2
-"""Real over expected relative deviation of the tracker's depth, as measured on rendered rooms."""
+TRACKER_SCALE = 0.5
+"""Taken for the real over the expected relative deviation of the tracker's depth: more than the 0.2
+that rendered rooms have in the median, as a cell near an edge may be of either side."""
 UNKNOWN_DEVIATION = 10.0
 BEST_DEVIATION = 0.002
 """Relative deviation below which the tracker is not believed."""
-KINK = 0.06
+KINK = 0.04
 """Relative second difference of inverse depth between cells that marks a depth edge."""
 
 
@@ -38,17 +39,20 @@ def tracker_evidence(completed: CompletedDepth, working: Camera, render: Camera)
 
 
 def prior_weight(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
-    """1 / (1 + (deviation / confident one)^2) on the grid, 0 where the tracker was rejected."""
+    """1 / (1 + (deviation / confident one)^2) on the grid, 0 where the tracker was rejected.
+
+    Where inverse depth bends sharply between cells, it falls to nothing: what is interpolated there
+    from foreground to background the tracker has not seen.
+    """
     weight = 1.0 / (1.0 + (completed.deviation / np.float32(CONFIDENT_DEVIATION)) ** 2)
-    return np.where(completed.inlier, weight, np.float32(0.0))
+    return np.where(completed.inlier, _flatness(completed.inverse_depth) * weight, np.float32(0.0))
 
 
 def relative_precision(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
     """1 / sigma^2 on the grid.
 
-    sigma is ``TRACKER_SCALE`` times the deviation the tracker expects. Where inverse depth
-    bends sharply between cells, interpolating makes a curtain from foreground to background: the
-    weight falls to nothing there, as it does where the robust completion rejected the tracker.
+    sigma is ``TRACKER_SCALE`` times the deviation the tracker expects. As ``prior_weight`` it falls
+    to nothing where inverse depth bends, and where the robust completion rejected the tracker.
     """
     deviation = np.where(completed.inlier, completed.deviation, np.float32(UNKNOWN_DEVIATION))
     sigma = np.maximum(np.float32(TRACKER_SCALE) * deviation, np.float32(BEST_DEVIATION))

@@ -1,9 +1,10 @@
 """Which keyframes to match a keyframe with, and over which depths."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from geogs.depth.depth_view import DepthView, ViewPose
 from geogs.geometry.camera import Camera
@@ -18,25 +19,88 @@ MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 1.0, 25.0
 """Least and largest usable angle."""
 MAX_VIEW_ANGLE_DEG = 35.0
 """Largest angle between viewing directions."""
+MIN_OVERLAP = 0.3
+"""Least part of what a keyframe sees that another has to see as well."""
+USUAL_ZOOM = 1.5
+"""Ratio of the distances from two keyframes at which a surface looks less alike."""
 MAX_BASELINE_COSINE = 0.97
 """Baselines closer to parallel than this are left to others where there is choice."""
+_RASTER = 9
+"""Points along either side of an image by which pairs are judged."""
 RANGE_MARGIN = 1.3
 """Factor by which searched depths go beyond those that are known, which are not all."""
 RANGE_DEVIATION = 0.1
 """Relative deviation below which the tracker's depth counts for the range."""
 
 
-def parallax_degrees(
-    reference: ViewPose, others: Sequence[ViewPose], depth: float
-) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Angles between the two rays to the point ``depth`` ahead, and between the two directions."""
-    poses = np.stack([v.T_cw for v in others])
-    centers = -(np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:])[:, :, 0]
-    ray = depth * reference.forward
-    return (
-        _angles(ray, reference.center + ray - centers),
-        _angles(reference.forward, poses[:, 2, :3]),
-    )
+@dataclass(frozen=True, eq=False)
+class ViewPairs:
+    """How others see what one keyframe sees: a raster of points at its typical depth.
+
+    All over the image, since a camera that moves straight on sees no parallax ahead.
+    """
+
+    parallax: Float64[np.ndarray, "n"]
+    """Degrees between the two rays to a point, median of what both see; 0 if that is nothing."""
+    rotation: Float64[np.ndarray, "n"]
+    """Degrees between the viewing directions."""
+    overlap: Float64[np.ndarray, "n"]
+    """Part of the points that the other sees."""
+    zoom: Float64[np.ndarray, "n"]
+    """Ratio, at least 1, of the distances to a point, median of those that both see."""
+
+    def usable(
+        self, least: float, most: float, max_rotation: float = MAX_VIEW_ANGLE_DEG
+    ) -> Bool[np.ndarray, "n"]:
+        """Pairs of enough overlap, and of a parallax and a rotation (degrees) within bounds."""
+        in_range = (self.parallax > least) & (self.parallax < most)
+        return in_range & (self.rotation < max_rotation) & (self.overlap >= MIN_OVERLAP)
+
+    def misfit(self, best: float) -> Float64[np.ndarray, "n"]:
+        """How far pairs are from ``best`` degrees of parallax (log scale) and from looks alike."""
+        parallax = np.abs(np.log(np.maximum(self.parallax, 0.05) / best))
+        zoom = (np.log(self.zoom) / np.log(USUAL_ZOOM)) ** 2
+        unseen = -np.log(np.maximum(self.overlap, 0.5 / _RASTER**2))
+        return np.asarray(parallax + (self.rotation / 20.0) ** 2 + zoom + unseen)
+
+
+def view_pairs(
+    reference: ViewPose, others: Sequence[ViewPose], depth: float, camera: Camera
+) -> ViewPairs:
+    """The pairs of a keyframe with others, all of one ``camera``, for surfaces at a depth."""
+    steps = (np.arange(_RASTER) + 0.5) / _RASTER
+    u, v = np.meshgrid(steps * camera.width - 0.5, steps * camera.height - 0.5)
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    points = depth * np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    poses = np.stack([other.T_cw for other in others])
+    relative = poses @ np.linalg.inv(reference.T_cw)
+    rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
+    there = points @ np.swapaxes(rotation, 1, 2) + translation[:, None]
+    z = np.maximum(there[..., 2], 1e-9)
+    column = camera.fx * there[..., 0] / z + camera.cx
+    row = camera.fy * there[..., 1] / z + camera.cy
+    seen = (there[..., 2] > 0) & (np.abs(2 * column / (camera.width - 1) - 1) <= 1)
+    seen &= np.abs(2 * row / (camera.height - 1) - 1) <= 1
+    own, theirs = np.linalg.norm(points, axis=-1), np.linalg.norm(there, axis=-1)
+    cosine = (points @ np.swapaxes(rotation, 1, 2) * there).sum(-1) / (own * theirs + 1e-12)
+    parallax = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    zoom = np.abs(np.log(np.maximum(theirs, 1e-12) / own))
+    return ViewPairs(
+        _median(parallax, seen), _angles(reference.forward, poses[:, 2, :3]),
+        seen.mean(1), np.exp(_median(zoom, seen)),
+    )  # fmt: skip
+
+
+def _median(
+    values: Float64[np.ndarray, "n m"], known: Bool[np.ndarray, "n m"]
+) -> Float64[np.ndarray, "n"]:
+    """The upper median of the known values of each row; 0 where there is none."""
+    ordered = np.sort(np.where(known, values, np.inf), axis=1)
+    count = known.sum(1)
+    middle = np.take_along_axis(ordered, np.minimum(count // 2, known.shape[1] - 1)[:, None], 1)[
+        :, 0
+    ]
+    return np.where(count > 0, middle, 0.0)
 
 
 def _angles(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
@@ -44,30 +108,27 @@ def _angles(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "n 3"]) -> Float
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def misfit(
-    parallax: Float64[np.ndarray, "n"], rotation: Float64[np.ndarray, "n"], best: float
-) -> Float64[np.ndarray, "n"]:
-    """How far pairs are from ``best`` degrees of parallax (log scale) and from looking alike."""
-    return np.abs(np.log(np.maximum(parallax, 0.05) / best)) + (rotation / 20.0) ** 2
-
-
 def select_sweep_neighbours(
-    reference: ViewPose, candidates: Sequence[ViewPose], depth: float, most: int = NEIGHBOURS
+    reference: ViewPose,
+    candidates: Sequence[ViewPose],
+    depth: float,
+    camera: Camera,
+    most: int = NEIGHBOURS,
 ) -> list[int]:
-    """Indices of the at most ``most`` best candidates, best first.
+    """Indices of the at most ``most`` best candidates, best first; all views are of ``camera``.
 
-    Good is a parallax near ``BEST_PARALLAX_DEG`` at ``depth`` (on a log scale) and a similar
-    viewing direction. Where there is choice, baselines point different ways, so that edges of any
-    orientation can be matched. Too small or too large a parallax, or looking more than 35 degrees
-    aside, excludes; if nobody is left, the two nearest to good are taken.
+    Good is a parallax near ``BEST_PARALLAX_DEG`` at ``depth`` (on a log scale), a similar viewing
+    direction and distance, and to see much of the same. Where there is choice, baselines point
+    different ways, so that edges of any orientation can be matched. Too small or too large a
+    parallax, too little overlap, or looking more than 35 degrees aside, excludes; if nobody is
+    left, the two nearest to good are taken.
     """
     others = np.array([i for i, v in enumerate(candidates) if v.id != reference.id], int)
     if len(others) == 0:
         return []
-    parallax, rotation = parallax_degrees(reference, [candidates[i] for i in others], depth)
-    usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
-    usable &= rotation < MAX_VIEW_ANGLE_DEG
-    order = np.lexsort((misfit(parallax, rotation, BEST_PARALLAX_DEG), ~usable))
+    pairs = view_pairs(reference, [candidates[i] for i in others], depth, camera)
+    usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG)
+    order = np.lexsort((pairs.misfit(BEST_PARALLAX_DEG), ~usable))
     ranked: list[int] = others[order].tolist()
     count = int(usable.sum())
     if count == 0:

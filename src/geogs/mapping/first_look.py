@@ -17,10 +17,9 @@ from geogs.depth.depth_view import DepthView, ViewPose
 from geogs.depth.plane_sweep import SweepResult, plane_sweep
 from geogs.depth.sweep_neighbors import (
     MAX_PARALLAX_DEG,
-    MAX_VIEW_ANGLE_DEG,
     MIN_PARALLAX_DEG,
-    parallax_degrees,
     select_sweep_neighbours,
+    view_pairs,
 )
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -196,13 +195,12 @@ class _FirstLook:
         others = [p for p in self._places if p.id != reference.id]
         if not others:
             return []
-        parallax, rotation = parallax_degrees(reference, others, distance)
-        usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
-        usable &= rotation < MAX_VIEW_ANGLE_DEG
+        pairs = view_pairs(reference, others, distance, self._camera)
+        usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG)
         others = [p for p, good in zip(others, usable, strict=True) if good]
         if len(others) < min(2, len(self._places) - 1):
             return []
-        chosen = select_sweep_neighbours(reference, others, distance, _NEIGHBOURS)
+        chosen = select_sweep_neighbours(reference, others, distance, self._camera, _NEIGHBOURS)
         return [others[i].id for i in chosen]
 
 

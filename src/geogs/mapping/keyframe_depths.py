@@ -92,8 +92,8 @@ class KeyframeDepths:
 
     def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
         """The other views from which a depth is best seen, best first."""
-        places = [v.place for v in others]
-        chosen = select_sweep_neighbours(view.place, places, depth)
+        places, camera = [v.place for v in others], self.views.arrays.cameras.render
+        chosen = select_sweep_neighbours(view.place, places, depth, camera)
         return [others[i] for i in chosen]
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from geogs.config import PhotoConfig
-from geogs.depth.sweep_neighbors import misfit, parallax_degrees
+from geogs.depth.sweep_neighbors import view_pairs
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
@@ -67,11 +67,10 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
     others = [o for o in others if o.id != view.id]
     if not others:
         return []
-    places = [o.place for o in others]
-    parallax, rotation = parallax_degrees(view.place, places, view.typical_depth)
-    usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
-    usable &= rotation < config.max_view_angle
-    scores = misfit(parallax, rotation, BEST_PARALLAX_DEG)
+    places, camera = [o.place for o in others], view.arrays.cameras.render
+    pairs = view_pairs(view.place, places, view.typical_depth, camera)
+    usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG, config.max_view_angle)
+    scores = pairs.misfit(BEST_PARALLAX_DEG)
     scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
     return [i for _, i in scored[: config.candidates]]
 

@@ -301,13 +301,14 @@ __device__ void write_evidence(
     const double amount = known ? (double)grids[g.cells + c] : 0.;
     const float deviation = (float)(1. / (u.data[i] * sqrt(amount) + 1e-3));
     const float unsure = deviation / s.sure_deviation;
-    out[g.cells + c] = inlier ? 1.f / (1.f + unsure * unsure) : 0.f;
     const float sigma =
         fmaxf(s.tracker_scale * (inlier ? deviation : s.unknown_deviation), s.best_deviation);
     const float bend = fmaxf(bend_at(out, c, i % g.minors, g.minors, g.minor_stride),
                              bend_at(out, c, i / g.minors, g.majors, g.major_stride));
     const float kinked = bend / (s.kink * out[c]);
-    out[2 * g.cells + c] = __expf(-2.f * kinked * kinked) / (sigma * sigma);
+    const float flat = __expf(-kinked * kinked);
+    out[g.cells + c] = inlier ? flat / (1.f + unsure * unsure) : 0.f;
+    out[2 * g.cells + c] = flat * flat / (sigma * sigma);
   }
 }
 
