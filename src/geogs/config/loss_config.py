@@ -27,7 +27,7 @@ class LossConfig(Settings, group="mapping.loss"):
 
     depth_weight: Weight = 0.15
     """L_d, rendered depth against the keyframe's depth."""
-    edge_factor: Weight = 5.0
+    edge_factor: Weight = 10.0
     """How much more L_d weighs near jumps of the keyframe's depth, where disks end."""
     edge_reach: CountOrZero = 3
     """Pixels of the render around such a jump that are near it."""

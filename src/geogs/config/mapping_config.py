@@ -31,6 +31,9 @@ class DiskConfig(Settings, group="mapping.disk"):
 
     stride: Annotated[int, Range(1, 100)] = 3
     """A candidate every stride-th pixel of the render."""
+    edge_stride: Annotated[int, Range(1, 100)] = 2
+    """The same near jumps of the keyframe's depth, if that is less: disks there are as much smaller
+    and hardly overhang the edge."""
     insert_confidence: Fraction = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
     fill_confidence: Fraction = 0.1

@@ -26,6 +26,7 @@ def paper_losses() -> LossConfig:
     """All terms as printed, none weighted by confidence, made robust or added."""
     return LossConfig(
         depth_weight=1.0,
+        edge_factor=1.0,
         normal_weight=0.05,
         normal_consistency_weight=0.05,
         distortion_weight=0.05,
@@ -51,6 +52,7 @@ def paper_disks() -> DiskConfig:
     """Local planes with the paper's shrink factor; scales as they come; no votes on free space."""
     return DiskConfig(
         stride=8,
+        edge_stride=8,
         insert_confidence=0.5,
         fill_confidence=0.5,
         scale_factor=1.0,

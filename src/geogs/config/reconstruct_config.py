@@ -82,7 +82,7 @@ def reconstruct_preset(name: Preset) -> ReconstructConfig:
             mapping=replace(base.mapping, render_long_edge=256),
         )
     if name in ("accurate", "paper"):
-        disk = replace(base.mapping.disk, stride=5)
+        disk = replace(base.mapping.disk, stride=5, edge_stride=3)
         mapping = replace(base.mapping, render_long_edge=800, photo_scale=1.0, disk=disk)
         return replace(
             base,

@@ -50,7 +50,7 @@ def preset(name: Preset, on_gpu: bool = False) -> Config:
     """
     base = Config()
     if name == "accurate" or (name == "default" and on_gpu):
-        disk = replace(base.mapping.disk, stride=6)
+        disk = replace(base.mapping.disk, stride=6, edge_stride=3)
         mapping = replace(base.mapping, render_long_edge=640, disk=disk)
         base = replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
     if name == "fast":

@@ -7,9 +7,10 @@ import torch
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
+from geogs.mapping.view_arrays import sure_jumps
 from geogs.splat.density import (
-    candidate_pixels,
     split,
+    spread_candidates,
     unexplained,
     worth_keeping,
     worth_splitting,
@@ -52,15 +53,15 @@ class DiskGrowth:
     @torch.no_grad()
     def insert(self, view: MapView, min_confidence: float) -> None:
         """Disks where the map does not explain a view's depth, by local planes."""
-        config, disks, random = self.config.disk, self.table.disks, self.table.random.of_torch
+        config, disks = self.config.disk, self.table.disks
         camera = self.depths.views.arrays.cameras.render
         depth, confidence = view.dense.depth, view.dense.confidence
         output = render(disks, camera, view.T_cw)
         needed = unexplained(output, depth, confidence) & (confidence >= min_confidence)
-        v, u = candidate_pixels(camera.height, camera.width, config.stride, random)
-        v, u = v.to(depth.device), u.to(depth.device)
-        chosen = needed[v, u]
-        v, u = v[chosen], u[chosen]
+        v, u, spacing = spread_candidates(
+            needed, sure_jumps(view.dense).around(config.stride), config.stride,
+            config.edge_stride, self.table.random.of_torch,
+        )  # fmt: skip
         z = depth[v, u]
         T_wc = view.T_wc.float().to(depth.device)
         rays = camera.rays(device=depth.device)[v, u]
@@ -68,14 +69,14 @@ class DiskGrowth:
         if config.carve:
             others = [other for other in self.voters(view) if other.id != view.id]
             kept = self.depths.keep(points, others)
-            points, z = points[kept], z[kept]
+            points, z, spacing = points[kept], z[kept], spacing[kept]
         if len(points) + len(disks) < NEIGHBOURS or len(points) == 0:
             return
-        footprint = config.stride * z / camera.fx
+        footprint = spacing * z / camera.fx
         existing = disks.position.detach()
         new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config)
         if self.config.ablation.initialisation == "random":
-            new = turned_at_random(new, random)
+            new = turned_at_random(new, self.table.random.of_torch)
         disks.append(new, view.id)
 
     def split(self, optimizer: MapOptimizer, unit: float) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from geogs.config import LossConfig, MappingConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
-from geogs.geometry.jumps import depth_jumps
+from geogs.geometry.jumps import DepthJumps, depth_jumps
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
 from geogs.mapping.dense_depths import get_depth, put_depth
@@ -237,13 +237,17 @@ class ViewArrays:
         """Depth, its weight in L_d, and normals: a prior's, else those that came with the depth."""
         is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
         weight = depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
-        sure = torch.where(depth.confidence >= SURE, depth.depth, 0.0)
-        at_edges = depth_jumps(sure).around(self.loss.edge_reach)
+        at_edges = sure_jumps(depth).around(self.loss.edge_reach)
         return (
             depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE),
             torch.where(at_edges, self.loss.edge_factor * weight, weight),
             depth.normal if loaded.normal is None else loaded.normal,
         )
+
+
+def sure_jumps(depth: DenseDepth) -> DepthJumps:
+    """Jumps between depths that are known fairly well."""
+    return depth_jumps(torch.where(depth.confidence >= SURE, depth.depth, 0.0))
 
 
 def _shrunk_normal(

@@ -35,6 +35,31 @@ def candidate_pixels(
     return v.flatten(), u.flatten()
 
 
+def spread_candidates(
+    needed: Bool[Tensor, "h w"],
+    at_edge: Bool[Tensor, "h w"],
+    stride: int,
+    edge_stride: int,
+    generator: torch.Generator,
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Rows and columns of some needed pixels, and how many pixels these are apart.
+
+    That is ``stride``, at the edges of things ``edge_stride`` if that is less: a disk is about as
+    large as its distance to others, and a large one overhangs the edge.
+    """
+    found = []
+    height, width = needed.shape
+    for step, there in (
+        (stride, needed & ~at_edge), (min(stride, edge_stride), needed & at_edge),
+    ):  # fmt: skip
+        v, u = (x.to(needed.device) for x in candidate_pixels(height, width, step, generator))
+        chosen = there[v, u]
+        v, u = v[chosen], u[chosen]
+        found.append((v, u, torch.full_like(v, step)))
+    v, u, spacing = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return v, u, spacing
+
+
 def unexplained(
     render: RenderOutput,
     depth: Float[Tensor, "h w"],
