@@ -133,7 +133,8 @@ def measured_run(
     with meter("shutter"):
         stream = with_shutter_found(stream)
     with meter("making the system"):
-        slam = Slam(stream.camera, config, device, mask=stream.mask)
+        at_end = config.mapping.when != "online"  # as a run from files has it
+        slam = Slam(stream.camera, config, device, mask=stream.mask, defers_map=at_end)
     slam.stopwatch = meter
     frames = iter(stream)
     while True:

@@ -1,9 +1,10 @@
 """Loops: pairs of keyframes far apart in time that show one place."""
 
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import islice, takewhile
+from itertools import islice
 
 import numpy as np
 import torch
@@ -156,10 +157,21 @@ class LoopDetector:
     def _found_near(self, id: int) -> list[Pair]:
         """Pairs of the loops found whose later keyframe is so near to one that they can rule out
         others of it; loops are found in the order of their later keyframes."""
-        least = self._order[id] - SUPPRESSION
-        found = reversed(self.table.loops)
-        recent = takewhile(lambda loop: self._order[loop.second] >= least, found)
-        return [(loop.first, loop.second) for loop in recent]
+        rank, loops = self._order[id], self.table.loops
+        first = bisect_left(loops, rank - SUPPRESSION, key=self._later_rank)
+        last = bisect_right(loops, rank + SUPPRESSION, key=self._later_rank)
+        return [(loop.first, loop.second) for loop in loops[first:last]]
+
+    def _later_rank(self, loop: Loop) -> int:
+        return self._order[loop.second]
+
+    def _is_implied(self, id: int, found: Sequence[Loop], settled: Sequence[Pair]) -> bool:
+        """Whether a place was joined before with one that a loop of the same keyframe has found."""
+        for loop in found:
+            pair = min(id, loop.first), max(id, loop.first)
+            if self._search.is_suppressed(pair, self._found_near(pair[1]), settled):
+                return True
+        return False
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
@@ -188,6 +200,8 @@ class LoopDetector:
             pair = view.candidate.first, view.candidate.second
             found_near = self._found_near(view.candidate.second)
             if self._search.is_suppressed(pair, found_near, settled):
+                continue
+            if self._is_implied(pair[0], found, settled):
                 continue
             loop = self._verify(view)
             if loop is None:
