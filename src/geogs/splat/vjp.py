@@ -33,7 +33,8 @@ class PullBack:
     """Takes gradients with respect to the maps of a rendering back to disks and pose.
 
     It is linear, and may be called again. What the rendering left for it is kept as long as it is;
-    disks and pose must not be changed in place before the last call.
+    disks and pose must not be changed in place before the last call. On a GPU it is called in the
+    stream of the rendering.
     """
 
     _backward: Callable[[_Gradients], RenderGradients]

@@ -114,11 +114,9 @@ class FrameLocator:
         ``T_second`` is about where the second is in the world of the first, ``T_first`` the other
         way round; the two may differ in scale. Neither was expected.
         """
-        fields = grid_fields(self.grid)
-        forward, _ = fields.reproject([first], [T_second])
-        backward, _ = fields.reproject([second], [T_first])
+        expected, _ = grid_fields(self.grid).reproject([first, second], [T_second, T_first])
         there, back = self.operator.measure(
-            [first.encoded], [second.encoded], forward, backward, fine=False
+            [first.encoded], [second.encoded], expected[:1], expected[1:], fine=False
         )
         return (
             self.fit(first, second.encoded, T_second, there, is_expected=False),
