@@ -32,7 +32,7 @@ from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
-from geogs.splat.cuda import autograd
+from geogs.splat.cuda import passes
 from geogs.splat.cuda.autograd import RasterizeOnGpu
 from geogs.splat.init import initialise_disks
 from geogs.splat.render import NEAR, RenderOutput
@@ -268,7 +268,7 @@ def parts_of(kernels: dict[str, float]) -> dict[str, float]:
 
 def started(make: Callable[[], Contestant]) -> tuple[Contestant, float]:
     """A contestant after two steps and the most memory of its tensors meanwhile, in MiB."""
-    autograd._pool.cache_clear()  # no buffers of earlier renderings
+    passes._pool.cache_clear()  # no buffers of earlier renderings
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
     contestant = make()

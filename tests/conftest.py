@@ -105,7 +105,8 @@ def _write_room(folder: Path, width: int, height: int) -> None:
 @pytest.fixture
 def no_report(monkeypatch) -> None:
     """Results come without the pictures of the report, which take longer than a small run."""
-    monkeypatch.setattr("geogs.application.results.write.write_report", lambda *_: None)
+    for part in ("write_page", "write_pictures"):
+        monkeypatch.setattr(f"geogs.application.results.write.{part}", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

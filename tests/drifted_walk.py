@@ -74,6 +74,6 @@ def closer_of(tracker: Tracker, loop: Loop, config: LoopConfig, waits: bool = Tr
     segments.main.map.graph.retire = lambda keep, least: {}
     closer = LoopCloser(segments, config, waits)
     closer.table.loops.append(loop)
-    closer.detector = SimpleNamespace(update=lambda ids, is_last: ())
+    closer.detector = SimpleNamespace(update=lambda ids, is_last, settled: ())
     closer._take(loop)
     return closer

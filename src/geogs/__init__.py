@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from geogs.pose_estimate import PoseEstimate
     from geogs.slam import Slam
     from geogs.splat.render import render
+    from geogs.splat.vjp import render_vjp
     from geogs.types import Frame
     from geogs.world.disks import GaussianMap
 
@@ -39,6 +40,7 @@ __all__ = [
     "open_source",
     "reconstruct",
     "render",
+    "render_vjp",
     "run",
     "save_slam",
     "slam_mesh",
@@ -60,6 +62,7 @@ _HOMES = {
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
+    "render_vjp": "geogs.splat.vjp",
     "run": "geogs.application.run_in_python",
     "save_slam": "geogs.application.slam_in_python",
     "slam_mesh": "geogs.application.slam_in_python",

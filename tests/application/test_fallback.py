@@ -92,7 +92,8 @@ def video(tmp_path, monkeypatch):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
     monkeypatch.setattr(offline, "reconstruct_preset", lambda _: SMALL)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: True)
-    monkeypatch.setattr("geogs.application.results.write.write_report", lambda *_: None)
+    for part in ("write_page", "write_pictures"):
+        monkeypatch.setattr(f"geogs.application.results.write.{part}", lambda *_: None)
     return tmp_path / "video", room.camera, room.T_wc
 
 

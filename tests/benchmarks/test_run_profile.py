@@ -1,5 +1,6 @@
 """The stages of a profiled run."""
 
+import threading
 import time
 
 import pytest
@@ -33,3 +34,17 @@ def test_a_stage_within_another_is_taken_out_of_it(profiles):
     if profiles:
         print_functions(meter, 3, said.append)
         assert sum("busy" in line for line in said) == 2
+
+
+def test_what_is_done_aside_belongs_to_no_stage():
+    meter = StageMeter(False)
+
+    def aside() -> None:
+        with meter.aside(), meter("rendering"):
+            pass
+
+    with meter("mesh"):
+        thread = threading.Thread(target=aside)
+        thread.start()
+        thread.join()
+    assert set(meter.seconds) == {"mesh"}

@@ -23,6 +23,7 @@ from geogs.loop.constraints import (
     JOIN_TOLERANCE,
     between_positions,
     closing_matches,
+    differences,
     disagreement,
     joined,
     of_edges,
@@ -33,10 +34,12 @@ from geogs.loop.constraints import (
     thinned,
 )
 from geogs.loop.detect import LoopDetector
+from geogs.loop.settled import settled_pairs
 from geogs.tracking.locate.frame_locator import Recognition
 from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection
+from geogs.world.edges import Pair
 from geogs.world.loops import Loop, LoopTable, RelativePoses, SegmentConstraints
 
 MOST_LOOPS = 200
@@ -106,7 +109,8 @@ class LoopCloser:
         fresh = [*result.finalized, *result.finalized_elsewhere]
         if fresh:
             self._retire(self.segments.tracker_of(fresh[0]), RETIRED_TOGETHER)
-        for loop in self.detector.update(fresh, is_last):
+        settled = self._settled(fresh) if fresh or is_last else []
+        for loop in self.detector.update(fresh, is_last, settled):
             self._take(loop)
         # Between keyframes nothing changes that could let segments meet.
         became_final = self._join() if fresh or is_last else ()
@@ -131,6 +135,14 @@ class LoopCloser:
             joined([held, of_edges(world.keyframes, edges)])
         )
         self._retire(world)
+
+    def _settled(self, fresh: Sequence[int]) -> list[Pair]:
+        """Pairs near which keyframes that became final are not looked up again."""
+        tracker = self.segments.tracker_of(fresh[0]) if fresh else self.segments.main
+        known, edges = self._of(tracker), tracker.map.graph.edges
+        relative = joined([known.odometry, known.loops])
+        min_gap, min_change = self.config.min_gap, self.config.min_change
+        return settled_pairs(tracker.keyframes, relative, edges, min_gap, min_change)
 
     def _of(self, tracker: Tracker) -> SegmentConstraints:
         """What is kept of the relative poses of a segment."""
@@ -158,9 +170,11 @@ class LoopCloser:
         known, constraint = self._of(first), self._constraint(loop)
         known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
         ends = sorted({loop.first, loop.second})
-        poses = first.keyframes.poses(ends)
-        errors = squared_errors(poses, between_positions(constraint, ends))
-        known.pending += bool((errors > self.config.residual).any())
+        poses, placed = first.keyframes.poses(ends), between_positions(constraint, ends)
+        depth = 1 / first.keyframes.inverse_depths(ends).median(1).values.cpu().double()
+        differs = differences(poses, placed, depth) >= self.config.min_change
+        errors = squared_errors(poses, placed)
+        known.pending += bool((differs & (errors > self.config.residual)).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
         return of_loop(self.segments.main.keyframes.table, loop)

@@ -173,6 +173,15 @@ def squared_errors(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Flo
     return (relative.information * error.square()).sum(-1)
 
 
+def differences(
+    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, depth: Float[Tensor, "n"]
+) -> Float[Tensor, "e"]:
+    """How far relative poses between places lie from given poses, as :func:`disagreement` has it
+    in the frames of their targets, whose median depth is ``depth``."""
+    now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
+    return disagreement(relative.G, now, depth[relative.target])
+
+
 def disagreement(
     S: Float[Tensor, "*b 4 4"], other: Float[Tensor, "*b 4 4"], depth: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b"]:

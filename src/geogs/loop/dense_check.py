@@ -62,16 +62,18 @@ def dense_check(
 ) -> DenseCheck:
     """Measure the flow between two keyframes from their supposed relative pose, and judge it.
 
-    Both directions are located on their own, each on the depth of its source; their poses must
-    turn alike, both views' depth must agree up to one scale where they match, where they do not
-    match neither may see through what the other shows, and the images must agree at the poses.
+    Both directions are measured together and located on their own, each on the depth of its
+    source; their poses must turn alike, both views' depth must agree up to one scale where they
+    match, where they do not match neither may see through what the other shows, and the images must
+    agree at the poses.
     ``T_ji`` is in the first's lengths, ``scale`` as in :class:`DenseCheck`.
     """
     limit = MAX_RESIDUAL * max(grid.camera.width, grid.camera.height)
     locator = FrameLocator(grid, operator, 0.0, limit, min_ncc=-1.0)
     T_ji = T_ji.to(first.T_cw)
-    there = locator.locate(first, second.encoded, T_ji @ first.T_cw)
-    back = locator.locate(second, first.encoded, se3_inverse(scaled(T_ji, scale)) @ second.T_cw)
+    T_second = T_ji @ first.T_cw
+    T_first = se3_inverse(scaled(T_ji, scale)) @ second.T_cw
+    there, back = locator.locate_both_ways(first, second, T_second, T_first)
     if there is None or back is None:
         return DenseCheck(False, "the flow agrees with no pose")
     matched, residual = min(there.matched, back.matched), max(there.residual, back.residual)

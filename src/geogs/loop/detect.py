@@ -1,9 +1,10 @@
 """Loops: pairs of keyframes far apart in time that show one place."""
 
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import islice, takewhile
+from itertools import islice
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from geogs.loop.search import SUPPRESSION, Depths, PlaceRecognition, Query
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.proximity import frame_distances
 from geogs.tracking.locate.frame_locator import Recognition
+from geogs.world.edges import Pair
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import Loop, LoopTable, VerifiedCandidate
 
@@ -89,21 +91,25 @@ class LoopDetector:
         for search in self._pending:
             _finish(search)
 
-    def update(self, ids: Sequence[int], is_last: bool = False) -> tuple[Loop, ...]:
+    def update(
+        self, ids: Sequence[int], is_last: bool = False, settled: Sequence[Pair] = ()
+    ) -> tuple[Loop, ...]:
         """Take keyframes that became final, earliest first, and return loops that were found.
 
-        They are those of the keyframes ``lag`` earlier, and at the end of all.
+        They are those of the keyframes ``lag`` earlier, and at the end of all. None is looked for
+        near pairs of keyframes that are ``settled``.
         """
         found: list[Loop] = []
         for id in ids:
             self._enter(id)
-            self._pending.append(self._thread.submit(self._search.find, self._query(id)))
+            ranked = self._ranked(settled)
+            self._pending.append(self._thread.submit(self._search.find, self._query(id, ranked)))
             first = self._pending[0]
             is_there = self._waits or first is None or first.done()
             if len(self._pending) > LAG and is_there:
-                found += self._decide()
+                found += self._decide(ranked)
         while is_last and self._pending:
-            found += self._decide()
+            found += self._decide(self._ranked(settled))
         return tuple(found)
 
     def remember(self, ids: Sequence[int]) -> None:
@@ -127,11 +133,15 @@ class LoopDetector:
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
         return [facing[n] for n in order[distance < limit].tolist()]
 
-    def _query(self, id: int) -> Query:
+    def _query(self, id: int, settled: Sequence[Pair]) -> Query:
         near, by_pose = self._near(id), tuple(self.candidates(id))
         known = tuple(self._found_near(id))
         features = self._search.describe(self.keyframes[id].image)
-        return Query(id, features, near, by_pose, known, self._depths())
+        return Query(id, features, near, by_pose, known, tuple(settled), self._depths())
+
+    def _ranked(self, pairs: Sequence[Pair]) -> list[Pair]:
+        """Those of keyframes taken so far."""
+        return [p for p in pairs if p[0] in self._order and p[1] in self._order]
 
     def _enter(self, id: int) -> None:
         """Take a keyframe as the latest."""
@@ -144,13 +154,24 @@ class LoopDetector:
             self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
         self._ids[rank] = id
 
-    def _found_near(self, id: int) -> list[tuple[int, int]]:
+    def _found_near(self, id: int) -> list[Pair]:
         """Pairs of the loops found whose later keyframe is so near to one that they can rule out
         others of it; loops are found in the order of their later keyframes."""
-        least = self._order[id] - SUPPRESSION
-        found = reversed(self.table.loops)
-        recent = takewhile(lambda loop: self._order[loop.second] >= least, found)
-        return [(loop.first, loop.second) for loop in recent]
+        rank, loops = self._order[id], self.table.loops
+        first = bisect_left(loops, rank - SUPPRESSION, key=self._later_rank)
+        last = bisect_right(loops, rank + SUPPRESSION, key=self._later_rank)
+        return [(loop.first, loop.second) for loop in loops[first:last]]
+
+    def _later_rank(self, loop: Loop) -> int:
+        return self._order[loop.second]
+
+    def _is_implied(self, id: int, found: Sequence[Loop], settled: Sequence[Pair]) -> bool:
+        """Whether a place was joined before with one that a loop of the same keyframe has found."""
+        for loop in found:
+            pair = min(id, loop.first), max(id, loop.first)
+            if self._search.is_suppressed(pair, self._found_near(pair[1]), settled):
+                return True
+        return False
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
@@ -171,13 +192,16 @@ class LoopDetector:
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
         return list(islice((k for k in around.tolist() if k in store), MEASURED))
 
-    def _decide(self) -> list[Loop]:
+    def _decide(self, settled: Sequence[Pair]) -> list[Loop]:
         """The loops among the candidates of the keyframe whose turn it is."""
         _finish(self._pending.popleft())
         found: list[Loop] = []
         for view in self.table.found.pop(0):
             pair = view.candidate.first, view.candidate.second
-            if self._search.is_suppressed(pair, self._found_near(view.candidate.second)):
+            found_near = self._found_near(view.candidate.second)
+            if self._search.is_suppressed(pair, found_near, settled):
+                continue
+            if self._is_implied(pair[0], found, settled):
                 continue
             loop = self._verify(view)
             if loop is None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -11,9 +12,11 @@ from torch import Tensor
 from geogs.config import LoopConfig
 from geogs.loop.orb_features import orb_features
 from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.settled import REACH
 from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.threads import worker_count
 from geogs.tracking.locate.frame_locator import Recognition
+from geogs.world.edges import Pair
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import ImageFeatures, LoopCandidate, LoopTable, VerifiedCandidate
 
@@ -40,8 +43,10 @@ class Query:
     """Keyframes that cannot be its loops, for being of the same time."""
     by_pose: tuple[int, ...]
     """Keyframes that the poses say are seen again, nearest first."""
-    known: tuple[tuple[int, int], ...]
+    known: tuple[Pair, ...]
     """Loops found so far."""
+    settled: tuple[Pair, ...]
+    """Pairs near which nothing new can be said."""
     depths: Depths
 
 
@@ -100,12 +105,13 @@ class PlaceRecognition:
                 found.append(Recognition(id, view.T_ji))
         return found
 
-    def is_suppressed(self, pair: tuple[int, int], others: Sequence[tuple[int, int]]) -> bool:
-        """Whether a pair is too near to another to say anything new."""
+    def is_suppressed(self, pair: Pair, found: Sequence[Pair], settled: Sequence[Pair]) -> bool:
+        """Whether a pair is too near to one that was found, or is settled, to say anything new."""
+        near = chain(((p, SUPPRESSION) for p in found), ((p, REACH) for p in settled))
         a, b = (self._order[k] for k in pair)
         return any(
-            abs(a - self._order[first]) + abs(b - self._order[second]) <= SUPPRESSION
-            for first, second in others
+            abs(a - self._order[first]) + abs(b - self._order[second]) <= reach
+            for (first, second), reach in near
         )
 
     def _candidates(self, query: Query) -> list[LoopCandidate]:
@@ -120,11 +126,12 @@ class PlaceRecognition:
                 for k in by_appearance[n : n + 1]
             ]
             alternating += [LoopCandidate(k, id, "geometry") for k in by_pose[n : n + 1]]
-        kept: list[tuple[int, int]] = []
+        kept: list[Pair] = []
         chosen: list[LoopCandidate] = []
         for p in alternating:
-            if not self.is_suppressed((p.first, p.second), [*kept, *query.known]):
-                kept.append((p.first, p.second))
+            pair = p.first, p.second
+            if not self.is_suppressed(pair, [*kept, *query.known], query.settled):
+                kept.append(pair)
                 chosen.append(p)
         return chosen[:VERIFIED]
 

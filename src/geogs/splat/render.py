@@ -69,25 +69,35 @@ def render(
     ``reference`` works in the positions' dtype on any device, ``cpu`` in float32 on the CPU and
     ``cuda`` in float32 on the GPU that holds the disks; ``auto`` takes the fastest that can.
     """
-    if isinstance(disks, MapSnapshot):
-        disks = DiskParameters.of(disks)
-    T_cw = torch.as_tensor(T_cw)
-    parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
-    if backend == "auto":
-        position = parameters.position
-        fits = position.dtype == torch.float32 and position.device.type in ("cpu", "cuda")
-        backend = "reference" if not fits else "cuda" if position.is_cuda else "cpu"
+    parameters = parameters_of(disks)
+    T_cw, backend = torch.as_tensor(T_cw), chosen_backend(parameters, backend)
     if backend == "reference":
         return RenderOutput(*render_reference(parameters, camera, T_cw, near))
-    if any(p.dtype != torch.float32 for p in parameters):
-        raise ValueError(f"The {backend} backend renders float32 disks.")
     if backend == "cuda":
         from geogs.splat.cuda.autograd import RasterizeOnGpu
 
         return RenderOutput(*RasterizeOnGpu.apply(*parameters, T_cw, camera, near))
-    if any(p.device.type != "cpu" for p in parameters):
-        raise ValueError("The cpu backend renders disks on the CPU.")
     return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, worker_count()))
+
+
+def parameters_of(disks: GaussianMap | DiskParameters | MapSnapshot) -> DiskParameters:
+    """The numbers that are rendered."""
+    if isinstance(disks, MapSnapshot):
+        return DiskParameters.of(disks)
+    return disks.parameters if isinstance(disks, GaussianMap) else disks
+
+
+def chosen_backend(disks: DiskParameters, backend: Backend) -> Literal["reference", "cpu", "cuda"]:
+    """What renders the disks. Raises ValueError if that cannot be the one that was asked for."""
+    if backend == "auto":
+        position = disks.position
+        fits = position.dtype == torch.float32 and position.device.type in ("cpu", "cuda")
+        backend = "reference" if not fits else "cuda" if position.is_cuda else "cpu"
+    if backend != "reference" and any(p.dtype != torch.float32 for p in disks):
+        raise ValueError(f"The {backend} backend renders float32 disks.")
+    if backend == "cpu" and any(p.device.type != "cpu" for p in disks):
+        raise ValueError("The cpu backend renders disks on the CPU.")
+    return backend
 
 
 class _Rasterize(torch.autograd.Function):
@@ -105,14 +115,11 @@ class _Rasterize(torch.autograd.Function):
         near: float,
         threads: int,
     ) -> tuple[Tensor, ...]:
-        from geogs.splat.cpu.rasterize import rasterize_forward
+        from geogs.splat.cpu.passes import forward_pass
 
-        disks = (position, quaternion, log_scale, opacity_logit)
-        x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
-        arrays = x, q, scale, logit
-        pose = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy()
+        disks = DiskParameters(position, quaternion, log_scale, opacity_logit)
         with_trace = any(ctx.needs_input_grad)
-        maps, trace = rasterize_forward(arrays, camera, pose, near, threads, with_trace)
+        maps, trace = forward_pass(disks, camera, T_cw, near, threads, with_trace)
         tensors = tuple(torch.from_numpy(getattr(maps, f)) for f in maps.__slots__)
         if with_trace:
             # Saved, so that PyTorch notices if they are changed before the backward pass.
@@ -125,14 +132,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        from geogs.splat.cpu.rasterize import rasterize_backward
+        from geogs.splat.cpu.passes import backward_pass
 
         *_, T_cw = ctx.saved_tensors
-        depth, normal, alpha, distortion = (
-            g.to(torch.float32).contiguous().numpy() for g in gradients[:4]
-        )
-        result = rasterize_backward(ctx.trace, depth, normal, alpha, distortion, ctx.threads)
-        d_T = torch.zeros(4, 4, dtype=torch.float64)
-        d_T[:3] = torch.from_numpy(result.T_cw)
-        disks = (result.position, result.quaternion, result.log_scale, result.opacity_logit)
-        return *(torch.from_numpy(d) for d in disks), d_T.to(T_cw), None, None, None
+        disks, d_T = backward_pass(ctx.trace, gradients[:4], ctx.threads)
+        return *disks, d_T.to(T_cw), None, None, None

@@ -60,19 +60,48 @@ def write_report(
     Raises:
         OutputError: a file cannot be written.
     """
+    write_pictures(folder, trajectory, renders)
+    write_page(folder, trajectory, renders, mesh, summary, disks)
+
+
+def write_pictures(
+    folder: Path, trajectory: Trajectory, renders: Sequence[RenderedKeyframe]
+) -> None:
+    """Those of the page that need no mesh: the path, and renders beside images.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
     from geogs.evaluation.pages import run_pictures
-    from geogs.evaluation.pages.run_page import write_run_page
 
     run_pictures.draw_path(folder / "trajectory.png", trajectory)
-    if renders:
-        numbers = np.linspace(0, len(renders) - 1, min(5, len(renders))).round().astype(int)
-        shown = [renders[i] for i in numbers]
-        run_pictures.draw_keyframes(
-            folder / "keyframes.png",
-            [r.image for r in shown if r.image is not None],
-            [r.depth.cpu().numpy() for r in shown],
-            [r.normal.cpu().numpy() for r in shown],
-        )
+    if not renders:
+        return
+    numbers = np.linspace(0, len(renders) - 1, min(5, len(renders))).round().astype(int)
+    shown = [renders[i] for i in numbers]
+    run_pictures.draw_keyframes(
+        folder / "keyframes.png",
+        [r.image for r in shown if r.image is not None],
+        [r.depth.cpu().numpy() for r in shown],
+        [r.normal.cpu().numpy() for r in shown],
+    )
+
+
+def write_page(
+    folder: Path,
+    trajectory: Trajectory,
+    renders: Sequence[RenderedKeyframe],
+    mesh: Mesh | None,
+    summary: Mapping[str, object],
+    disks: MapSnapshot | None = None,
+) -> None:
+    """The page of a result whose pictures are in its folder.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from geogs.evaluation.pages.run_page import write_run_page
+
     model = None
     if renders:
         views, camera = _rendered_views(renders), renders[0].camera

@@ -9,7 +9,7 @@ from pathlib import Path
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.result import Result
-from geogs.application.results.result_page import write_report
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.summary import summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import Config, ReconstructConfig
@@ -45,7 +45,8 @@ def write_files(
     write_more: Callable[[], None] = lambda: None,
     keyframe_images: bool = True,
 ) -> None:
-    """Write poses first, then map and mesh beside each other, what else was asked for, the report.
+    """Write poses first, then map, pictures and mesh beside each other, what else was asked for,
+    and the page, which shows all of it.
 
     ``write_more`` writes the rest, which the summary then counts.
 
@@ -60,10 +61,11 @@ def write_files(
     as_it_came = () if isinstance(source, PosedSource) else (source.calibration, source.shutter)
     write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
-    disks = result.map
-    renders = result.renders if result.why_no_map is None else ()
-    with ThreadPoolExecutor(1, thread_name_prefix="map") as thread:
-        written = thread.submit(_write_map, output, result, renders, keyframe_images)
+    disks, shown = result.map, result.renders
+    renders = shown if result.why_no_map is None else ()
+    with ThreadPoolExecutor(2, thread_name_prefix="files") as threads:
+        written = threads.submit(_write_map, output, result, renders, keyframe_images)
+        drawn = threads.submit(_write_pictures, output, result, shown)
         if (mesh := result.mesh) is not None:
             with scene.stopwatch("mesh"):
                 write_mesh(
@@ -71,6 +73,7 @@ def write_files(
                 )
         with scene.stopwatch("keyframes"):
             written.result()
+            drawn.result()
     write_more()
     lost = result.trajectory.states.count("lost")
     if lost > 0.2 * scene.frames:
@@ -79,7 +82,7 @@ def write_files(
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     progress.stage("report", 0.0)
     with scene.stopwatch("report"):
-        write_report(output / "report", result.trajectory, result.renders, mesh, summary, disks)
+        write_page(output / "report", result.trajectory, shown, mesh, summary, disks)
     progress.stage("report", 1.0)
 
 
@@ -97,6 +100,13 @@ def _write_map(
         if len(disks):
             colours = splat_colours(disks, fusion_views(renders))
             write_splats(output / "splats.ply", disks, colours)
+
+
+@on_one_torch_thread
+def _write_pictures(output: Path, result: Result, shown: Sequence[RenderedKeyframe]) -> None:
+    """Those of the report, beside the mesh."""
+    with result.scene.stopwatch.aside():
+        write_pictures(output / "report", result.trajectory, shown)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:

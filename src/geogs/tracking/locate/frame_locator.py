@@ -100,6 +100,38 @@ class FrameLocator:
         match, _ = self.operator.measure(
             [keyframe.encoded], [encoded], forward, backward, fine=False
         )
+        return self.fit(keyframe, encoded, T_guess, match, is_expected)
+
+    def locate_both_ways(
+        self,
+        first: Keyframe,
+        second: Keyframe,
+        T_second: Float[Tensor, "4 4"],
+        T_first: Float[Tensor, "4 4"],
+    ) -> tuple[FrameMotion | None, FrameMotion | None]:
+        """The second on the first's depth, and the first on the second's, from one measurement.
+
+        ``T_second`` is about where the second is in the world of the first, ``T_first`` the other
+        way round; the two may differ in scale. Neither was expected.
+        """
+        expected, _ = grid_fields(self.grid).reproject([first, second], [T_second, T_first])
+        there, back = self.operator.measure(
+            [first.encoded], [second.encoded], expected[:1], expected[1:], fine=False
+        )
+        return (
+            self.fit(first, second.encoded, T_second, there, is_expected=False),
+            self.fit(second, first.encoded, T_first, back, is_expected=False),
+        )
+
+    def fit(
+        self,
+        keyframe: Keyframe,
+        encoded: Any,
+        T_guess: Float[Tensor, "4 4"],
+        match: FlowMatch,
+        is_expected: bool = True,
+    ) -> FrameMotion | None:
+        """As :meth:`locate`, by flow from the keyframe that has been measured."""
         T, T_ji, fit = motion_solver(self.grid).fit(
             T_guess,
             keyframe,

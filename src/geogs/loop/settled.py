@@ -1,0 +1,53 @@
+"""Places seen again of which a further look would say nothing new."""
+
+from collections.abc import Collection
+
+import torch
+
+from geogs.loop.constraints import between_positions, differences
+from geogs.world.edges import Pair
+from geogs.world.keyframes import KeyframeSet
+from geogs.world.loops import RelativePoses
+
+REACH = 8
+"""Keyframes, those of both ends together, within which of a settled pair others are settled, too:
+what can drift between them is a small part of what drifted between its ends."""
+RECENT = 64
+"""Latest keyframes among which the later ends are: more than any that is looked at."""
+
+
+def settled_pairs(
+    segment: KeyframeSet,
+    relative: RelativePoses,
+    edges: Collection[Pair],
+    min_gap: int,
+    min_change: float,
+) -> list[Pair]:
+    """Pairs of recent keyframes with older ones, earlier id first, whose motion is known.
+
+    By a loop whose relative poses, between ids, lie within ``min_change`` (radians, parts of the
+    median depth, or of the scale) of the present poses, so that no keyframe would be moved by more;
+    or by matches that tracking holds, or held, between keyframes ``min_gap`` or more apart, which
+    the present poses fit.
+    """
+    ids = segment.ids
+    if len(ids) <= min_gap:
+        return []
+    first_recent = ids[max(len(ids) - RECENT, 0)]
+    relative = relative.select(torch.maximum(relative.source, relative.target) >= first_recent)
+    places = between_positions(relative, ids)
+    relative = relative.select((places.source - places.target).abs() >= min_gap)
+    place = {k: n for n, k in enumerate(ids)}
+    held = {
+        (i, j) for i, j in edges if j >= first_recent and i < j and place[j] - place[i] >= min_gap
+    }
+    if not len(relative):
+        return sorted(held)
+    known = sorted({*relative.source.tolist(), *relative.target.tolist()})
+    at, T_cw = between_positions(relative, known), segment.poses(known)
+    depth = 1 / segment.inverse_depths(known).median(1).values.cpu().double()
+    differs = relative.is_loop & (differences(T_cw, at, depth) >= min_change)
+    ends = zip(relative.source.tolist(), relative.target.tolist(), strict=True)
+    pairs = [(min(e), max(e)) for e in ends]
+    open_ones = {p for p, d in zip(pairs, differs.tolist(), strict=True) if d}
+    return sorted(held | ({*pairs} - open_ones))
