@@ -12,19 +12,28 @@ POSES = 0.5
 """Fraction of the time that the poses may take; the map is made in the rest."""
 LEAST_MAP = 15.0
 """Seconds that the smallest map takes with mesh and files."""
-_A_PHOTOGRAPH, _A_PAIR, _TO_PLACE = 0.4, 0.13, 0.3
-"""Seconds to read a photograph, find its features and who shows the same, and to match a pair, on
-one core; and to place one, on any number. With all features."""
+_A_PHOTOGRAPH, _ALIKE, _A_PAIR, _TO_PLACE = 0.2, 0.2, 0.13, 0.3
+"""Seconds to read a photograph and find its features, and who shows the same, and to match a pair,
+on one core; and to place one, on any number. With all features."""
 _PAIRS = 20.0
 """That are matched for each photograph, where there are many."""
 
 
-def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
-    """About how long it takes to find the poses of so many photographs."""
-    part = features / MAX_FEATURES
+def stages_of_poses(count: int, features: int = MAX_FEATURES) -> dict[str, float]:
+    """About how many seconds each stage takes that finds the poses of so many photographs."""
+    part, cores = features / MAX_FEATURES, worker_count()
     pairs = min(0.5 * count * (count - 1), _PAIRS * count)
-    on_all_cores = _A_PHOTOGRAPH * count + _A_PAIR * part**2 * pairs
-    return on_all_cores / worker_count() + _TO_PLACE * part * count
+    return {
+        "features": _A_PHOTOGRAPH * count / cores,
+        "choosing pairs": _ALIKE * count / cores,
+        "matching": _A_PAIR * part**2 * pairs / cores,
+        "finding poses": _TO_PLACE * part * count,
+    }
+
+
+def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
+    """The same of all of them."""
+    return sum(stages_of_poses(count, features).values())
 
 
 def features_for(count: int, seconds: float | None) -> int:

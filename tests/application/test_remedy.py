@@ -13,6 +13,7 @@ from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.cli.run import parse
 from geogs.config import Config, InputConfig, preset
+from geogs.geometry.camera import Camera
 from geogs.io.sources.frame_source import Source
 
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
@@ -25,6 +26,7 @@ def source(is_live: bool = False, is_guess: bool = False) -> Source:
     made = type("Some", (Source,), names)
     one = made.__new__(made)
     one.length, one.fps, one.calibration = 150, 30.0, SimpleNamespace(is_guess=is_guess)
+    one.camera = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
     return one
 
 
