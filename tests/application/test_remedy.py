@@ -1,5 +1,6 @@
 """What a run that lost its camera ends with: one command, that can be typed as it stands."""
 
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +45,7 @@ def test_where_structure_from_motion_was_not_tried_it_is_named_with_its_time(pho
     photos(False)
     said = remedy(VIDEO, source(), LOST, 90.0)
     assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --offline ")
-    assert "in about 1 min" in said or "in about 2 min" in said or "in about 3 min" in said
+    assert re.search(r"in about [1-5] min", said)
     photos(True)
     said = remedy(replace(VIDEO, fallback=False), source(), LOST, 90.0)
     assert said.startswith("geogs run 'my video.mp4' --offline places")

@@ -82,7 +82,7 @@ class TrackedVideo:
         """The map after :meth:`locate` came to ``outcome``: where it was cut short or this is, one
         in little time."""
         slam, is_mapped = self.scene, False
-        if outcome is Outcome.FINISHED and slam.world.maps_at_end:
+        if outcome is Outcome.FINISHED and slam.world.maps_at_end and not driver.kernels.is_working:
             self._write_preview(driver)
         with _full_memory_said(driver):
             is_mapped = outcome is Outcome.FINISHED and driver.stop.lets_finish(

@@ -24,6 +24,8 @@ MOST = math.log(3.0)
 """Logarithm of the pace that a stage says at most: one may have had nothing to do."""
 LONGER = 0.3
 """Fraction of what was left at the last report that stays left, however long ago that was."""
+LEAST_LEFT = 0.5
+"""Seconds that are left until the end, where the time that was given is over."""
 LEAST_REST = 15.0
 """Seconds that the smallest map takes with mesh and files where poses have used up the time."""
 STEADY = 0.04
@@ -57,8 +59,9 @@ class Forecast:
         """Frames and keyframes before it began, when there were keyframes first, and by now."""
         self._found_at = self._said_at
         self._keyframes = FIRST_KEYFRAMES + KEYFRAMES_PER_FRAME * plan.frames
-        self._paces: list[tuple[float, float]] = []
-        """Seconds that each stage took, and takes on the reference."""
+        self._paces: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+        """Seconds that each stage took, and takes on the reference: of the others, and of those
+        that find poses, whose time depends on the pictures more than on the machine."""
         self._found = self._by_now()
 
     def change(self, plan: Plan) -> None:
@@ -111,7 +114,8 @@ class Forecast:
         if (stage := self._stage) is None:
             return now
         end = stage.reported if stage.part >= 1 else now
-        self._paces.append((end - stage.began, self._planned()[stage.name]))
+        took = end - stage.began, self._planned()[stage.name]
+        self._paces[stage.name not in self._plan.fixed].append(took)
         return end
 
     def _end_aside(self, now: float) -> None:
@@ -145,26 +149,25 @@ class Forecast:
         """Seconds left when something is reported, by all that has been."""
         stages, stage, now = self._planned(), self._stage, self._clock()
         names, until, own = list(stages), now if self._aside is None else self._aside.began, 0.0
-        place, paces = -1, list(self._paces)
+        place, paces = -1, {of_map: list(said) for of_map, said in self._paces.items()}
         if stage is not None:
             place, part = names.index(stage.name), self._part_of(stage, stages)
-            paces.append((until - stage.began, part * stages[stage.name]))
-            own = _left(pace_of(paces) * stages[stage.name], until - stage.began, part)
+            same = paces[stage.name not in self._plan.fixed]
+            same.append((until - stage.began, part * stages[stage.name]))
+            own = _left(pace_of(same) * stages[stage.name], until - stage.began, part)
         if self._aside is not None:
             own += _left(0.0, now - self._aside.began, self._aside.part)
-        pace, after = pace_of(paces), names[place + 1 :]
-        if self._plan.end is not None:
-            return self._until(self._plan.end - now, own, after, pace)
-        return own + pace * sum(stages[name] for name in after)
-
-    def _until(self, given: float, own: float, after: list[str], pace: float) -> float:
-        """Seconds left where so many are ``given``: more if a stage has not ended by then, or if
-        those that take their time leave none for the rest."""
-        stages, fixed = self._planned(), set(self._plan.fixed)
-        of_fixed = sum(stages[name] for name in fixed.intersection(after))
-        is_fixed = self._stage is not None and self._stage.name in fixed
-        least = LEAST_REST if of_fixed or is_fixed else 0.0
-        return max(given, own + pace * of_fixed + least)
+        seconds = {True: 0.0, False: 0.0}
+        for name in names[place + 1 :]:
+            seconds[name not in self._plan.fixed] += stages[name]
+        of_poses = pace_of(paces[False]) * seconds[False]
+        if self._plan.end is None:
+            return own + of_poses + pace_of(paces[True]) * seconds[True]
+        if stage is not None and stage.name in self._plan.fixed:
+            of_poses += own
+        # The map takes what the poses leave, but for the smallest one.
+        least = of_poses + LEAST_REST if of_poses else LEAST_LEFT
+        return max(self._plan.end - now, least)
 
     def _part_of(self, stage: _Stage, stages: dict[str, float]) -> float:
         """How much of it is done, by time; of the frames those with keyframes take most."""

@@ -31,11 +31,11 @@ def on_cpu(rendered: float) -> PosedCosts:
     """On a CPU, where maps have so many times the pixels of the reference."""
     return PosedCosts(
         first_look=2.0,
-        view=0.02,
-        searched_view=0.1 + 0.4 * rendered,
-        grown_view=0.1,
-        step=0.03 + 0.03 * rendered,
-        meshed_view=0.02 + 0.12 * rendered,
+        view=0.2,
+        searched_view=0.2 + 0.9 * rendered,
+        grown_view=0.03,
+        step=0.04 + 0.03 * rendered,
+        meshed_view=0.02 + 0.25 * rendered,
         mesh=1.0,
         report=0.6,
     )
