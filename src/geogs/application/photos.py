@@ -29,15 +29,13 @@ Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
 
 SECONDS_PER_FRAME = {
-    "features": 0.15,
-    "choosing pairs": 0.2,
-    "matching": 1.5,
-    "finding poses": 0.65,
-}
+    "features": 0.1, "choosing pairs": 0.13, "matching": 0.9, "finding poses": 0.25
+}  # fmt: skip
 """Of one core, by stage, to find where such a frame was taken: some 22 pairs of each are matched
-(50 frames of 512 pixels, and 90 of 320)."""
-SECONDS_PER_OTHER = 0.3
-"""Of one core, to place another frame against their points."""
+(50 frames of 512 pixels)."""
+SECONDS_PER_OTHER, SECONDS_TO_ADD = 0.3, 0.1
+"""Of one core, to place another frame against their points, and to take one that has been placed
+into the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,8 @@ def seconds_to_place(chosen: int, length: int) -> dict[str, float]:
     many are given to structure from motion."""
     cores = worker_count()
     found = {stage: chosen * seconds / cores for stage, seconds in SECONDS_PER_FRAME.items()}
-    return {**found, "placing frames": SECONDS_PER_OTHER * (length - chosen) / cores}
+    placing = SECONDS_PER_OTHER * (length - chosen) / cores + SECONDS_TO_ADD * chosen
+    return {**found, "placing frames": placing}
 
 
 def has_pycolmap() -> bool:

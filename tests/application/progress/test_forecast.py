@@ -1,8 +1,9 @@
 """The time that is left of a command, on what commands on two cores reported, and when.
 
 ``fixtures/time_left`` has them, as ``benchmarks/time_left.py`` keeps them: runs of 60 frames of a
-synthetic room and of 150 of a kitchen with the default, and of a phone that is held in the hand,
-moved slowly, and carried, with ``--preset fast``.
+synthetic room and of 150 of a phone (held in the hand, moved slowly, carried) with the default and
+with ``--preset fast``, photographs that are placed offline, and reconstructions with and without
+poses, most of them beside other programs.
 """
 
 import json

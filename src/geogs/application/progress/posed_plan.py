@@ -31,8 +31,8 @@ def on_cpu(rendered: float) -> PosedCosts:
     """On a CPU, where maps have so many times the pixels of the reference."""
     return PosedCosts(
         first_look=2.0,
-        view=0.2,
-        searched_view=0.2 + 0.9 * rendered,
+        view=0.01,
+        searched_view=0.1 + 1.3 * rendered,
         grown_view=0.03,
         step=0.04 + 0.03 * rendered,
         meshed_view=0.02 + 0.25 * rendered,
