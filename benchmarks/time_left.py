@@ -19,11 +19,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
 
-import numpy as np
-
 BEGUN = time.perf_counter()
+if __name__ == "__main__":
+    from geogs.cli.process import take_over
 
-from geogs.application.interrupt import Interruption  # noqa: E402  # the command's time counts all
+    take_over()  # as the command does, before NumPy is imported
+
+import numpy as np  # noqa: E402  # the command's time counts all
+
+from geogs.application.interrupt import Interruption  # noqa: E402
 from geogs.application.progress.forecast import Forecast  # noqa: E402
 from geogs.application.progress.plan import Plan  # noqa: E402
 from geogs.application.progress.posed_plan import PosedPlan  # noqa: E402
