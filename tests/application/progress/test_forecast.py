@@ -116,7 +116,7 @@ def test_what_is_given_is_what_is_left():
 def test_where_poses_take_all_that_is_given_more_is_said_at_once():
     now = [0.0]
     forecast = Forecast(budgeted(30.0), lambda: now[0])
-    assert forecast.left() == pytest.approx(40 + 15, abs=1)  # and the smallest map
+    assert forecast.left() == pytest.approx(40 + 17, abs=1)  # and the smallest map
     for second in range(41):
         now[0] = float(second)
         forecast.stage("features" if second < 5 else "matching", 0.0 if second < 5 else second / 50)

@@ -26,7 +26,7 @@ LONGER = 0.3
 """Fraction of what was left at the last report that stays left, however long ago that was."""
 LEAST_LEFT = 0.5
 """Seconds that are left until the end, where the time that was given is over."""
-LEAST_REST = 15.0
+LEAST_REST = 17.0
 """Seconds that the smallest map takes with mesh and files where poses have used up the time."""
 STEADY = 0.04
 """Fraction of the time left within which it follows what has changed."""
@@ -49,7 +49,8 @@ class Forecast:
 
     def __init__(self, plan: Plan, clock: Clock = time.perf_counter) -> None:
         self._plan, self._clock = plan, clock
-        self._said_at = clock()
+        self._said_at = self._rest_began = clock()
+        """The latter is when what finds poses had ended, if anything has to."""
         self._said = math.nan
         self._stage: _Stage | None = None
         """The last of those that were planned."""
@@ -69,7 +70,7 @@ class Forecast:
         now = self._clock()
         self._end_aside(now)
         self._end_stage(now)
-        self._plan, self._stage = plan, None
+        self._plan, self._stage, self._rest_began = plan, None, now
         self._found, self._found_at = self._by_now(), now
 
     def expect(self, begun: int) -> None:
@@ -114,6 +115,8 @@ class Forecast:
         if (stage := self._stage) is None:
             return now
         end = stage.reported if stage.part >= 1 else now
+        if stage.name in self._plan.fixed:
+            self._rest_began = end
         took = end - stage.began, self._planned()[stage.name]
         self._paces[stage.name not in self._plan.fixed].append(took)
         return end
@@ -163,11 +166,13 @@ class Forecast:
         of_poses = pace_of(paces[False]) * seconds[False]
         if self._plan.end is None:
             return own + of_poses + pace_of(paces[True]) * seconds[True]
-        if stage is not None and stage.name in self._plan.fixed:
+        rest = LEAST_REST
+        if stage is None or stage.name in self._plan.fixed:
             of_poses += own
+        else:
+            rest -= until - self._rest_began
         # The map takes what the poses leave, but for the smallest one.
-        least = of_poses + LEAST_REST if of_poses else LEAST_LEFT
-        return max(self._plan.end - now, least)
+        return max(self._plan.end - now, of_poses + max(rest, LEAST_LEFT))
 
     def _part_of(self, stage: _Stage, stages: dict[str, float]) -> float:
         """How much of it is done, by time; of the frames those with keyframes take most."""
