@@ -70,6 +70,22 @@ def write_record3d(folder: Path, poses: list[np.ndarray]) -> Path:
     return archived(folder)
 
 
+def write_record3d_export(folder: Path, poses: list[np.ndarray]) -> None:
+    """What Record3D exports as pictures, in its ``EXR_RGBD``; of the depth the name alone."""
+    inner = folder / "EXR_RGBD"
+    for k in range(len(poses)):
+        write_image(inner / f"rgb/{k}.jpg", gradient_image(k))
+        (inner / "depth").mkdir(exist_ok=True)
+        (inner / f"depth/{k}.exr").write_bytes(b"")
+    rows = [[*quaternion(T @ OPENGL), *T[:3, 3]] for T in poses]
+    facts = {
+        "w": 64, "h": 48, "fps": 60, "K": [50, 0, 0, 0, 51, 0, 31, 23, 1],
+        "frameTimestamps": [0.02 * k for k in range(len(poses))],
+        "poses": [[float(x) for x in row] for row in rows],
+    }  # fmt: skip
+    (inner / "metadata.json").write_text(json.dumps(facts))
+
+
 def archived(folder: Path) -> Path:
     """The archive of a folder of Record3D."""
     path = folder.with_suffix(".r3d")
@@ -80,14 +96,15 @@ def archived(folder: Path) -> Path:
     return path
 
 
-def write_polycam(folder: Path, poses: list[np.ndarray]) -> None:
-    """An export of Polycam's raw data."""
+def write_polycam(folder: Path, poses: list[np.ndarray], step: int = 250_000) -> None:
+    """An export of Polycam's raw data, so many microseconds from image to image."""
     for k, T in enumerate(poses):
-        write_image(folder / f"keyframes/images/{1000 + k}.jpg", gradient_image(k))
+        name = 1442008525605 + step * k
+        write_image(folder / f"keyframes/images/{name}.jpg", gradient_image(k))
         A = T @ OPENGL
         entry = {f"t_{i}{j}": float(A[i, j]) for i in range(3) for j in range(4)}
         entry |= {"fx": 50, "fy": 51, "cx": 31, "cy": 23, "width": 64, "height": 48}
-        path = folder / f"keyframes/cameras/{1000 + k}.json"
+        path = folder / f"keyframes/cameras/{name}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(entry))
 

@@ -10,21 +10,34 @@ FEATURES = (MAX_FEATURES, 2896, 2048, 1448, 1024)
 """Of a photograph, at most: from one to the next matching takes half as long."""
 POSES = 0.5
 """Fraction of the time that the poses may take; the map is made in the rest."""
-LEAST_MAP = 15.0
-"""Seconds that the smallest map takes with mesh and files."""
-_A_PHOTOGRAPH, _A_PAIR, _TO_PLACE = 0.4, 0.13, 0.3
-"""Seconds to read a photograph, find its features and who shows the same, and to match a pair, on
-one core; and to place one, on any number. With all features."""
+LEAST_MAP = 20.0
+"""Seconds that the smallest map takes, with loading, mesh and files."""
+_A_PHOTOGRAPH, _ALIKE = 0.12, 0.1
+"""Seconds of one core to read a photograph and find its features, and who shows the same."""
+_TO_VERIFY, _TO_MATCH = 0.025, 0.105
+"""Seconds of one core to see whether a pair shows the same, however many features there are, and to
+match all of its features, with their square."""
+_TO_START, _TO_PLACE = 0.06, 0.24
+"""Seconds to place a photograph, on any number of cores: in any case, and with all features."""
 _PAIRS = 20.0
 """That are matched for each photograph, where there are many."""
 
 
-def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
-    """About how long it takes to find the poses of so many photographs."""
-    part = features / MAX_FEATURES
+def stages_of_poses(count: int, features: int = MAX_FEATURES) -> dict[str, float]:
+    """About how many seconds each stage takes that finds the poses of so many photographs."""
+    part, cores = features / MAX_FEATURES, worker_count()
     pairs = min(0.5 * count * (count - 1), _PAIRS * count)
-    on_all_cores = _A_PHOTOGRAPH * count + _A_PAIR * part**2 * pairs
-    return on_all_cores / worker_count() + _TO_PLACE * part * count
+    return {
+        "features": _A_PHOTOGRAPH * count / cores,
+        "choosing pairs": _ALIKE * count / cores,
+        "matching": (_TO_VERIFY + _TO_MATCH * part**2) * pairs / cores,
+        "finding poses": (_TO_START + _TO_PLACE * part) * count,
+    }
+
+
+def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
+    """The same of all of them."""
+    return sum(stages_of_poses(count, features).values())
 
 
 def features_for(count: int, seconds: float | None) -> int:
@@ -46,9 +59,10 @@ def what_does_not_fit(count: int, seconds: float | None) -> str:
             f"note: For the --budget the poses are found from {features} features a photograph "
             f"instead of {MAX_FEATURES}, in about {duration(least)}."
         )
+    whole = least + LEAST_MAP
     return (
         f"warning: The --budget will not do: the poses of {count} photographs take about "
-        f"{duration(least)} here, and the smallest map {duration(LEAST_MAP)}. --budget "
-        f"{math.ceil((least + LEAST_MAP) / 10) * 10}s would do, or --input.stride 2, which takes "
-        "half of the photographs."
+        f"{duration(least)} here, and the smallest map {duration(LEAST_MAP)}, so that it takes "
+        f"about {duration(whole)}. --budget {math.ceil(whole / 10) * 10}s would do, or "
+        "--input.stride 2, which takes half of the photographs."
     )

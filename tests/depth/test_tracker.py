@@ -32,7 +32,7 @@ def slow_pixel(view, u: int, v: int) -> float | None:
 
 def test_every_pixel_is_the_mean_of_the_valid_cells_around_it():
     view = make_scene().views[0]
-    depth = enlarged_depth(view, WORKING, RENDER)
+    depth = enlarged_depth(view.inverse_depth, view.information, WORKING, RENDER)
     assert set(np.unique(depth.confidence)) == {0.0, 1.0}
     assert (depth.depth > 0).all()
     checked = 0

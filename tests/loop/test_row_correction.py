@@ -109,9 +109,9 @@ def error(T_cw: Tensor) -> float:
 def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch):
     tracker, bent = tracker_of_rows(as_read()), []
 
-    def settle(tracker, *others):
+    def settle(tracker, *others, **more):
         bent.append(error(tracker.keyframes.poses(tracker.keyframes.ids)))
-        correct_rows(tracker, *others)
+        correct_rows(tracker, *others, **more)
 
     monkeypatch.setattr("geogs.loop.global_bundle.correct_rows", settle)
     global_bundle(tracker)
@@ -134,8 +134,13 @@ def test_the_gradient_falls_to_zero_at_the_true_readout():
     assert abs(at[1]) < 0.05 * at[2]
 
 
-def test_a_readout_that_was_told_is_kept(monkeypatch):
-    tracker, factors = tracker_of_rows(as_read(1.15)), set()
+@pytest.mark.parametrize(
+    ("doubt", "finds_readout", "kept"), [(0.0, True, True), (0.1, False, True), (0.1, True, False)]
+)
+def test_a_readout_that_was_told_is_kept_and_one_that_is_not_to_be_found(
+    monkeypatch, doubt, finds_readout, kept
+):
+    tracker, factors = tracker_of_rows(as_read(1.15, doubt=doubt)), set()
     given = RowErrors.with_readout
 
     def noted(errors, factor):
@@ -144,8 +149,8 @@ def test_a_readout_that_was_told_is_kept(monkeypatch):
 
     monkeypatch.setattr(RowErrors, "with_readout", noted)
     tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
-    correct_rows(tracker, [1, 2], [0, 1, 2], BundleOptions())
-    assert factors == {1.0}
+    correct_rows(tracker, [1, 2], [0, 1, 2], BundleOptions(), finds_readout)
+    assert (factors == {1.0}) == kept
 
 
 def test_a_search_ends_where_the_gradient_is_zero():

@@ -11,6 +11,7 @@ from pose_samples import (
     walked,
     write_polycam,
     write_record3d,
+    write_record3d_export,
     write_stray,
     write_transforms,
     write_tum_poses,
@@ -24,9 +25,15 @@ def pose_priors() -> dict[str, Parser]:
     return {
         "stray-odometry": Parser(stray, ("odometry.csv",), mutations.text, poses_of("auto")),
         "record3d-metadata": Parser(record3d, ("metadata",), mutations.json_text, poses_of("auto")),
+        "record3d-export": Parser(
+            exported, ("EXR_RGBD/metadata.json",), mutations.json_text, poses_of("auto")
+        ),
         "record3d-archive": Parser(archived, ("room.r3d",), mutations.binary, archive_poses),
         "polycam-camera": Parser(
-            polycam, ("keyframes/cameras/1001.json",), mutations.json_text, poses_of("auto")
+            polycam,
+            ("keyframes/cameras/1442008775605.json",),
+            mutations.json_text,
+            poses_of("auto"),
         ),
         "transforms-prior": Parser(
             transforms, ("transforms.json",), mutations.json_text, poses_of("prior")
@@ -65,6 +72,10 @@ def record3d(folder: Path) -> None:
 
 def archived(folder: Path) -> None:
     write_record3d(folder / "room", PATH)
+
+
+def exported(folder: Path) -> None:
+    write_record3d_export(folder, PATH)
 
 
 def polycam(folder: Path) -> None:

@@ -27,4 +27,10 @@ def test_what_will_not_do_is_said_at_once():
     said = what_does_not_fit(200, 30.0)
     assert said.startswith("warning: The --budget will not do: the poses of 200 photographs")
     assert f"take about {duration(seconds_to_find_poses(200, FEATURES[-1]))} here" in said
-    assert "--budget 90s would do, or --input.stride 2" in said
+    assert "--budget 130s would do, or --input.stride 2" in said
+
+
+@pytest.mark.parametrize(("photographs", "took"), [(50, 20.5), (62, 40.0)])
+def test_the_poses_of_two_sets_take_about_what_is_said(photographs, took):
+    """A statue and a skeleton of half a megapixel and less, on two cores, with fewest features."""
+    assert 0.7 < seconds_to_find_poses(photographs, FEATURES[-1]) / took < 1.4

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
 from geogs.application.agreement import turn_alike
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.offline import PlacedOffline, beginning_with, offline_plan
 from geogs.application.photos import has_pycolmap
+from geogs.application.progress.plan import Plan
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
@@ -21,9 +22,6 @@ from geogs.application.tracked_video import TrackedVideo
 from geogs.errors import InputError, TrackingLost
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
-
-if TYPE_CHECKING:
-    from geogs.application.offline import PlacedOffline
 
 MAX_UNKNOWN = 0.1
 """Part of the frames without a place from which on structure from motion is tried."""
@@ -40,9 +38,10 @@ class TrackedOrPlaced(Work):
     to be better, and wherever it fails or is stopped, the tracked result is what is kept.
     """
 
-    def __init__(self, tracked: TrackedVideo, opened: Source) -> None:
-        """``opened`` is the video as it came, before the run calibrated it."""
-        self._tracked, self._opened = tracked, opened
+    def __init__(self, tracked: TrackedVideo, opened: Source, plan: Plan | None = None) -> None:
+        """``opened`` is the video as it came, before the run calibrated it; ``plan`` is of the run
+        that tracks it, where that is known."""
+        self._tracked, self._opened, self._plan = tracked, opened, plan
         self._take(tracked)
 
     @property
@@ -70,15 +69,17 @@ class TrackedOrPlaced(Work):
                 placed = self._placed(driver, judged)
                 if placed is not None and self._is_mapped(placed, driver, checkpoint):
                     return Outcome.STOPPED if driver.stop.requested else outcome
+                if self._plan is not None:
+                    driver.progress.plan(self._plan)
             outcome = Outcome.STOPPED if driver.stop.requested else outcome
         if failure is not None:
             raise failure
         return tracked.map(driver, outcome)
 
-    def _take(self, work: "TrackedVideo | PlacedOffline") -> None:
+    def _take(self, work: TrackedVideo | PlacedOffline) -> None:
         self.scene, self.source = work.scene, work.source
 
-    def _placed(self, driver: Driver, tracked: Verdict | None) -> "PlacedOffline | None":
+    def _placed(self, driver: Driver, tracked: Verdict | None) -> PlacedOffline | None:
         """The frames placed otherwise, if that can be tried and is better; what is said of it."""
         say, settings = driver.progress.write, self._tracked.metadata.settings
         if not settings.fallback:
@@ -89,10 +90,12 @@ class TrackedOrPlaced(Work):
             return None
         if not has_pycolmap():
             return None
-        from geogs.application.offline import PlacedOffline, beginning_with
-
         video = beginning_with(self._opened, self._tracked.source)
         placed = PlacedOffline(settings.config, video, self._tracked.scene.stopwatch)
+        if video.length is not None:
+            on_gpu = driver.device.type == "cuda"
+            plan = offline_plan(settings.config, video, on_gpu, False, is_begun=True)
+            driver.progress.plan(plan)
         if not self._succeeds(driver, lambda: placed.choose(driver)):
             return None
         seconds = placed.seconds_to_place
@@ -116,7 +119,7 @@ class TrackedOrPlaced(Work):
         placed.scene.instead_of = _in_words(tracked)
         return placed if is_taken else None
 
-    def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
+    def _is_mapped(self, placed: PlacedOffline, driver: Driver, checkpoint: Checkpoint) -> bool:
         """Map the placed frames; false where nothing came of it."""
         if not self._succeeds(driver, lambda: placed.map(driver, checkpoint)):
             return False

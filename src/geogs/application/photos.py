@@ -1,7 +1,7 @@
 """Structure from motion of photographs and of videos, as another package registers it."""
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -28,12 +28,14 @@ GROUP = "geogs.photos"
 Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
 
-SECONDS_PER_FRAME = 2.5
-"""Of one core, to find where such a frame was taken: about 0.15 for features, 0.2 to choose
-pairs, 1 to match some 22 of them and 0.6 to put all together (50 frames of 512 pixels, and 90 of
-320)."""
-SECONDS_PER_OTHER = 0.3
-"""Of one core, to place another frame against their points."""
+SECONDS_PER_FRAME = {
+    "features": 0.1, "choosing pairs": 0.13, "matching": 0.9, "finding poses": 0.25
+}  # fmt: skip
+"""Of one core, by stage, to find where such a frame was taken: some 22 pairs of each are matched
+(50 frames of 512 pixels)."""
+SECONDS_PER_OTHER, SECONDS_TO_ADD = 0.3, 0.1
+"""Of one core, to place another frame against their points, and to take one that has been placed
+into the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +71,13 @@ class PlacedVideo:
         return np.unique(np.concatenate(self.positions), axis=0)
 
 
-def seconds_to_place(chosen: int, length: int) -> float:
-    """About how long it takes to find where the frames of a video were taken, of which so many are
-    given to structure from motion."""
-    core_seconds = SECONDS_PER_FRAME * chosen + SECONDS_PER_OTHER * (length - chosen)
-    return core_seconds / worker_count()
+def seconds_to_place(chosen: int, length: int) -> dict[str, float]:
+    """About how long the stages take that find where the frames of a video were taken, of which so
+    many are given to structure from motion."""
+    cores = worker_count()
+    found = {stage: chosen * seconds / cores for stage, seconds in SECONDS_PER_FRAME.items()}
+    placing = SECONDS_PER_OTHER * (length - chosen) / cores + SECONDS_TO_ADD * chosen
+    return {**found, "placing frames": placing}
 
 
 def has_pycolmap() -> bool:
@@ -127,6 +131,7 @@ def open_photographs(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     seconds: float | None = None,
+    expects: Callable[[int, Mapping[str, float]], None] = lambda count, stages: None,
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
@@ -142,6 +147,8 @@ def open_photographs(
         stop: ends it.
         seconds: for poses and map together; where they are few the poses take less effort, and
             ``progress`` hears at once what does not fit. None is no limit.
+        expects: hears, where poses have to be found, of how many photographs, and how many seconds
+            each stage of that takes.
 
     Raises:
         InputError: pycolmap is missing, or the photographs do not tell where they were taken.
@@ -150,7 +157,7 @@ def open_photographs(
     """
     open_them = _registered("open_photographs")
     source: PosedSource = open_them(
-        folder, config, kept, hold_out, again, progress, stop, seconds
+        folder, config, kept, hold_out, again, progress, stop, seconds, expects
     )  # fmt: skip
     return source
 

@@ -2,8 +2,9 @@
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +19,7 @@ from geogs.application.machine.device import compiled_kernels, full_memory_in_a_
 from geogs.application.output_cost import OutputForecast
 from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews
+from geogs.application.progress.posed_plan import PosedPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result, Written
@@ -36,6 +38,8 @@ from geogs.reconstruction_output import ReconstructionTable
 from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
 
+RECORDED = 4000
+"""Pixels of the longer side of a photograph, about, where its size is taken as it is."""
 FIRST_BATCH = 24
 """Images read before it is known for how many the time lasts: some show what one costs."""
 _LEAST_BUDGET = 1.0
@@ -135,18 +139,44 @@ def reconstruct_to_folder(
         wanted = Path("out") / source.name
         if not settings.resume:
             wanted = free_folder(wanted, source.fingerprint())
+    end = None if settings.budget is None else begin + settings.budget
+    planned = _Planned(progress, config, device, end)
     with claimed(settings.output or wanted) as output, compiling(device) as kernels:
         if finds_poses:
             with stop:
                 source = open_photographs(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
-                    stop, settings.budget,
+                    stop, settings.budget, planned.finding_poses,
                 )  # fmt: skip
         begin += _compiled(device, kernels, settings.budget, progress)
+        planned.mapping(source)
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)
         return driver.complete(MappedImages(scene, source, settings))
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """Tells ``progress`` what a reconstruction is going to do, as soon as it is known."""
+
+    progress: RunProgress
+    config: ReconstructConfig
+    device: torch.device
+    end: float | None
+
+    def finding_poses(self, photographs: int, stages: Mapping[str, float]) -> None:
+        """With the poses to be found, in so many seconds by stage."""
+        edge = self.config.input.long_edge or RECORDED
+        self._tell(photographs, (edge, 3 * edge // 4), stages)
+
+    def mapping(self, source: PosedSource) -> None:
+        """With the poses known."""
+        self._tell(len(source), (source.camera.width, source.camera.height), {})
+
+    def _tell(self, views: int, size: tuple[int, int], before: Mapping[str, float]) -> None:
+        on_gpu = self.device.type == "cuda"
+        self.progress.plan(PosedPlan(self.config, views, size, on_gpu, before, self.end))
 
 
 class MappedImages(Work):

@@ -1,12 +1,10 @@
 """What to do where a run lost its camera, or is not to be relied on: the command that may help."""
 
-import math
 import shlex
 
-from geogs.application.chosen_frames import stretch_length
 from geogs.application.fallback import impossible, is_wanted
-from geogs.application.photos import has_pycolmap, seconds_to_place
-from geogs.application.progress.run_forecast import RunPlan
+from geogs.application.offline import offline_plan
+from geogs.application.photos import has_pycolmap
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.config import InputConfig, preset_of
@@ -66,10 +64,8 @@ def arguments(settings: RunSettings) -> str:
 
 def seconds_offline(settings: RunSettings, source: Source) -> float:
     """About how long a run takes that places frames by structure from motion."""
-    length = source.length or 0
-    chosen = math.ceil(length / stretch_length(source.fps, length))
-    plan = RunPlan(settings.config, length, False, False, True).seconds(chosen)
-    return seconds_to_place(chosen, length) + plan["mapping"] + plan["mesh"]
+    plan = offline_plan(settings.config, source, False, False, is_begun=True)
+    return sum(plan.seconds(0).values())
 
 
 def _was_placed(settings: RunSettings, source: Source) -> bool:

@@ -16,8 +16,10 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
+from geogs.application.offline import PlacedOffline, beginning_with, offline_plan
 from geogs.application.prior_choice import open_prior
-from geogs.application.progress.run_forecast import RunPlan
+from geogs.application.progress.plan import Plan
+from geogs.application.progress.run_plan import RunPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder
@@ -80,12 +82,10 @@ def run(
         if (plan := _plan(driver, opened)) is not None:
             progress.plan(plan)
         if settings.offline:
-            from geogs.application.offline import PlacedOffline, beginning_with
-
             told = self_calibrated(opened, config, device, progress, stop)
             told = with_shutter_found(told, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
-        work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened)
+        work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
         return _completed(driver, settings, work)
 
 
@@ -105,17 +105,20 @@ def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool
     return when == "after" or (when == "auto" and not is_shown)
 
 
-def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> RunPlan | None:
+def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> Plan | None:
     """What is going to be done, where that is known."""
     settings = driver.settings
-    if not isinstance(settings, RunSettings) or settings.offline or source.length is None:
+    if not isinstance(settings, RunSettings) or source.length is None:
         return None
+    calibrates = settings.config.calibration.refine and source.is_calibration_open
+    on_gpu = driver.device.type == "cuda"
+    if settings.offline:
+        return offline_plan(settings.config, source, on_gpu, calibrates)
     if maps_at_end is None:
         may_follow = settings.config.mapping.may_follow
         maps_at_end = may_follow and maps_at_the_end(settings, driver.observer)
-    calibrates = settings.config.calibration.refine and source.is_calibration_open
-    on_gpu = driver.device.type == "cuda"
-    return RunPlan(settings.config, source.length, on_gpu, calibrates, maps_at_end)
+    size = source.camera.width, source.camera.height
+    return RunPlan(settings.config, source.length, size, on_gpu, calibrates, maps_at_end)
 
 
 def seen_by(base: SavedResult, config: Config) -> InputConfig:
@@ -196,7 +199,7 @@ def resume(
         driver = Driver(settings, folder, device, progress, stop, observer, kernels)
         if (plan := _plan(driver, source, slam.world.maps_at_end)) is not None:
             progress.plan(plan)
-        return _completed(driver, settings, TrackedOrPlaced(work, opened))
+        return _completed(driver, settings, TrackedOrPlaced(work, opened, plan))
 
 
 def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:

@@ -12,6 +12,9 @@ from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
 from geogs.application.machine.compilation import OF_MAP, OF_SEARCH
+from geogs.application.progress.run_plan import RunPlan
+from geogs.application.results.preview import NAME as PREVIEW
+from geogs.application.results.preview import write_preview
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
@@ -21,6 +24,8 @@ from geogs.slam import Slam
 from geogs.stopwatch import Stopwatch
 from geogs.types import Frame
 
+LONG = 15.0
+"""Seconds for map and mesh, on the machine of reference, from which there is a preview."""
 BRIEFLY = 40.0
 """Seconds for a map after an interruption, where there is none yet."""
 
@@ -77,6 +82,8 @@ class TrackedVideo:
         """The map after :meth:`locate` came to ``outcome``: where it was cut short or this is, one
         in little time."""
         slam, is_mapped = self.scene, False
+        if outcome is Outcome.FINISHED and slam.world.maps_at_end and not driver.kernels.is_working:
+            self._write_preview(driver)
         with _full_memory_said(driver):
             is_mapped = outcome is Outcome.FINISHED and driver.stop.lets_finish(
                 lambda: self._refine(driver)
@@ -132,6 +139,20 @@ class TrackedVideo:
                 kernels.wait(driver.report, OF_MAP)
 
         self.scene.refine(report)
+
+    def _write_preview(self, driver: Driver) -> None:
+        """A rough mesh for who would wait long for the other."""
+        slam, settings = self.scene, self.metadata.settings
+        size, on_gpu = (slam.camera.width, slam.camera.height), slam.world.keyframes.grid.on_gpu
+        plan = RunPlan(settings.config, slam.frames, size, on_gpu, False, maps_at_end=True)
+        if plan.seconds_to_map(len(slam.segments.main.segment.ids)) < LONG:
+            return
+        with slam.stopwatch("preview"):
+            is_there = write_preview(driver.output, slam)
+        if is_there:
+            driver.progress.write(
+                f"A first, rough mesh is in {driver.output / PREVIEW}, until the other one is made."
+            )
 
     def _adjust(self, driver: Driver, new: Path) -> None:
         self.scene.adjust(driver.report)

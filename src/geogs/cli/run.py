@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 from geogs.application.result_settings import HERE
 from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.speech import followed
+from geogs.cli.speech import followed, say_loading
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
@@ -48,6 +48,7 @@ def main(argv: Sequence[str]) -> int:
     if options.offline and options.map is not None:
         raise InputError("--map is gone on with by tracking; leave out --offline.")
 
+    say_loading(options)
     start_gpu(options.device)
     from geogs.application.interrupt import Interruption
     from geogs.application.run import resume, run

@@ -1,6 +1,7 @@
 """What a command says while it works and at its end."""
 
 import logging
+import sys
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -18,6 +19,12 @@ NOT_JUDGED = (
     "missing."
 )
 """Said of a run that was stopped."""
+
+
+def say_loading(options: Verbosity) -> None:
+    """A word on a terminal before what takes seconds to load; the first news writes over it."""
+    if not options.quiet and sys.stderr is not None and sys.stderr.isatty():
+        print("loading ...", end="\r", file=sys.stderr, flush=True)
 
 
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> "Written":

@@ -51,8 +51,9 @@ class TrackingConfig(Settings, group="tracking"):
     window: Annotated[int, Range(1, 1000)] = 8
     """Most recent keyframes whose poses the local adjustment moves."""
     fine_adjustment: bool = True
-    """Match at full resolution for the adjustment of all keyframes; off matches images of more than
-    400 pixels at half of it, as on the way."""
+    """Match at full resolution for the adjustment of all keyframes, and find the readout of a
+    rolling shutter once more in it; off matches images of more than 400 pixels at half of it, as on
+    the way, and keeps the readout."""
     patience: Count = 15
     """Frames with texture in which the camera stays lost before another segment is begun."""
     moving: Annotated[float, Range(0, 1000)] = 3.0

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
 from geogs.depth.completion import known_cells, upsample_grid
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
@@ -14,13 +15,17 @@ VALID_DEVIATION = 0.3
 """Relative deviation, as the adjustment expects it, up to which a cell's depth is valid."""
 
 
-def enlarged_depth(view: DepthView, working: Camera, render: Camera) -> KeyframeDepth:
+def enlarged_depth(
+    grid: Float32[np.ndarray, "gh gw"],
+    information: Float32[np.ndarray, "gh gw"],
+    working: Camera,
+    render: Camera,
+) -> KeyframeDepth:
     """Inverse depth of the tracker's grid, bilinear between the cells that are valid.
 
     A pixel is valid, with confidence 1, where these have more than half of the weight; elsewhere it
     has the median depth with confidence 0.
     """
-    grid, information = view.inverse_depth, view.information
     valid = known_cells(grid, information)
     valid &= (VALID_DEVIATION * grid) ** 2 * information > 1
     fraction = upsample_grid(valid.astype(np.float32), working, render)
@@ -53,7 +58,10 @@ class TrackerDepthEngine(AlternativeSearch):
         limits: Sequence[Limits | None] | None = None,
     ) -> list[DenseDepth]:
         """As in the protocol; neighbours and limits say nothing."""
-        return [self._dense(enlarged_depth(r, self.working, self.render)) for r in references]
+        return [
+            self._dense(enlarged_depth(r.inverse_depth, r.information, self.working, self.render))
+            for r in references
+        ]
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]

@@ -73,7 +73,8 @@ def global_bundle(
         graph.adjust(list(graph.edges), free if fixed else ids[1:], free, GLOBAL_OPTIONS)
         graph.update_dynamic(set(free), config.moving)
         odometry.update_scale_by_all()
-    correct_rows(tracker, free if fixed else ids[1:], free, GLOBAL_OPTIONS)
+    free_poses = free if fixed else ids[1:]
+    correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:

@@ -36,11 +36,16 @@ EVIDENCE = 0.02
 
 
 def correct_rows(
-    tracker: Tracker, free_pose: Sequence[int], free_depth: Sequence[int], options: BundleOptions
+    tracker: Tracker,
+    free_pose: Sequence[int],
+    free_depth: Sequence[int],
+    options: BundleOptions,
+    finds_readout: bool = True,
 ) -> None:
     """Correct all matches for their rows and adjust again; nothing where no rows were rectified.
 
-    What was measured of the frames between the keyframes is corrected, too.
+    What was measured of the frames between the keyframes is corrected, too. ``finds_readout`` says
+    whether the readout is found once more, where it was found in the video.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = {e: edge for e, edge in graph.edges.items() if isinstance(edge, PackedEdge)}
@@ -58,7 +63,7 @@ def correct_rows(
             )
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
         shift_rows(log, keyframes, present)
-        if n + 1 >= ROUNDS and not errors.doubt:
+        if n + 1 >= ROUNDS and not (finds_readout and errors.doubt):
             return
 
 

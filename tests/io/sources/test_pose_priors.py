@@ -7,20 +7,24 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.pose_priors import turned_upright
 from geogs.io.sources.sniff import open_source
 from io_samples import write_images
 from pose_samples import (
     archived,
     walked,
+    write_depth,
     write_polycam,
     write_record3d,
+    write_record3d_export,
     write_stray,
     write_transforms,
     write_tum_poses,
 )
 
 PATH = walked(5)
+WRITERS = [write_stray, write_record3d, write_record3d_export, write_polycam]
 
 
 def found(source) -> list[np.ndarray]:
@@ -28,7 +32,7 @@ def found(source) -> list[np.ndarray]:
     return [np.linalg.inv(f.pose.T_cw.numpy()) for f in source]
 
 
-@pytest.mark.parametrize("write", [write_stray, write_record3d, write_polycam])
+@pytest.mark.parametrize("write", WRITERS)
 def test_poses_of_apps_are_used_unasked(tmp_path, write):
     write(tmp_path / "a", PATH) if write is not write_stray else write_stray_into(tmp_path / "a")
     source = open_source(tmp_path / "a", InputConfig(readout=0.0))
@@ -78,6 +82,41 @@ def test_depth_of_record3d_is_what_its_confidence_lets_through(tmp_path):
     assert (metres[1][:, :28] == 0).all()
     at = (np.arange(34, 62) + 0.5) / 4 - 0.5
     np.testing.assert_allclose(1 / metres[1][26, 34:62], 1 - 0.5 * at / 15, rtol=1e-3)
+
+
+def test_pictures_of_record3d_have_its_times_and_camera_and_say_that_depth_is_elsewhere(tmp_path):
+    write_record3d_export(tmp_path / "room", PATH)
+    for folder in (tmp_path / "room", tmp_path / "room" / "EXR_RGBD"):
+        source = open_source(folder, InputConfig(readout=0.0))
+        assert (source.kind, source.name) == ("record3d", "room")
+        assert (source.camera.fx, source.camera.fy, source.camera.cx) == (50, 51, 31)
+        np.testing.assert_allclose([f.timestamp for f in source], 0.02 * np.arange(5))
+    with pytest.raises(InputError, match=r"depth in EXR is not read; Record3D's \.r3d"):
+        open_source(tmp_path / "room", InputConfig(depth="sensor"))
+    assert read_calibration(tmp_path / "room" / "EXR_RGBD" / "metadata.json").fy == 51
+
+
+def test_names_of_polycam_are_times_in_microseconds(tmp_path):
+    write_polycam(tmp_path / "a", PATH)
+    times = [f.timestamp for f in open_source(tmp_path / "a", InputConfig(readout=0.0))]
+    np.testing.assert_allclose(times, 0.25 * np.arange(5))
+    write_polycam(tmp_path / "b", PATH, step=1)  # no times
+    times = [f.timestamp for f in open_source(tmp_path / "b", InputConfig(readout=0.0))]
+    np.testing.assert_allclose(times, np.arange(5) / 30)
+
+
+def test_depth_of_polycam_is_what_its_confidence_lets_through(tmp_path):
+    write_polycam(tmp_path, PATH)
+    confidence = np.full((12, 16), 255, np.uint8)
+    confidence[:, :8], confidence[:, 8:12] = 0, 127
+    write_depth(tmp_path / "keyframes/depth/1442008775605.png", np.full((12, 16), 1500, np.uint16))
+    write_depth(tmp_path / "keyframes/confidence/1442008775605.png", confidence)
+    source = open_source(tmp_path, InputConfig(depth="sensor", readout=0.0))
+    depths = [f.depth for f in source]
+    assert [d is None for d in depths] == [True, False, True, True, True]
+    metres = depths[1].metres()
+    assert (metres[:, :30] == 0).all()
+    assert (metres[:, 34:] == 1.5).all()
 
 
 def test_depth_of_stray_scanner_is_what_its_confidence_lets_through(tmp_path):

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from geogs.application.progress.run_forecast import RunPlan
+    from geogs.application.progress.plan import Plan
     from geogs.pose_estimate import PoseEstimate
 
 
@@ -13,7 +13,7 @@ class RunProgress:
     def write(self, text: str) -> None:
         """A sentence for the user; nothing if it is empty."""
 
-    def plan(self, plan: "RunPlan") -> None:
+    def plan(self, plan: "Plan") -> None:
         """Before the work of which so much is known."""
 
     def expect(self, frames: int | None, begun: int = 0) -> None:

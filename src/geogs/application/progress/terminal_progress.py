@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from geogs.application.machine.device import peak_memory
-from geogs.application.progress.run_forecast import RunForecast, RunPlan
+from geogs.application.progress.forecast import Forecast
+from geogs.application.progress.plan import Plan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.run_settings import Verbosity
 from geogs.errors import OutputError
@@ -53,7 +54,7 @@ class TerminalProgress(RunProgress):
         self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
         self._frames: int | None = None
         self._dropped = 0
-        self._forecast: RunForecast | None = None
+        self._forecast: Forecast | None = None
         self._printed = self._phase_began = time.perf_counter()
         self._phase = self._stage = self._last = ""
         self._memory, self._measured = "", -math.inf
@@ -92,9 +93,12 @@ class TerminalProgress(RunProgress):
             Console(stderr=True, highlight=False).print(text, soft_wrap=True, markup=False)
         self._bar.console.print(text, soft_wrap=True, markup=False)
 
-    def plan(self, plan: RunPlan) -> None:
+    def plan(self, plan: Plan) -> None:
         """From now on the time that is left is that of all of it."""
-        self._forecast = RunForecast(plan)
+        if self._forecast is None:
+            self._forecast = Forecast(plan)
+        else:
+            self._forecast.change(plan)
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
         """Begin with the frames."""

@@ -12,6 +12,7 @@ from geogs.io.sources.formats import (
     model_layouts,
     polycam,
     record3d,
+    record3d_export,
     replica,
     scannet,
     seven_scenes,
@@ -120,6 +121,11 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(
         "Record3D", record3d.is_record3d, lambda p: record3d.Record3dRecording(p.folder), (),
         ("rgbd", "metadata"), "rgbd with the images beside the metadata",
+    ),
+    Layout(
+        "Record3D", record3d_export.is_record3d_export,
+        _whole(record3d_export.open_record3d_export), (), ("depth/*.exr",),
+        "rgb with the pictures, or metadata.json with K, w, h and poses,",
     ),
 )  # fmt: skip
 """Earlier ones win."""

@@ -14,6 +14,8 @@ from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_k
 from geogs.io.sources.pose_priors import measured_pose, rigid
 
 _PER_METRE = 1000.0
+_DIGITS, _LEAST_GAP = 18, 1e-3
+"""Of a time in microseconds, at most; and seconds from one keyframe to the next, at least."""
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 
 
@@ -27,7 +29,9 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def open_polycam(folder: Path) -> ImageList:
-    """Read the keyframes of an export; they are taken to be a thirtieth of a second apart.
+    """Read the keyframes of an export, whose names are their times in microseconds.
+
+    Where these cannot be, they are taken to be a thirtieth of a second apart.
 
     Raises:
         InputError: there are none, or a camera cannot be understood.
@@ -37,7 +41,9 @@ def open_polycam(folder: Path) -> ImageList:
         raise InputError(f"{folder} is no export of Polycam's raw data.")
     cameras, images = places
     files, lenses = [], []
-    for n, path in enumerate(sorted(cameras.glob("*.json"), key=lambda p: natural_key(p.name))):
+    paths = sorted(cameras.glob("*.json"), key=lambda p: natural_key(p.name))
+    times = _times([path.stem for path in paths])
+    for path in paths:
         image = images / f"{path.stem}.jpg"
         if not image.is_file():
             continue
@@ -53,11 +59,9 @@ def open_polycam(folder: Path) -> ImageList:
         except UNUSABLE:
             raise InputError(f"{path} holds no camera of Polycam; export it again.") from None
         pose = rigid(T_wc @ OPENCV_FROM_OPENGL)
-        depth = folder / "keyframes" / "depth" / f"{path.stem}.png"
         files.append(
             ImageFile(
-                image, n / FRAMES_PER_SECOND,
-                DepthFile(depth, _PER_METRE) if depth.is_file() else None,
+                image, times[path.stem], _depth(folder / "keyframes", path.stem),
                 None if pose is None else measured_pose(pose),
             )
         )  # fmt: skip
@@ -69,3 +73,21 @@ def open_polycam(folder: Path) -> ImageList:
     )
     name = folder.resolve().name
     return ImageList("polycam", name, files, calibration, "Polycam", is_capture=True)
+
+
+def _times(names: list[str]) -> dict[str, float]:
+    """Seconds since the first of some keyframes, in order."""
+    evenly = {name: n / FRAMES_PER_SECOND for n, name in enumerate(names)}
+    if not all(name.isdecimal() and len(name) <= _DIGITS for name in names):
+        return evenly
+    seconds = {name: (int(name) - int(names[0])) * 1e-6 for name in names}
+    gaps = np.diff([*seconds.values()])
+    return seconds if len(gaps) and np.median(gaps) > _LEAST_GAP else evenly
+
+
+def _depth(keyframes: Path, name: str) -> DepthFile | None:
+    path, confidence = (keyframes / kind / f"{name}.png" for kind in ("depth", "confidence"))
+    if not path.is_file():
+        return None
+    # 0, 127 and 255 are low, medium and high.
+    return DepthFile(path, _PER_METRE, confidence=confidence if confidence.is_file() else None)

@@ -21,7 +21,7 @@ from jaxtyping import Float32
 from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes, require_file
 from geogs.errors import InputError
 from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
-from geogs.io.pose_files import OPENCV_FROM_OPENGL, poses_from
+from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL, poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import record3d_camera
 from geogs.io.sources.depth_files import LEAST_CONFIDENCE, DepthCamera
@@ -147,9 +147,9 @@ class Record3dRecording:
         height, width = first.shape[:2]
         try:
             metadata: dict[str, Any] = json.loads(self._files.read("metadata", LARGEST_DOCUMENT))
-            fps = float(metadata.get("fps") or 30)
+            fps = float(metadata.get("fps") or FRAMES_PER_SECOND)
             calibration = _calibration(metadata, width, height)
-            self._poses = _poses(metadata.get("poses", []))
+            self._poses = measured_poses(metadata.get("poses", []))
             self._times = [float(t) for t in metadata.get("frameTimestamps") or []]
             self._size = _whole(metadata, "dh", _LIDAR[0]), _whole(metadata, "dw", _LIDAR[1])
         except (*UNUSABLE, UnicodeDecodeError):
@@ -199,8 +199,11 @@ def _calibration(metadata: dict[str, Any], width: int, height: int) -> Calibrati
     return record3d_camera({"w": width, "h": height, **metadata}).fit(width, height)
 
 
-def _poses(rows: object) -> dict[int, MeasuredPose]:
-    """Poses by the number of the frame; what is none is left out."""
+def measured_poses(rows: object) -> dict[int, MeasuredPose]:
+    """Record3D's ``poses`` by the number of the frame; what is none is left out.
+
+    Raises ValueError where they are no table of them.
+    """
     table = np.array(rows, dtype=np.float64)
     if not table.size:
         return {}

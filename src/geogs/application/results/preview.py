@@ -1,0 +1,64 @@
+"""A first surface, from what tracking knows, while the map is still to be made."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from geogs.depth.tracker_depth import enlarged_depth
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.writers.ply_writer import write_mesh
+from geogs.io.writers.replacement import replaced
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
+from geogs.on_demand import OnDemand
+from geogs.slam import Slam
+from geogs.threads import on_one_torch_thread
+from geogs.world.keyframes import Keyframe
+
+NAME = "preview.ply"
+_EDGE = 128
+"""Longer side of the depth maps, pixels: cells of the tracker are eight pixels of its images."""
+_TRIANGLES = 60_000
+_MOST_VIEWS = 60
+"""Keyframes that are fused, evenly spread."""
+
+
+def write_preview(output: Path, slam: Slam) -> bool:
+    """``preview.ply``: the surface of the depths by which the keyframes were tracked.
+
+    It belongs to the result that is being made, and goes when that is written. Returns whether
+    there is one.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    mesh = preview(slam)
+    if mesh is None:
+        return False
+    with replaced(output, "part") as new:
+        write_mesh(new / NAME, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    return True
+
+
+@on_one_torch_thread
+def preview(slam: Slam) -> Mesh | None:
+    """The surface of the depths of tracking, which know a cell in 64 pixels; none without any."""
+    keyframes = slam.segments.main.segment.keyframes
+    stride = -(-max(len(keyframes), 1) // _MOST_VIEWS)
+    camera = slam.camera
+    shrink = min(_EDGE / max(camera.width, camera.height), 1.0)
+    small = camera.resized(round(shrink * camera.width), round(shrink * camera.height))
+    views = OnDemand(list(keyframes)[::stride], lambda k: _view(k, camera, small))
+    config = slam.config.mesh
+    try:
+        return extract_mesh(views, replace(config, voxel=None, triangle_budget=_TRIANGLES))
+    except InputError:  # too little is known for a surface; of all of it the map may have more
+        return None
+
+
+def _view(keyframe: Keyframe, working: Camera, small: Camera) -> DepthMapView:
+    found = enlarged_depth(*keyframe.depth_field(), working, small)
+    depth, weight = (torch.from_numpy(m) for m in (found.depth, found.confidence))
+    return DepthMapView(depth, weight, small, keyframe.T_cw, keyframe.image)
