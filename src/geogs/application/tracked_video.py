@@ -143,8 +143,10 @@ class TrackedVideo:
     def _write_preview(self, driver: Driver) -> None:
         """A rough mesh for who would wait long for the other."""
         slam, settings = self.scene, self.metadata.settings
-        size, on_gpu = (slam.camera.width, slam.camera.height), slam.world.keyframes.grid.on_gpu
-        plan = RunPlan(settings.config, slam.frames, size, on_gpu, False, maps_at_end=True)
+        if slam.world.keyframes.grid.on_gpu:  # there the map is made in seconds
+            return
+        size = slam.camera.width, slam.camera.height
+        plan = RunPlan(settings.config, slam.frames, size, False, False, maps_at_end=True)
         if plan.seconds_to_map(len(slam.segments.main.segment.ids)) < LONG:
             return
         with slam.stopwatch("preview"):

@@ -4,7 +4,6 @@ import torch
 
 from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthEngine
-from geogs.depth.far_bound import BoundedSearch
 from geogs.depth.far_side import FarSideSearch
 from geogs.geometry.camera import Camera
 
@@ -27,25 +26,12 @@ def depth_engine(
     engine = config.engine
     if engine == "auto":
         engine = "joint" if torch.device(device).type == "cuda" else "classical"
+    if engine == "classical":
+        return classical
     if engine == "tracker":
         from geogs.depth.tracker_depth import TrackerDepthEngine
 
         return TrackerDepthEngine(classical, torch.device(device), render, working)
-    search = classical
-    if engine != "classical":
-        search = _with_network(device, render, working, config, resident, classical)
-    return BoundedSearch(search, render, working)
-
-
-def _with_network(
-    device: torch.device | str,
-    render: Camera,
-    working: Camera,
-    config: DepthConfig,
-    resident: int,
-    classical: DepthEngine,
-) -> DepthEngine:
-    """The network alone, or joined with the classical search."""
     from geogs.depth.network.engine import NetworkDepthEngine
     from geogs.depth.network.model import load_depth_network
     from geogs.networks.weights_files import find_weights
@@ -54,7 +40,7 @@ def _with_network(
     network = NetworkDepthEngine(
         trained, classical, torch.device(device), render, working, resident
     )
-    if config.engine == "network":
+    if engine == "network":
         return network
     from geogs.depth.network.joint import JointDepthEngine
 

@@ -153,7 +153,7 @@ class OwnFlow:
             )  # fmt: skip
         pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
         if options.polish:
-            pixels, weight = self._polished(first, second, pixels, weight, fine)
+            pixels, weight = self._polished(first, second, pixels, weight, fine, is_warm)
         return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
 
     def _refinement(self, iterations: int, is_warm: bool, is_recorded: bool) -> Callable[..., Maps]:
@@ -196,8 +196,13 @@ class OwnFlow:
         pixels: Float[Tensor, "d p 2"],
         weight: Float[Tensor, "d p 2"],
         fine: bool,
+        is_warm: bool,
     ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
-        """The network's flow joined with the classical flow that begins there."""
+        """The network's flow joined with the classical flow that begins there.
+
+        From a cold start what the classical flow does not bear out has no weight: where neither
+        knows the motion, as in front of a car, the network is as sure of what is merely alike.
+        """
         sides = [[i.classical for i in side] for side in (first, second)]
         n = len(first)
         matches = self.classical.measure(sides[0], sides[1], pixels[:n], pixels[n:], fine)
@@ -209,7 +214,8 @@ class OwnFlow:
         join = both & (residual < self.options.agreement**2)
         total = weight + certain
         mean = (weight * pixels + certain * theirs) / total.clamp(min=1e-9)
-        return torch.where(join, mean, pixels), torch.where(join, total, weight)
+        alone = weight if is_warm else torch.zeros_like(weight)
+        return torch.where(join, mean, pixels), torch.where(join, total, alone)
 
     def _weight(
         self, estimate: FlowEstimate, start: Float[Tensor, "e p 2"] | None
