@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from geogs.application.agreement import turn_alike
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.offline import PlacedOffline, beginning_with, offline_plan
+from geogs.application.offline_plan import offline_plan
 from geogs.application.photos import has_pycolmap
 from geogs.application.progress.plan import Plan
 from geogs.application.results.result import Result
@@ -22,6 +23,9 @@ from geogs.application.tracked_video import TrackedVideo
 from geogs.errors import InputError, TrackingLost
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
+
+if TYPE_CHECKING:
+    from geogs.application.offline import PlacedOffline
 
 MAX_UNKNOWN = 0.1
 """Part of the frames without a place from which on structure from motion is tried."""
@@ -76,10 +80,10 @@ class TrackedOrPlaced(Work):
             raise failure
         return tracked.map(driver, outcome)
 
-    def _take(self, work: TrackedVideo | PlacedOffline) -> None:
+    def _take(self, work: "TrackedVideo | PlacedOffline") -> None:
         self.scene, self.source = work.scene, work.source
 
-    def _placed(self, driver: Driver, tracked: Verdict | None) -> PlacedOffline | None:
+    def _placed(self, driver: Driver, tracked: Verdict | None) -> "PlacedOffline | None":
         """The frames placed otherwise, if that can be tried and is better; what is said of it."""
         say, settings = driver.progress.write, self._tracked.metadata.settings
         if not settings.fallback:
@@ -90,6 +94,8 @@ class TrackedOrPlaced(Work):
             return None
         if not has_pycolmap():
             return None
+        from geogs.application.offline import PlacedOffline, beginning_with
+
         video = beginning_with(self._opened, self._tracked.source)
         placed = PlacedOffline(settings.config, video, self._tracked.scene.stopwatch)
         if video.length is not None:
@@ -119,7 +125,7 @@ class TrackedOrPlaced(Work):
         placed.scene.instead_of = _in_words(tracked)
         return placed if is_taken else None
 
-    def _is_mapped(self, placed: PlacedOffline, driver: Driver, checkpoint: Checkpoint) -> bool:
+    def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
         """Map the placed frames; false where nothing came of it."""
         if not self._succeeds(driver, lambda: placed.map(driver, checkpoint)):
             return False

@@ -1,6 +1,5 @@
 """A video without tracking: sharp frames, structure from motion, every frame against the map."""
 
-import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -9,13 +8,12 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
-from geogs.application.chosen_frames import ChosenFrames, choose_frames, stretch_length
+from geogs.application.chosen_frames import ChosenFrames, choose_frames
 from geogs.application.driver import Driver, Outcome, Work
+from geogs.application.offline_plan import offline_config
 from geogs.application.photos import PlacedVideo, localiser, place_frames, seconds_to_place
-from geogs.application.progress.posed_plan import PosedPlan
-from geogs.application.progress.run_plan import RunPlan
 from geogs.application.results.verdict import Verdict, verdict
-from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_preset
+from geogs.config import Config, ReconstructConfig
 from geogs.evaluation.duration import duration
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
@@ -24,9 +22,6 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import Trajectory, Uncertainty
-
-_SECONDS_TO_CHOOSE = 0.02
-"""Of each frame."""
 
 
 class PlacedOffline(Work):
@@ -129,28 +124,6 @@ class PlacedOffline(Work):
         # Not before, as it would say of which frames the map is to be made.
         scene.know(self.trajectory)
         return outcome
-
-
-def offline_config(config: Config) -> ReconstructConfig:
-    """How the map is made of frames that were placed so, with the settings of a run."""
-    made = reconstruct_preset(preset_of(config))
-    return replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
-
-
-def offline_plan(
-    config: Config, source: Source, on_gpu: bool, calibrates: bool, is_begun: bool = False
-) -> PosedPlan:
-    """What is going to be done with a video whose length is known.
-
-    ``is_begun`` says that focal length and shutter are known.
-    """
-    length, size = source.length or 0, (source.camera.width, source.camera.height)
-    chosen = math.ceil(length / stretch_length(source.fps, length))
-    before = {"choosing frames": _SECONDS_TO_CHOOSE * length, **seconds_to_place(chosen, length)}
-    if not is_begun:
-        begun = RunPlan(config, length, size, on_gpu, calibrates, True).seconds(0)
-        before = {stage: begun[stage] for stage in ("calibration", "shutter")} | before
-    return PosedPlan(offline_config(config), chosen, size, on_gpu, before)
 
 
 def beginning_with(video: Source, found: Source) -> Source:

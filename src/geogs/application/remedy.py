@@ -3,7 +3,7 @@
 import shlex
 
 from geogs.application.fallback import impossible, is_wanted
-from geogs.application.offline import offline_plan
+from geogs.application.offline_plan import offline_plan
 from geogs.application.photos import has_pycolmap
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings

@@ -16,7 +16,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
-from geogs.application.offline import PlacedOffline, beginning_with, offline_plan
+from geogs.application.offline_plan import offline_plan
 from geogs.application.prior_choice import open_prior
 from geogs.application.progress.plan import Plan
 from geogs.application.progress.run_plan import RunPlan
@@ -82,6 +82,8 @@ def run(
         if (plan := _plan(driver, opened)) is not None:
             progress.plan(plan)
         if settings.offline:
+            from geogs.application.offline import PlacedOffline, beginning_with
+
             told = self_calibrated(opened, config, device, progress, stop)
             told = with_shutter_found(told, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))

@@ -13,8 +13,6 @@ from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_s
 from geogs.application.driver import Driver, Outcome
 from geogs.application.machine.compilation import OF_MAP, OF_SEARCH
 from geogs.application.progress.run_plan import RunPlan
-from geogs.application.results.preview import NAME as PREVIEW
-from geogs.application.results.preview import write_preview
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
@@ -149,11 +147,13 @@ class TrackedVideo:
         plan = RunPlan(settings.config, slam.frames, size, False, False, maps_at_end=True)
         if plan.seconds_to_map(len(slam.segments.main.segment.ids)) < LONG:
             return
+        from geogs.application.results.preview import NAME, write_preview
+
         with slam.stopwatch("preview"):
             is_there = write_preview(driver.output, slam)
         if is_there:
             driver.progress.write(
-                f"A first, rough mesh is in {driver.output / PREVIEW}, until the other one is made."
+                f"A first, rough mesh is in {driver.output / NAME}, until the other one is made."
             )
 
     def _adjust(self, driver: Driver, new: Path) -> None:
