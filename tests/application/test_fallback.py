@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geogs.application import fallback, offline, remedy
+from geogs.application import fallback, offline_plan, remedy
 from geogs.application.fallback import impossible, is_better, is_wanted
 from geogs.application.offline import PlacedOffline
 from geogs.application.results.verdict import Verdict
@@ -90,7 +90,7 @@ def video(tmp_path, monkeypatch):
     room = render_room(FRAMES, 3, 160, 120)
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
-    monkeypatch.setattr(offline, "reconstruct_preset", lambda _: SMALL)
+    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: True)
     for part in ("write_page", "write_pictures"):
         monkeypatch.setattr(f"geogs.application.results.write.{part}", lambda *_: None)

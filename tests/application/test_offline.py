@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application import chosen_frames, offline
+from geogs.application import chosen_frames, offline_plan
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
@@ -21,7 +21,7 @@ FRAMES = 12
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(chosen_frames, "FEWEST", FRAMES // 2)
-    monkeypatch.setattr(offline, "reconstruct_preset", lambda _: SMALL)
+    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
     room = render_room(FRAMES, 3, 320, 240)
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
