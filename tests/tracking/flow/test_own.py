@@ -184,6 +184,23 @@ def test_cells_that_jump_from_a_warm_start_have_no_weight(operator):
     assert (operator._weight(estimate, None)[0, far, 0] > 0).all()
 
 
+def test_a_cold_start_counts_where_the_classical_flow_bears_it_out(operator):
+    """The network is made to believe itself everywhere; noise and other noise have no match."""
+    operator.options = OwnFlowOptions(
+        min_probability=0.0, max_deviation=1e6, max_correction=1e6, cold_iterations=1
+    )
+    one, other = (operator.encode(image) for image in images(2))
+    here = operator.grid.pixels[None]
+
+    def matched(first, second, *start) -> float:
+        match, _ = operator.measure([first], [second], *start)
+        return float((match.weight[0, :, 0] > 0).float().mean())
+
+    assert matched(one, other, here, here) > 0.7  # begun where one is, it is believed as it is
+    assert matched(one, other) < 0.3
+    assert matched(one, one) > 0.7
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_what_is_recorded_on_a_gpu_says_what_is_not(network, tmp_path, caplog):
