@@ -97,10 +97,7 @@ def _median(
     """The upper median of the known values of each row; 0 where there is none."""
     ordered = np.sort(np.where(known, values, np.inf), axis=1)
     count = known.sum(1)
-    middle = np.take_along_axis(ordered, np.minimum(count // 2, known.shape[1] - 1)[:, None], 1)[
-        :, 0
-    ]
-    return np.where(count > 0, middle, 0.0)
+    return np.where(count > 0, ordered[np.arange(len(ordered)), count // 2], 0.0)
 
 
 def _angles(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
