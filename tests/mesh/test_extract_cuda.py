@@ -18,8 +18,9 @@ from geogs.io.writers.ply_writer import write_splats
 from geogs.mesh import tsdf
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
+from geogs.mesh.pixel_planes import PixelPlanes, widest
 from geogs.mesh.triangle_mesh import DepthMapView
-from geogs.mesh.tsdf import SparseTsdf, _plane_table, band_blocks
+from geogs.mesh.tsdf import SparseTsdf, blocks_seen
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()
@@ -59,12 +60,10 @@ def test_kernel_updates_voxels_like_torch(monkeypatch):
     for view in views(camera, 3):
         expected.integrate(view.depth, view.weight, camera, view.T_cw)
         valid = view.valid()
-        points = camera.back_project(view.depth)[valid].double()
-        points = (points - view.T_cw[:3, 3]) @ view.T_cw[:3, :3]
-        tested._allocate(band_blocks(points, 0.09, 3.0))
-        table = _plane_table(view.depth, torch.where(valid, view.weight, 0.0), valid)
-        farthest = torch.where(valid, view.depth, 0.0).amax()
-        tested.update_by_kernel(table, camera, view.T_cw, farthest)
+        tested._allocate(blocks_seen(view.depth, valid, camera, view.T_cw, 0.09, 3.0))
+        planes = PixelPlanes.of(view.depth, view.weight, valid, camera, 0.27)
+        far = torch.where(valid, view.depth, 0.0).amax() + widest(0.27)
+        tested.update_by_kernel(planes, camera, view.T_cw, far)
     assert (tested.coordinates == expected.coordinates).all()
     seen = expected.weight > 0
     assert seen.double().mean() > 0.2
@@ -80,8 +79,8 @@ def test_blocks_out_of_view_stay_untouched(monkeypatch):
     (view,) = views(camera, 1)
     volume = SparseTsdf(0.09, 3.0)
     volume._allocate(torch.tensor([[0, 0, -4], [60, 0, 2], [0, -60, 2], [0, 0, 40], [0, 0, 2]]))
-    table = _plane_table(view.depth, view.weight, view.valid())
-    volume.update_by_kernel(table, camera, view.T_cw, view.depth.amax())
+    planes = PixelPlanes.of(view.depth, view.weight, view.valid(), camera, 0.27)
+    volume.update_by_kernel(planes, camera, view.T_cw, view.depth.amax() + 0.27)
     touched = (volume.weight > 0).flatten(1).any(1)
     assert touched.tolist() == [False, False, False, False, True]
 

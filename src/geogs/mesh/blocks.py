@@ -18,8 +18,9 @@ from geogs.mesh.clean import cleaned
 from geogs.mesh.extract import VolumePlan, integrate
 from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.level_set import CHUNK, SurfacePart, stitched, surface_parts
+from geogs.mesh.pixel_planes import widest
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, band_blocks, meets_frustum
+from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, blocks_seen, meets_frustum
 from geogs.threads import on_one_torch_thread
 
 
@@ -35,8 +36,7 @@ def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a view lies, with its band."""
     valid = view.valid() & (view.depth <= plan.max_depth)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
-    points = view.camera.back_project(view.depth.float())[valid].double()
-    return band_blocks((points - T_cw[:3, 3]) @ T_cw[:3, :3], plan.voxel, plan.truncation)
+    return blocks_seen(view.depth.float(), valid, view.camera, T_cw, plan.voxel, plan.truncation)
 
 
 def boxes_of(blocks: Int[np.ndarray, "k 3"], most: int) -> list[BlockBox]:
@@ -75,7 +75,7 @@ def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> b
     centre, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
     T = T_cw.double().numpy()
     point = torch.from_numpy(T[:3, :3] @ centre + T[:3, 3])[None]
-    far = plan.max_depth + plan.truncation * plan.voxel
+    far = plan.max_depth + widest(plan.truncation * plan.voxel)
     return bool(meets_frustum(point, radius, camera, far))
 
 

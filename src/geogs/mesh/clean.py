@@ -8,8 +8,9 @@ from geogs.errors import InputError
 from geogs.mesh.holes import IsFree, close_holes
 from geogs.mesh.triangle_mesh import Mesh
 
-LEAST_OF_LARGEST = 0.001
-"""Parts with fewer faces than this fraction of the largest part's are removed: specks."""
+LEAST_OF_LARGEST = 2e-4
+"""Parts with fewer faces than this fraction of the largest part's are removed: specks. Of
+a road with its fronts, one part, a trunk or a sign is less than a thousandth."""
 CLOSED_HOLES = 8
 """Holes with so many edges or fewer are closed, unless somebody looked through them."""
 

@@ -9,14 +9,13 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.jumps import minmod_slopes
 from geogs.gpu.kernels import kernels_for
+from geogs.mesh.pixel_planes import PixelPlanes, footprint_points
 from geogs.threads import run_chunks, worker_count
 
 BLOCK = 8
@@ -72,6 +71,23 @@ def band_blocks(
     blocks = low[:, None] + offsets
     inside = (blocks <= high[:, None]).all(-1)
     return unpack(torch.unique(pack(blocks[inside])))
+
+
+def blocks_seen(
+    depth: Float[Tensor, "h w"],
+    valid: Bool[Tensor, "h w"],
+    camera: Camera,
+    T_cw: Float[Tensor, "4 4"],
+    voxel: float,
+    truncation: float,
+) -> Int[Tensor, "k 3"]:
+    """Coordinates of the blocks in which the surface of a depth map lies, with its band.
+
+    Footprints are followed from one half block to the next, so that a floor that is seen at a
+    slant has no gaps between the rows of the image.
+    """
+    points = footprint_points(depth, valid, camera, voxel * _HALF).double()
+    return band_blocks((points - T_cw[:3, 3]) @ T_cw[:3, :3], voxel, truncation)
 
 
 def meets_frustum(
@@ -166,12 +182,12 @@ class SparseTsdf:
     ) -> None:
         """Average one depth map in.
 
-        Each pixel is a small plane: its inverse depth with its slopes, which is exact on flat
-        surfaces at any slant and does not mix the two sides of a depth step. Every voxel of every
-        block in view is updated up to one truncation behind the surface, so free space seen later
-        clears what an earlier view put there. In the farther half of that the weight falls to
-        zero (Bylow et al. 2013), since what is behind one view's silhouette is often in front of
-        another's surface. Distances are along the optical axis.
+        Each pixel is a small plane, which is exact on flat surfaces at any slant and does not mix
+        the two sides of a depth step. Every voxel of every block in view is updated up to one
+        truncation behind the surface, so free space seen later clears what an earlier view put
+        there. In the farther half of that the weight falls to zero (Bylow et al. 2013), since what
+        is behind one view's silhouette is often in front of another's surface. Distances, and the
+        truncation, are along the optical axis; at a slant that is wider (``PixelPlanes``).
         """
         depth = depth.to(self.device, torch.float32)
         weight = weight.to(self.device, torch.float32)
@@ -179,36 +195,34 @@ class SparseTsdf:
         if not bool(valid.any()):
             return
         T_cw = T_cw.to(self.device, torch.float64)
-        points = camera.back_project(depth)[valid].double()
-        points = (points - T_cw[:3, 3]) @ T_cw[:3, :3]
-        self._allocate(self._kept(band_blocks(points, self.voxel, self.truncation)))
+        blocks = blocks_seen(depth, valid, camera, T_cw, self.voxel, self.truncation)
+        self._allocate(self._kept(blocks))
         if not len(self):
             return
-        table = _plane_table(depth, torch.where(valid, weight, 0.0), valid)
+        planes = PixelPlanes.of(depth, weight, valid, camera, self.truncation * self.voxel)
+        far = torch.where(valid, depth + planes.truncation.view_as(depth), 0.0).amax()
         if self.device.type == "cuda":
-            self.update_by_kernel(table, camera, T_cw, torch.where(valid, depth, 0.0).amax())
+            self.update_by_kernel(planes, camera, T_cw, far)
             return
-        far = float(depth[valid].max()) + self.truncation * self.voxel
         projection = camera.matrix() @ T_cw[:3]
-        self._update(self._in_view(camera, T_cw, far), projection, table, camera)
+        self._update(self._in_view(camera, T_cw, float(far)), projection, planes, camera)
 
     def update_by_kernel(
         self,
-        table: Float[Tensor, "p 4"],
+        planes: PixelPlanes,
         camera: Camera,
         T_cw: Float[Tensor, "4 4"],
-        farthest: Float[Tensor, ""],
+        far: Float[Tensor, ""],
     ) -> None:
         """What a GPU does in place of :meth:`_update`: all blocks in view at once.
 
-        ``farthest`` is the largest depth of the map; it stays on the device.
+        Nothing changes beyond the depth ``far``, which stays on the device.
         """
         c = camera
-        far = farthest + self.truncation * self.voxel
         kernels_for(_SOURCE, self.device)["integrate"](
-            len(self), BLOCK**3, self._coordinates, self._distance, self._weight, table,
-            T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
-            self.voxel, self.truncation,
+            len(self), BLOCK**3, self._coordinates, self._distance, self._weight, planes.table,
+            planes.truncation, T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
+            self.voxel,
         )  # fmt: skip
 
     def _kept(self, blocks: Int[Tensor, "k 3"]) -> Int[Tensor, "l 3"]:
@@ -253,7 +267,7 @@ class SparseTsdf:
         self,
         slots: Int[Tensor, "k"],
         projection: Float[Tensor, "3 4"],
-        table: Float[Tensor, "p 4"],
+        planes: PixelPlanes,
         camera: Camera,
     ) -> None:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
@@ -262,23 +276,14 @@ class SparseTsdf:
         corner = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
         block = (corner + projection[:, 3:]).float().mT.contiguous().numpy()
         local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float().numpy()
-        distance, weight, planes = (x.numpy() for x in (self._distance, self._weight, table))
-        truncation = np.float32(self.truncation * self.voxel)
+        distance, weight = self._distance.numpy(), self._weight.numpy()
+        table, truncation = planes.table.numpy(), planes.truncation.numpy()
 
         def update(chunk: int) -> None:
             some = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
             average_in(
-                slots.numpy()[some], block[some], local, planes, camera.width, camera.height,
-                truncation, distance, weight,
+                slots.numpy()[some], block[some], local, table, truncation, camera.width,
+                camera.height, distance, weight,
             )  # fmt: skip
 
         run_chunks(update, -(-len(slots) // _CHUNK), worker_count())
-
-
-def _plane_table(
-    depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
-) -> Float[Tensor, "p 4"]:
-    """Inverse depth, its slopes along u and v (1 / map unit / pixel) and weight of each pixel."""
-    inverse = torch.where(valid, 1.0 / torch.where(valid, depth, 1.0), 1.0)
-    right, down = minmod_slopes(inverse, valid)
-    return torch.stack([inverse, right, down, weight], -1).flatten(0, 1)

@@ -7,12 +7,11 @@ _ONE, _TWO, _NEAREST = np.float32(1), np.float32(2), np.float32(1e-6)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def average_in(slots, block, local, table, width, height, truncation, distance, weight):
+def average_in(slots, block, local, table, truncation, width, height, distance, weight):
     """Update the voxels of some blocks (k,) of ``distance`` and ``weight`` (blocks, voxels).
 
     ``block`` (k, 3) and ``local`` (3, voxels) add up to a voxel's u z, v z and z in the image;
-    ``table`` (pixels, 4) holds inverse depth, its slopes and the weight; ``truncation`` is in map
-    units.
+    ``table`` (pixels, 4) and ``truncation`` (pixels), in map units, are those of ``PixelPlanes``.
     """
     for k in range(len(slots)):
         slot = slots[k]
@@ -26,9 +25,10 @@ def average_in(slots, block, local, table, width, height, truncation, distance, 
             column, row = np.rint(u), np.rint(v)
             if not (column >= 0 and row >= 0 and column < width and row < height):
                 continue
-            plane = table[np.int64(row) * width + np.int64(column)]
+            pixel = np.int64(row) * width + np.int64(column)
+            plane = table[pixel]
             surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
-            ahead = (_ONE / surface - z) / truncation
+            ahead = (_ONE / surface - z) / truncation[pixel]
             if not ahead > -_ONE:
                 continue
             gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)

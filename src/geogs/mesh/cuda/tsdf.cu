@@ -19,15 +19,16 @@ __device__ __forceinline__ bool in_view(const double c[3], float radius, float f
 }
 
 // One thread block per volume block, one thread per voxel. planes (h, w, 4) holds inverse depth, its
-// two slopes and the weight of each pixel; T_cw (4, 4) is world to camera; far (1) the depth behind
-// which nothing changes. distance and weight (blocks, 512) are averaged in place.
+// two slopes and the weight of each pixel, truncation (h, w) that along the axis in map units; T_cw
+// (4, 4) is world to camera; far (1) the depth behind which nothing changes. distance and weight
+// (blocks, 512) are averaged in place.
 extern "C" __global__ void integrate(const long long* __restrict__ coordinates,
                                      float* __restrict__ distance, float* __restrict__ weight,
                                      const float4* __restrict__ planes,
+                                     const float* __restrict__ truncation,
                                      const double* __restrict__ T_cw,
                                      const float* __restrict__ far, int width, int height,
-                                     float fx, float fy, float cx, float cy, double voxel,
-                                     float truncation) {
+                                     float fx, float fy, float cx, float cy, double voxel) {
   const int block = blockIdx.x, i = threadIdx.x;
   const double* T = T_cw;
   double corner[3], centre[3];
@@ -50,9 +51,10 @@ extern "C" __global__ void integrate(const long long* __restrict__ coordinates,
   const float u = fx * p[0] / p[2] + cx, v = fy * p[1] / p[2] + cy;
   const float column = rintf(u), row = rintf(v);
   if (!(column >= 0.f && row >= 0.f && column < width && row < height)) return;
-  const float4 plane = planes[(int)row * width + (int)column];
+  const int pixel = (int)row * width + (int)column;
+  const float4 plane = planes[pixel];
   const float surface = plane.x + plane.y * (u - column) + plane.z * (v - row);
-  const float ahead = (1.f / surface - p[2]) / (truncation * (float)voxel);
+  const float ahead = (1.f / surface - p[2]) / truncation[pixel];
   if (!(ahead > -1.f)) return;
   const float gain = plane.w * fminf(2.f + 2.f * ahead, 1.f);
   if (!(gain > 0.f)) return;
