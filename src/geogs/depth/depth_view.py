@@ -103,8 +103,9 @@ class DenseDepth:
 
     def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
         """Nothing known in the mask; the depth there, and the median, stay what they are."""
-        confidence = torch.where(mask.to(self.confidence.device), 0.0, self.confidence)
-        return DenseDepth(self.depth, confidence, self.median, self.written)
+        mask = mask.to(self.confidence.device)
+        normal = None if self.normal is None else torch.where(mask[..., None], 0.0, self.normal)
+        return replace(self, confidence=torch.where(mask, 0.0, self.confidence), normal=normal)
 
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""

@@ -5,6 +5,7 @@ import torch
 from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthEngine
 from geogs.depth.far_side import FarSideSearch
+from geogs.depth.unbounded import BoundedSearch
 from geogs.geometry.camera import Camera
 
 
@@ -20,6 +21,16 @@ def depth_engine(
 
     Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
+    return BoundedSearch(_search(device, render, working, config, resident), render)
+
+
+def _search(
+    device: torch.device | str,
+    render: Camera,
+    working: Camera,
+    config: DepthConfig,
+    resident: int,
+) -> DepthEngine:
     classical = _classical(device, render, working, config, resident)
     if torch.device(device).type == "cpu":  # tried nowhere else
         classical = FarSideSearch(classical, render)

@@ -45,16 +45,39 @@ def photo_vote(
         same: where both are of one surface, from which the neighbours' noise and light are learned.
         camera: of the depths and of the views' ``grey``.
     """
+    guide, costs = _single_pixels(reference, neighbours, depths, same, camera)
+    return averaged_by_colour(costs[0] - costs[1], guide)
+
+
+def photo_costs(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    depths: Float[Tensor, "2 h w"],
+    same: Bool[Tensor, "h w"],
+    camera: Camera,
+) -> Float[Tensor, "2 h w"]:
+    """How badly the images agree at each of two depths, in [0, 1]; arguments as above."""
+    guide, costs = _single_pixels(reference, neighbours, depths, same, camera)
+    return averaged_by_colour(costs, guide)
+
+
+def _single_pixels(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    depths: Float[Tensor, "2 h w"],
+    same: Bool[Tensor, "h w"],
+    camera: Camera,
+) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "2 h w"]]:
+    """Colours of the reference in [0, 1], and the cost of each pixel at each depth."""
     device, size = depths.device, (camera.width, camera.height)
     grey = torch.from_numpy(np.stack([v.grey for v in (reference, *neighbours)])).to(device)
     poses = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
     differences = torch.stack(
         [seen_from(grey[1:], poses, depth, camera) - grey[0] for depth in depths]
     )
-    costs = best_half(truncated(differences, same))
     colour = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
     guide = torch.from_numpy(colour).to(device).movedim(-1, 0).float() / 255
-    return averaged_by_colour(costs[0] - costs[1], guide)
+    return guide, best_half(truncated(differences, same))
 
 
 def seen_from(
@@ -103,19 +126,20 @@ def best_half(costs: Float[Tensor, "*b n h w"]) -> Float[Tensor, "*b h w"]:
 
 
 def averaged_by_colour(
-    values: Float[Tensor, "h w"], guide: Float[Tensor, "3 h w"]
-) -> Float[Tensor, "h w"]:
+    values: Float[Tensor, "*b h w"], guide: Float[Tensor, "3 h w"]
+) -> Float[Tensor, "*b h w"]:
     """Each pixel's mean over those within ``RADIUS``, weighted by their likeness in colour."""
-    height, width = values.shape
+    height, width = values.shape[-2:]
     sides = (RADIUS,) * 4
-    around = F.pad(values[None, None], sides, mode="replicate")[0, 0]
+    around = F.pad(values.reshape(1, -1, height, width), sides, mode="replicate")[0]
+    around = around.reshape(*values.shape[:-2], *around.shape[1:])
     colours = F.pad(guide[None], sides, mode="replicate")[0]
-    total, weights = torch.zeros_like(values), torch.zeros_like(values)
+    total, weights = torch.zeros_like(values), torch.zeros_like(guide[0])
     for dy in range(2 * RADIUS + 1):
         for dx in range(2 * RADIUS + 1):
             rows, columns = slice(dy, dy + height), slice(dx, dx + width)
             apart = (colours[:, rows, columns] - guide).abs().mean(0)
             weight = (apart * (-1 / CONTRAST)).exp()
-            total += weight * around[rows, columns]
+            total += weight * around[..., rows, columns]
             weights += weight
     return total / weights

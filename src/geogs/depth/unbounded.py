@@ -1,0 +1,75 @@
+"""Sky: pixels whose depth no parallax bounds from above."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView
+from geogs.depth.photo_vote import photo_costs
+from geogs.geometry.camera import Camera
+from geogs.threads import thread_map
+
+FAR = 2.0
+"""Times the median depth from which a pixel is asked: a bare wall nearby looks the same at any
+depth, and is none of these."""
+_ASKED = 0.005
+"""Least part of a view for which it is worth it."""
+WORSE = 0.03
+"""By how much the cost at infinity may exceed that of the depth found: their difference has so much
+noise where both are right."""
+AGREES = 0.3
+"""Cost up to which images agree: surfaces that are found right have 0.4, seen at infinity 0.9."""
+_SURE = 0.5
+"""Least confidence of depths from which noise and light are learned."""
+_INFINITY = 1e6
+"""Times the median depth."""
+
+
+class BoundedSearch(AlternativeSearch):
+    """A search that is not sure of any depth where the images agree as well at infinity."""
+
+    def __init__(self, search: DepthEngine, render: Camera) -> None:
+        super().__init__(search)
+        self.render = render
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+        searched = self.classical.estimate(references, neighbours, progress, limits)
+        tasks = list(zip(references, neighbours, searched, strict=True))
+        return thread_map(lambda task: self._bounded(*task), tasks)
+
+    def _bounded(
+        self, view: DepthView, others: Sequence[DepthView], found: DenseDepth
+    ) -> DenseDepth:
+        sky = unbounded(view, others, found, self.render)
+        return found if sky is None else found.unsure_where(sky)
+
+
+def unbounded(
+    view: DepthView, others: Sequence[DepthView], found: DenseDepth, render: Camera
+) -> Bool[Tensor, "h w"] | None:
+    """Far pixels where the other views agree at infinity, and not worse than at the depth found.
+
+    At infinity only the rotations between the views count. What is asked is a mean over single
+    pixels of like colour (``photo_costs``), so that a roof says nothing of the sky beside it.
+    None where hardly a pixel is far, or there is nothing to compare with.
+    """
+    sure = found.confidence > _SURE
+    if not others or not bool(sure.any()):
+        return None
+    typical = found.depth[sure].median()
+    is_far = found.depth > FAR * typical
+    if float(is_far.float().mean()) < _ASKED:
+        return None
+    depths = torch.stack([found.depth, (_INFINITY * typical).expand_as(found.depth)])
+    here, beyond = photo_costs(view, others, depths, sure, render)
+    return is_far & (beyond < AGREES) & (beyond < here + WORSE)
