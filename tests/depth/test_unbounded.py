@@ -10,7 +10,7 @@ import torch
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.depth_engine import AlternativeSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, depth_images
-from geogs.depth.unbounded import FAR, BoundedSearch, unbounded
+from geogs.depth.unbounded import FAR, SkySearch, unbounded
 from geogs.geometry.camera import Camera
 
 HORIZON = -0.05
@@ -106,10 +106,10 @@ def test_the_search_is_sure_of_no_sky():
     normal = torch.zeros(*depth.shape, 3)
     normal[..., 2] = -1
     given = replace(dense(depth), normal=normal)
-    (found,) = BoundedSearch(Found(given), RENDER).estimate([views[0]], [views[1:]])
+    (found,) = SkySearch(Found(given), RENDER).estimate([views[0]], [views[1:]])
     unsure = found.confidence == 0
     assert unsure[torch.from_numpy(inner(sky))].float().mean() > 0.95
     assert (found.confidence[~unsure] == given.confidence[~unsure]).all()
     assert (found.depth == given.depth).all()
-    assert (found.normal[unsure] == 0).all()
-    assert (found.normal[~unsure] == normal[~unsure]).all()
+    assert (found.sky == unsure).all()
+    assert (found.normal == normal).all()

@@ -41,8 +41,8 @@ class LossConfig(Settings, group="mapping.loss"):
     """L_dist, spread of the depths along a ray over the map's length unit."""
     opacity_weight: Weight = 0.1
     """1 - alpha, closes holes."""
-    silhouette_weight: Annotated[Weight, Only("reconstruct")] = 0.3
-    """alpha outside the masks, where there are masks."""
+    silhouette_weight: Weight = 0.3
+    """alpha in the sky, and outside the masks where there are masks."""
     smoothness_weight: Weight = 0.0
     """L_ds, edge-aware smoothness of depth over its median."""
     l1_weight: Weight = 4.0

@@ -72,6 +72,8 @@ class DenseDepth:
     """After which a GPU has written the median."""
     normal: Float32[Tensor, "h w 3"] | None = None
     """Unit, camera frame, facing the camera, where who found the depth knows it; zero elsewhere."""
+    sky: Bool[Tensor, "h w"] | None = None
+    """Where nothing is, however far one looks; there nothing is known of a depth, either."""
 
     @staticmethod
     def of(depth: KeyframeDepth) -> "DenseDepth":
@@ -103,9 +105,12 @@ class DenseDepth:
 
     def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
         """Nothing known in the mask; the depth there, and the median, stay what they are."""
-        mask = mask.to(self.confidence.device)
-        normal = None if self.normal is None else torch.where(mask[..., None], 0.0, self.normal)
-        return replace(self, confidence=torch.where(mask, 0.0, self.confidence), normal=normal)
+        confidence = torch.where(mask.to(self.confidence.device), 0.0, self.confidence)
+        return replace(self, confidence=confidence, normal=None)
+
+    def under(self, sky: Bool[Tensor, "h w"] | None) -> "DenseDepth":
+        """With that sky."""
+        return self if sky is None else replace(self.unsure_where(sky), normal=self.normal, sky=sky)
 
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""

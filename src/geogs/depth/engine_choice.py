@@ -5,7 +5,7 @@ import torch
 from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthEngine
 from geogs.depth.far_side import FarSideSearch
-from geogs.depth.unbounded import BoundedSearch
+from geogs.depth.unbounded import SkySearch
 from geogs.geometry.camera import Camera
 
 
@@ -21,16 +21,6 @@ def depth_engine(
 
     Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
-    return BoundedSearch(_search(device, render, working, config, resident), render)
-
-
-def _search(
-    device: torch.device | str,
-    render: Camera,
-    working: Camera,
-    config: DepthConfig,
-    resident: int,
-) -> DepthEngine:
     classical = _classical(device, render, working, config, resident)
     if torch.device(device).type == "cpu":  # tried nowhere else
         classical = FarSideSearch(classical, render)
@@ -38,7 +28,7 @@ def _search(
     if engine == "auto":
         engine = "joint" if torch.device(device).type == "cuda" else "classical"
     if engine == "classical":
-        return classical
+        return SkySearch(classical, render)
     if engine == "tracker":
         from geogs.depth.tracker_depth import TrackerDepthEngine
 
@@ -52,10 +42,10 @@ def _search(
         trained, classical, torch.device(device), render, working, resident
     )
     if engine == "network":
-        return network
+        return SkySearch(network, render)
     from geogs.depth.network.joint import JointDepthEngine
 
-    return JointDepthEngine(network, classical, render)
+    return SkySearch(JointDepthEngine(network, classical, render), render)
 
 
 def _classical(

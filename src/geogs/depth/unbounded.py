@@ -7,7 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
 from geogs.depth.photo_vote import photo_costs
 from geogs.geometry.camera import Camera
 from geogs.threads import thread_map
@@ -28,8 +28,8 @@ _INFINITY = 1e6
 """Times the median depth."""
 
 
-class BoundedSearch(AlternativeSearch):
-    """A search that is not sure of any depth where the images agree as well at infinity."""
+class SkySearch(AlternativeSearch):
+    """A search that finds sky where the images agree as well at infinity."""
 
     def __init__(self, search: DepthEngine, render: Camera) -> None:
         super().__init__(search)
@@ -45,13 +45,14 @@ class BoundedSearch(AlternativeSearch):
         """As in the protocol."""
         searched = self.classical.estimate(references, neighbours, progress, limits)
         tasks = list(zip(references, neighbours, searched, strict=True))
-        return thread_map(lambda task: self._bounded(*task), tasks)
+        return thread_map(lambda t: t[2].under(unbounded(*t, self.render)), tasks)
 
-    def _bounded(
-        self, view: DepthView, others: Sequence[DepthView], found: DenseDepth
-    ) -> DenseDepth:
-        sky = unbounded(view, others, found, self.render)
-        return found if sky is None else found.unsure_where(sky)
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol; what is sky stays sky."""
+        checked = self.classical.check(depths, others)
+        return [found.under(own.depth.sky) for own, found in zip(depths, checked, strict=True)]
 
 
 def unbounded(

@@ -39,7 +39,8 @@ class ViewConstants:
     image_gradient: Float[Tensor, "h w"]
     """Image gradient in grey values per pixel, see :func:`gradient_norm`."""
     prior_depth: Float[Tensor, "h w"]
-    """The keyframe's own depth D_f in map units; 0 where unknown, ``OUTSIDE`` beyond a mask."""
+    """The keyframe's own depth D_f in map units; 0 where unknown, ``OUTSIDE`` beyond a mask
+    and in the sky."""
     confidence: Float[Tensor, "h w"]
     """Weight of the prior depth, in [0, 1] unless it was measured."""
     prior_normal: Float[Tensor, "h w 3"] | None = None

@@ -16,10 +16,13 @@ def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> S
     maps = depth.arrays()
     arrays.put("depth", id, maps.depth)
     arrays.put("confidence", id, maps.confidence)
-    if depth.normal is None:
-        arrays.drop("depth normal", id)
-    else:  # nobody measures with them
-        arrays.put("depth normal", id, depth.normal.half().cpu().numpy())
+    # Nobody measures with the normals.
+    normal = None if depth.normal is None else depth.normal.half()
+    for name, values in (("depth normal", normal), ("sky", depth.sky)):
+        if values is None:
+            arrays.drop(name, id)
+        else:
+            arrays.put(name, id, values.cpu().numpy())
     return SearchedDepth(depth.typical, scale)
 
 
@@ -30,8 +33,9 @@ def get_depth(
     depth, confidence = (torch.from_numpy(arrays.load(n, id)) for n in ("depth", "confidence"))
     if scale != stored.scale:
         depth = depth * (scale / stored.scale)
-    normal = arrays.get("depth normal", id)
+    normal, sky = arrays.get("depth normal", id), arrays.get("sky", id)
     return DenseDepth(
         depth.to(device), confidence.to(device), torch.tensor(stored.typical_at(scale)),
         normal=None if normal is None else torch.from_numpy(normal).float().to(device),
+        sky=None if sky is None else torch.from_numpy(sky).to(device),
     )  # fmt: skip

@@ -218,10 +218,8 @@ class ViewArrays:
             if known is not None and known[0] is written:
                 recent.put(id, known)
                 depth, typical = known[1], torch.tensor(written.typical_at(scale))
-                factor = scale / written.scale
-                return DenseDepth(
-                    depth.depth * factor, depth.confidence, typical, normal=depth.normal
-                )
+                scaled = depth.depth * (scale / written.scale)
+                return replace(depth, depth=scaled, median=typical, written=None)
         return get_depth(arrays, id, written, scale, self.device)
 
     def _at_scale(self, id: int, loaded: LoadedView) -> LoadedView:
@@ -238,8 +236,9 @@ class ViewArrays:
         is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
         weight = depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
         at_edges = sure_jumps(depth).around(self.loss.edge_reach)
+        prior = depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE)
         return (
-            depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE),
+            prior if depth.sky is None else torch.where(depth.sky, OUTSIDE, prior),
             torch.where(at_edges, self.loss.edge_factor * weight, weight),
             depth.normal if loaded.normal is None else loaded.normal,
         )

@@ -22,6 +22,7 @@ MAP_ARRAYS = {
     "depth": Annotated[Float32[np.ndarray, "h w"], POSITIVE],
     "confidence": Annotated[Float32[np.ndarray, "h w"], Range(0, 1)],
     "depth normal": Float16[np.ndarray, "h w 3"],
+    "sky": Bool[np.ndarray, "h w"],
     "rendered depth": Annotated[Float32[np.ndarray, "h w"], AT_LEAST_0],
 }
 """The large arrays that a view may have."""
