@@ -1,15 +1,17 @@
 """Sky: pixels whose depth no parallax bounds from above."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
 from geogs.depth.photo_vote import photo_costs
 from geogs.geometry.camera import Camera
+from geogs.on_demand import OnDemand
 from geogs.threads import thread_map
 
 FAR = 2.0
@@ -53,6 +55,20 @@ class SkySearch(AlternativeSearch):
         """As in the protocol; what is sky stays sky."""
         checked = self.classical.check(depths, others)
         return [found.under(own.depth.sky) for own, found in zip(depths, checked, strict=True)]
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol; all that is seen in the sky stands in free space."""
+        return self.classical.keep(points, OnDemand(depths, _with_sky_far_away))
+
+
+def _with_sky_far_away(posed: PosedDepth) -> PosedDepth:
+    """The sky as a depth that is sure, and behind everything."""
+    found = posed.depth
+    if found.sky is None:
+        return posed
+    far = torch.where(found.sky, _INFINITY * found.depth, found.depth)
+    sure = torch.where(found.sky, 1.0, found.confidence)
+    return replace(posed, depth=replace(found, depth=far, confidence=sure))
 
 
 def unbounded(
