@@ -12,6 +12,8 @@ from geogs.geometry.depth_maps import normals_from_depth
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
+from geogs_synth.raycast.solid_kernels import crossing
+from geogs_synth.raycast.visibility_kernels import visibility_slices
 from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
@@ -223,3 +225,37 @@ def test_resolution_keeps_geometry(raycaster: Raycaster, poses: np.ndarray) -> N
     fine, coarse = (raycaster.render(c, poses[5]) for c in (large, small))
     np.testing.assert_allclose(fine.depth[1::3, 1::3], coarse.depth, rtol=1e-6)
     assert math.isclose(small.cx, 39.5)
+
+
+def test_light_reaches_cells_as_if_every_solid_was_asked():
+    """Solids that are left out because they are far from a ray would not have been in its way."""
+    room = make_room(0)
+    s, rng = room.solids, np.random.default_rng(0)
+    radius = np.linalg.norm(s.bounding_half, axis=1)
+    solids = s.kind, s.half, s.rotation, s.centre, radius
+    sphere = rng.standard_normal((16, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    lights = np.array([[*(0.5 * room.size), 0.2], [*(0.2 * room.size), 0.05]])
+    voxel, reach = 0.5, 0.7
+    nx, ny, nz = np.ceil(room.size / voxel).astype(int)
+    volume = np.zeros((nz, ny, nx, 3), np.float32)
+    visibility_slices(*solids, lights, sphere, reach, voxel, 0, nz, volume)
+
+    def is_free(p, d, length):
+        return all(
+            crossing(*(a[i] for a in solids), *p, *d, length, False)[0] >= length
+            for i in range(len(radius))
+        )
+
+    partly = 0
+    for cell in rng.integers(0, (nz, ny, nx), (25, 3)):
+        p = (cell[::-1] + 0.5) * voxel
+        free = np.mean([is_free(p, d, reach) for d in sphere])
+        assert volume[*cell, 0] == pytest.approx(min(1.0, 2 * free), abs=1e-6)
+        for k, (*centre, size) in enumerate(lights):
+            ends = np.array(centre) + size * sphere[::2] - p
+            far = np.linalg.norm(ends, axis=1)
+            seen = np.mean([is_free(p, e / n, n) for e, n in zip(ends, far, strict=True)])
+            assert volume[*cell, 1 + k] == pytest.approx(seen, abs=1e-6)
+            partly += 0 < seen < 1
+    assert partly > 3
