@@ -12,9 +12,10 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
-from geogs.loop.row_correction import _readout_gradient, _Search, correct_rows
+from geogs.loop.row_correction import FIRST_STEP, _readout_gradient, _Search, correct_rows
 from geogs.tracking.frames.pose_filling import row_errors
 from geogs.tracking.frames.row_errors import RowErrors
+from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid
@@ -175,3 +176,26 @@ def test_nothing_happens_to_a_global_shutter():
     correct_rows(tracker, [1], [0, 1], BundleOptions())
     assert torch.equal(tracker.map.graph.edges[0, 1].position, before)
     assert torch.equal(tracker.keyframes[1].T_cw, pose(np.arange(COUNT))[1])
+
+
+@pytest.mark.parametrize(
+    ("doubt", "best", "steps"),
+    [(0.0, None, [4, 10]), (0.1, 0.9, [4, 4, 4, 10]), (0.1, 1 - FIRST_STEP, [4, 4, 10])],
+    ids=["a readout that was told", "one that is far", "one that the first trial finds"],
+)
+def test_only_the_last_adjustment_is_a_long_one(monkeypatch, doubt, best, steps):
+    tracker, taken = tracker_of_rows(as_read(1.15, doubt=doubt)), []
+    given = FrameGraph.adjust
+
+    def noted(graph, edges, free_pose, free_depth, options):
+        taken.append(options.iterations)
+        return given(graph, edges, free_pose, free_depth, options)
+
+    monkeypatch.setattr(FrameGraph, "adjust", noted)
+    monkeypatch.setattr(
+        "geogs.loop.row_correction._readout_gradient",
+        lambda graph, measured, errors, factor, options: 40 * (factor - best) ** 3,
+    )
+    tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
+    correct_rows(tracker, [1, 2], [0, 1, 2], GLOBAL_OPTIONS)
+    assert taken == steps

@@ -26,9 +26,13 @@ from geogs.world.edges import PackedEdge, Pair, edge_matches, in_steps
 from geogs.world.grid import SampleGrid
 
 ROUNDS = 2
-"""The first takes most of it."""
-READOUT_ROUNDS = 3
-"""With another readout each, after these."""
+"""Where the readout is not searched for: the first takes most of it."""
+READOUTS = 3
+"""Tried after the first round, at most."""
+SETTLED = 0.003
+"""Fraction of the readout by less than which a change ends the search."""
+BETWEEN = 4
+"""Steps of an adjustment that another follows, which goes on from there."""
 FIRST_STEP, FARTHEST = 0.04, 0.25
 """Fraction of the readout that is tried first, and by which it changes at most."""
 EVIDENCE = 0.02
@@ -49,21 +53,28 @@ def correct_rows(
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = {e: edge for e, edge in graph.edges.items() if isinstance(edge, PackedEdge)}
-    search, grid = _Search(), keyframes.grid
-    for n in range(ROUNDS + READOUT_ROUNDS):
+    search, grid, last = _Search(), keyframes.grid, ROUNDS - 1
+    between = replace(options, iterations=min(options.iterations, BETWEEN))
+    for n in range(1 + READOUTS):
         errors = row_errors(log, keyframes) if measured else None
         if errors is None:
             return
-        if n >= ROUNDS:
-            search.step(_readout_gradient(graph, measured, errors, search.factor, options))
+        searches = finds_readout and errors.doubt > 0
+        if searches:
+            last = READOUTS
+        if searches and n > 0:
+            before = search.factor
+            search.step(_readout_gradient(graph, measured, errors, before, options))
+            if abs(search.factor - before) < SETTLED:
+                last = n
         present = errors.with_readout(search.factor)
         for part, shift in _shifts(graph, measured, present):
             graph.edges.update(
                 {pair: _moved(grid, measured[pair], s) for pair, s in zip(part, shift, strict=True)}
             )
-        graph.adjust(list(graph.edges), free_pose, free_depth, options)
+        graph.adjust(list(graph.edges), free_pose, free_depth, options if n == last else between)
         shift_rows(log, keyframes, present)
-        if n + 1 >= ROUNDS and not (finds_readout and errors.doubt):
+        if n == last:
             return
 
 
