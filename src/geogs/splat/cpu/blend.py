@@ -42,8 +42,9 @@ _INLINE = {**PER_PIXEL, "cache": False}
 # State planes. Offsets are unsigned, so that the compiler need not handle negative indices.
 (
     _X, _Y, _LIGHT, _MOMENT, _NORMAL_X, _NORMAL_Y, _NORMAL_Z, _DISTORTION, _MEDIAN, _LAST,
-) = (np.uint64(k * TILE_PIXELS) for k in range(10))  # fmt: skip
-BLEND_PLANES = 10
+    _ALPHA, _DEPTH,
+) = (np.uint64(k * TILE_PIXELS) for k in range(12))  # fmt: skip
+BLEND_PLANES = 12
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 CHECK_EVERY = 16
@@ -67,14 +68,15 @@ def common_runs(runs, k, first_run, last_run):
 def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
     """Blend one disk into the runs first..last of a tile; returns the sum of its weights.
 
-    A pixel's light is the transmittance, and turns negative when blending stops.
+    A pixel's light is the transmittance, and turns negative when blending stops. In two loops: of
+    one, each pixel would have so long a chain of results to wait for that the processor would wait,
+    too.
     """
     mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
     ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
     nx, ny, nz = r[NX], r[NY], r[NZ]
     nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
     least = wc * MIN_HIT_RATIO
-    shown = ZERO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
         w = wx * dx + wy * dy + wc
@@ -83,9 +85,11 @@ def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
         u, v = z * (ux * dx + uy * dy), z * (vx * dx + vy * dy)
         rho3, rho2 = u * u + v * v, dx * dx + dy * dy
         on_plane = (bounded == w) & (rho3 <= rho2)
-        z = z if on_plane else min(max(z, nearest), furthest)
-        a = min(opacity * exp_minus(rho3 if on_plane else rho2), MAX_ALPHA)
-        light = state[_LIGHT + j]
+        state[_DEPTH + j] = z if on_plane else min(max(z, nearest), furthest)
+        state[_ALPHA + j] = min(opacity * exp_minus(rho3 if on_plane else rho2), MAX_ALPHA)
+    shown = ZERO
+    for j in range(first * _RUN, last * _RUN):
+        a, z, light = state[_ALPHA + j], state[_DEPTH + j], state[_LIGHT + j]
         weight = light * a
         left = light - weight
         hit = a >= MIN_ALPHA

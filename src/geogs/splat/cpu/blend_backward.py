@@ -57,10 +57,44 @@ _INLINE = {**PER_PIXEL, "cache": False}
 (
     _X, _Y, _LIGHT, _MOMENT, _LAST, _BEHIND, _SIGNS, _SIGNED_Z,
     _D_CONSTANT, _D_Z, _D_NORMAL_X, _D_NORMAL_Y, _D_NORMAL_Z, _D_DISTORTION,
-) = (np.uint64(k * TILE_PIXELS) for k in range(14))  # fmt: skip
-UNBLEND_PLANES = 14
+    _ALPHA, _DEPTH, _FREE_DEPTH, _U, _V, _BEND, _BLUR,
+) = (np.uint64(k * TILE_PIXELS) for k in range(21))  # fmt: skip
+UNBLEND_PLANES = 21
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
+
+
+@numba.njit(**_INLINE)
+def meet_disk(state, first, last, r, rank, inverse_near):
+    """Where one disk is seen by the runs first..last of a tile, as the forward pass has it.
+
+    Per pixel: ALPHA, 0 where it was not blended; DEPTH; FREE_DEPTH, the same where it follows the
+    plane and else 0; and where the Gaussian is that of the plane, z u in U, z v in V and z rho in
+    BEND, else 0, and 1 in BLUR.
+    """
+    mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
+    ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
+    nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
+    least = wc * MIN_HIT_RATIO
+    for j in range(first * _RUN, last * _RUN):
+        dx, dy = state[_X + j] - mx, state[_Y + j] - my
+        w = wx * dx + wy * dy + wc
+        bounded = min(max(w, least), inverse_near)
+        z = ONE / bounded
+        u, v = z * (ux * dx + uy * dy), z * (vx * dx + vy * dy)
+        rho3, rho2 = u * u + v * v, dx * dx + dy * dy
+        on_plane = (bounded == w) & (rho3 <= rho2)
+        z_kept = min(max(z, nearest), furthest)
+        free = on_plane | ((z_kept == z) & (bounded == w))
+        a = opacity * exp_minus(rho3 if on_plane else rho2)
+        blended = (a >= MIN_ALPHA) & (state[_LAST + j] >= rank)
+        state[_ALPHA + j] = min(a, MAX_ALPHA) if blended else ZERO
+        state[_DEPTH + j] = z if on_plane else z_kept
+        state[_FREE_DEPTH + j] = z if free else ZERO
+        state[_U + j] = u * z if on_plane else ZERO
+        state[_V + j] = v * z if on_plane else ZERO
+        state[_BEND + j] = rho3 * z if on_plane else ZERO
+        state[_BLUR + j] = ZERO if on_plane else ONE
 
 
 @numba.njit(**_INLINE)
@@ -73,36 +107,22 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
 
         dL/dw = 2 |q| + 2 sum_{i behind} w_i s_i (z_i - z),
         dL/dz = 2 w (s A - sum_{i behind} w_i s_i).
+
+    In two loops: of one, each pixel would have so long a chain of results to wait for that the
+    processor would wait, too.
     """
-    mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
-    ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
+    meet_disk(state, first, last, r, rank, inverse_near)
+    mx, my, opacity = r[MX], r[MY], r[OPACITY]
     nx, ny, nz = r[NX], r[NY], r[NZ]
-    nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
-    least = wc * MIN_HIT_RATIO
     s_u = s_ux = s_uy = s_v = s_vx = s_vy = s_w = s_wx = s_wy = ZERO
     s_clamped = s_mx = s_my = s_opacity = s_nx = s_ny = s_nz = ZERO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
-        w = wx * dx + wy * dy + wc
-        bounded = min(max(w, least), inverse_near)
-        z = ONE / bounded
-        u, v = z * (ux * dx + uy * dy), z * (vx * dx + vy * dy)
-        rho3, rho2 = u * u + v * v, dx * dx + dy * dy
-        on_plane = (bounded == w) & (rho3 <= rho2)
-        z_kept = min(max(z, nearest), furthest)
-        free = on_plane | ((z_kept == z) & (bounded == w))
-        z_hit = z if on_plane else z_kept
-        rho = rho3 if on_plane else rho2
-        gauss = exp_minus(rho)
-        a = opacity * gauss
-        blended = (a >= MIN_ALPHA) & (state[_LAST + j] >= rank)
-        is_free_alpha = blended & (a < MAX_ALPHA)
-        a = min(a, MAX_ALPHA) if blended else ZERO
+        a, zc, z_free = state[_ALPHA + j], state[_DEPTH + j] - z_reference, state[_FREE_DEPTH + j]
         inverse = ONE / (ONE - a)
         light_behind = state[_LIGHT + j]
         light = light_behind * inverse
         weight = light * a
-        zc = z_hit - z_reference
         moment = state[_MOMENT + j] - weight * zc
         covered = ONE - light
         q = zc * covered - moment
@@ -114,19 +134,16 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         g_weight += d_distortion * (abs(q) + signed_z - zc * signs)
         g_z = weight * (d_z + d_distortion * (sign * covered - signs))
         g_alpha = (light_behind * g_weight - behind) * inverse
-        g_alpha = g_alpha if is_free_alpha else ZERO
+        g_alpha = g_alpha * a if a < MAX_ALPHA else ZERO
         state[_LIGHT + j] = light
         state[_MOMENT + j] = moment
         state[_BEHIND + j] = behind + weight * g_weight
         state[_SIGNS + j] = signs + weight * sign
         state[_SIGNED_Z + j] = signed_z + weight * sign * zc
 
-        g_rho = -g_alpha * a
-        g_rho3 = TWO * g_rho if on_plane else ZERO
-        g_rho2 = TWO * g_rho - g_rho3
-        g_u, g_v = g_rho3 * u * z, g_rho3 * v * z
-        g_w = -z * (z * g_z + g_rho3 * rho)
-        g_w = g_w if free else ZERO
+        g_rho = -TWO * g_alpha
+        g_u, g_v, g_rho2 = g_rho * state[_U + j], g_rho * state[_V + j], g_rho * state[_BLUR + j]
+        g_w = -z_free * z_free * g_z - g_rho * state[_BEND + j]
         s_u += g_u
         s_ux += g_u * dx
         s_uy += g_u * dy
@@ -136,16 +153,16 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         s_w += g_w
         s_wx += g_w * dx
         s_wy += g_w * dy
-        s_clamped += ZERO if free else g_z
+        s_clamped += ZERO if z_free > ZERO else g_z
         s_mx -= g_rho2 * dx
         s_my -= g_rho2 * dy
-        s_opacity += g_alpha * gauss
+        s_opacity += g_alpha
         s_nx += weight * h_x
         s_ny += weight * h_y
         s_nz += weight * h_z
     g[G_U], g[G_UX], g[G_UY], g[G_V], g[G_VX], g[G_VY] = s_u, s_ux, s_uy, s_v, s_vx, s_vy
     g[G_W], g[G_WX], g[G_WY], g[G_CLAMPED] = s_w, s_wx, s_wy, s_clamped
-    g[G_MX], g[G_MY], g[G_OPACITY] = s_mx, s_my, s_opacity
+    g[G_MX], g[G_MY], g[G_OPACITY] = s_mx, s_my, s_opacity / opacity
     g[G_NX], g[G_NY], g[G_NZ] = s_nx, s_ny, s_nz
 
 
