@@ -18,11 +18,29 @@ ZERO, HALF, ONE, TWO, HUGE = (np.float32(v) for v in (0, 0.5, 1, 2, 1e30))
 
 
 @njit(**PART)
-def sample_plain(image, i, j, fx, fy):
-    """Bilinear value between (j, i) and (j + 1, i + 1) and its derivatives along x and y."""
-    p, q, r, s = image[j, i], image[j, i + 1], image[j + 1, i], image[j + 1, i + 1]
-    upper, lower = p + (q - p) * fx, r + (s - r) * fx
-    return upper + (lower - upper) * fy, (q - p) * (ONE - fy) + (s - r) * fy, lower - upper
+def fetch_corners(image, us, vs, index, shares, corners):
+    """What a bilinear sample of a row of places needs: ``corners`` (4, w) receives the pixels at
+    the upper left, upper right, lower left and lower right, ``shares`` (2, w) the fractions.
+
+    Places are held within the image. The copying of pixels is a loop of its own, so that the
+    others, which compute, are vectorised.
+    """
+    height, width = image.shape
+    last_u, last_v = np.float32(width - 1), np.float32(height - 1)
+    most_i, most_j = np.float32(width - 2), np.float32(height - 2)
+    fx, fy = shares[0], shares[1]
+    for x in range(us.shape[0]):
+        u, v = min(max(us[x], ZERO), last_u), min(max(vs[x], ZERO), last_v)
+        i, j = min(np.floor(u), most_i), min(np.floor(v), most_j)
+        fx[x], fy[x] = u - i, v - j
+        index[x] = np.uint32(np.int32(j) * np.int32(width) + np.int32(i))
+    flat, right, down = image.ravel(), np.uint32(1), np.uint32(width)
+    p, q, r, s = corners[0], corners[1], corners[2], corners[3]
+    for x in range(us.shape[0]):
+        k = index[x]
+        p[x], q[x] = flat[k], flat[k + right]
+        k += down
+        r[x], s[x] = flat[k], flat[k + right]
 
 
 @njit(**PART)
@@ -49,16 +67,44 @@ def sample_sobel(image, i, j, fx, fy):
 
 
 @njit(**PART)
-def is_visible(depth, u, v, z, tolerance):
-    """Whether a point of depth ``z`` at (u, v) of the target's depth map is not hidden there."""
-    height, width = depth.shape
-    u, v = min(max(u, ZERO), np.float32(width - 1)), min(max(v, ZERO), np.float32(height - 1))
-    i, j = min(int(u), width - 2), min(int(v), height - 2)
-    p, q, r, s = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
-    fx, fy = u - np.float32(i), v - np.float32(j)
-    upper, lower = p + (q - p) * fx, r + (s - r) * fx
-    known = (p > ZERO) & (q > ZERO) & (r > ZERO) & (s > ZERO)
-    return known and abs(z - upper - (lower - upper) * fy) < tolerance * z
+def hide_line(depth, lenses, tolerance, geometry, places, index, shares, corners):
+    """Clears ``geometry[2]``, the depth in the target, where the target's depth map is nearer or
+    farther by ``tolerance`` of it, or not known. The other arguments but ``lenses`` are scratch."""
+    hx, hy = lenses[1, 2], lenses[1, 3]
+    zoom_u, zoom_v = lenses[2, 0] / lenses[1, 0], lenses[2, 1] / lenses[1, 1]
+    cx, cy = lenses[2, 2], lenses[2, 3]
+    us, vs, zs = geometry[0], geometry[1], geometry[2]
+    s, t = places[0], places[1]
+    for x in range(us.shape[0]):
+        s[x], t[x] = (us[x] - hx) * zoom_u + cx, (vs[x] - hy) * zoom_v + cy
+    fetch_corners(depth, s, t, index, shares, corners)
+    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], shares[0], shares[1]
+    for x in range(us.shape[0]):
+        p, q, r, last = p0[x], q0[x], r0[x], s0[x]
+        upper, lower = p + (q - p) * fx[x], r + (last - r) * fx[x]
+        known = (p > ZERO) & (q > ZERO) & (r > ZERO) & (last > ZERO)
+        z = zs[x]
+        near = abs(z - upper - (lower - upper) * fy[x]) < tolerance * z
+        zs[x] = z if known & near else ZERO
+
+
+@njit(**PART)
+def sample_line(y, geometry, shares, corners, reference, warped, slope, mask):
+    """Row ``y`` of the warped image, its slope by depth and its mask from the corners of its
+    samples; ``corners[2:]`` receive the image's derivatives along x and y."""
+    zs, by_u, by_v = geometry[2], geometry[3], geometry[4]
+    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], shares[0], shares[1]
+    own, out, out_slope, out_mask = reference[y], warped[y], slope[y], mask[y]
+    for x in range(zs.shape[0]):
+        p, q, r, s = p0[x], q0[x], r0[x], s0[x]
+        upper, lower = p + (q - p) * fx[x], r + (s - r) * fx[x]
+        seen = zs[x] > ZERO
+        du = (q - p) * (ONE - fy[x]) + (s - r) * fy[x] if seen else ZERO
+        dv = lower - upper if seen else ZERO
+        out[x] = upper + (lower - upper) * fy[x] if seen else own[x]
+        out_mask[x] = ONE if seen else ZERO
+        out_slope[x] = du * by_u[x] + dv * by_v[x]
+        r0[x], s0[x] = du, dv
 
 
 @njit(**PART)
@@ -116,32 +162,33 @@ def warp_rows(
     """
     height, width = target.shape
     last_u, last_v = np.float32(width - 1), np.float32(height - 1)
-    hx, hy = lenses[1, 2], lenses[1, 3]
-    zoom_u, zoom_v = lenses[2, 0] / lenses[1, 0], lenses[2, 1] / lenses[1, 1]
     occluded, with_extra = target_depth.shape[0] > 1, extra.shape[1] > 0
+    count = reference.shape[1]
     line = np.empty(depth.shape[1], np.float32)
-    geometry = np.empty((6, reference.shape[1]), np.float32)
+    geometry = np.empty((6, count), np.float32)
+    index, places = np.empty(count, np.uint32), np.empty((2, count), np.float32)
+    shares, corners = np.empty((2, count), np.float32), np.empty((4, count), np.float32)
     for y in range(first, last):
         total = ZERO
         enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometry)
         project_line(y, lenses, T, settings.min_depth_ratio, last_u, last_v, geometry)
-        for x in range(reference.shape[1]):
-            u, v, z = geometry[0, x], geometry[1, x], geometry[2, x]
-            seen = z > ZERO
-            if seen and occluded:
-                s, t = (u - hx) * zoom_u + lenses[2, 2], (v - hy) * zoom_v + lenses[2, 3]
-                seen = is_visible(target_depth, s, t, z, settings.occlusion)
-            value, du, dv = reference[y, x], ZERO, ZERO
-            if seen:
-                i, j = min(int(u), width - 2), min(int(v), height - 2)
-                fu, fv = u - np.float32(i), v - np.float32(j)
-                value, du, dv = sample_plain(target, i, j, fu, fv)
-                if sobel:
-                    du, dv = sample_sobel(target, i, j, fu, fv)
-            warped[y, x], mask[y, x] = value, ONE if seen else ZERO
-            slope[y, x] = du * geometry[3, x] + dv * geometry[4, x] if seen else ZERO
-            if with_extra:
-                extra[0, y, x], extra[1, y, x], extra[2, y, x] = du, dv, geometry[5, x]
+        if occluded:
+            hide_line(
+                target_depth, lenses, settings.occlusion, geometry, places, index, shares, corners
+            )
+        fetch_corners(target, geometry[0], geometry[1], index, shares, corners)
+        sample_line(y, geometry, shares, corners, reference, warped, slope, mask)
+        if sobel:
+            for x in range(count):
+                if geometry[2, x] > ZERO:
+                    i, j = min(int(geometry[0, x]), width - 2), min(int(geometry[1, x]), height - 2)
+                    du, dv = sample_sobel(target, i, j, shares[0, x], shares[1, x])
+                    slope[y, x] = du * geometry[3, x] + dv * geometry[4, x]
+                    corners[2, x], corners[3, x] = du, dv
+        if with_extra:
+            for x in range(count):
+                extra[0, y, x], extra[1, y, x] = corners[2, x], corners[3, x]
+                extra[2, y, x] = geometry[5, x]
         for x in range(reference.shape[1]):
             size = min(abs(warped[y, x] - reference[y, x]), settings.cut)
             small = min(size, settings.huber)

@@ -73,22 +73,42 @@ def normal_terms(clean, r, normal, prior, y, settings, g_normal):
 
 
 @njit(**PART)
-def consistency_terms(clean, r, normal, edge, y, settings, push, g, g_y):
+def split_normals(normal, y, lines):
+    """The coordinates of row ``y``'s normals as rows of their own, what is not a number as 0."""
+    nx, ny, nz = lines[0], lines[1], lines[2]
+    for x in range(normal.shape[1]):
+        ax, ay, az = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
+        nx[x] = ax if abs(ax) < HUGE else ZERO
+        ny[x] = ay if abs(ay) < HUGE else ZERO
+        nz[x] = az if abs(az) < HUGE else ZERO
+
+
+@njit(**PART)
+def consistency_terms(clean, r, edge, y, settings, lines, push):
     """Weighted sum of L_nc over the centres of row ``y``.
 
-    ``push`` (4, w) receives d/dD at the left, right, upper and lower neighbour of each centre;
-    the normal's gradient is added to row ``g_y`` of ``g``. Depths are 0 where unknown.
+    ``lines`` (6, w): coordinates of the normals, and their gradients, which it receives. ``push``
+    (4, w) receives d/dD at the left, right, upper and lower neighbour of each centre. Depths are 0
+    where unknown.
     """
     fx, fy, cx, cy = settings.fx, settings.fy, settings.cx, settings.cy
     weight, epsilon = settings.consistency, settings.normal_epsilon
     ry, step_x, step_y = (np.float32(y) - cy) / fy, ONE / fx, ONE / fy
+    width = clean.shape[1]
+    # Views from the first centre on, because an index that could be negative would keep the loop
+    # from vectorising.
+    left, centre, right = clean[r, : width - 2], clean[r, 1 : width - 1], clean[r, 2:width]
+    above, below = clean[r - 1, 1 : width - 1], clean[r + 1, 1 : width - 1]
+    nx, ny, nz = lines[0, 1 : width - 1], lines[1, 1 : width - 1], lines[2, 1 : width - 1]
+    g_x, g_y, g_z = lines[3, 1 : width - 1], lines[4, 1 : width - 1], lines[5, 1 : width - 1]
+    to_left, to_right = push[0, 1 : width - 1], push[1, 1 : width - 1]
+    to_above, to_below = push[2, 1 : width - 1], push[3, 1 : width - 1]
+    edges = edge[y, 1 : width - 1]
     total = ZERO
-    for i in range(clean.shape[1] - 2):
-        x = i + 1
-        dl, dc, dr = clean[r, i], clean[r, x], clean[r, x + 1]
-        dt, db = clean[r - 1, x], clean[r + 1, x]
+    for i in range(width - 2):
+        dl, dc, dr, dt, db = left[i], centre[i], right[i], above[i], below[i]
         known = (dl > ZERO) & (dc > ZERO) & (dr > ZERO) & (dt > ZERO) & (db > ZERO)
-        rx = (np.float32(x) - cx) / fx
+        rx = (np.float32(np.int32(i + 1)) - cx) * step_x
         # h = P_right - P_left, v = P_top - P_bottom: rays differ by a step in one coordinate.
         hx, hz = dr * (rx + step_x) - dl * (rx - step_x), dr - dl
         hy = ry * hz
@@ -98,31 +118,38 @@ def consistency_terms(clean, r, normal, edge, y, settings, push, g, g_y):
         inverse = ONE / np.sqrt(kx * kx + ky * ky + kz * kz + np.float32(1e-30))
         kx, ky, kz = kx * inverse, ky * inverse, kz * inverse
 
-        ax, ay, az = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
-        ax = ax if abs(ax) < HUGE else ZERO
-        ay = ay if abs(ay) < HUGE else ZERO
-        az = az if abs(az) < HUGE else ZERO
+        ax, ay, az = nx[i], ny[i], nz[i]
         shrink = ONE / np.sqrt(ax * ax + ay * ay + az * az + epsilon)
         ax, ay, az = ax * shrink, ay * shrink, az * shrink
         cosine = ax * kx + ay * ky + az * kz
-        w = weight * (ONE - edge[y, x]) if known else ZERO
+        w = weight * (ONE - edges[i]) if known else ZERO
         total += w * (ONE - cosine)
 
         s = -w * shrink
-        g[g_y, x, 0] += s * (kx - cosine * ax)
-        g[g_y, x, 1] += s * (ky - cosine * ay)
-        g[g_y, x, 2] += s * (kz - cosine * az)
+        g_x[i] = s * (kx - cosine * ax)
+        g_y[i] = s * (ky - cosine * ay)
+        g_z[i] = s * (kz - cosine * az)
         s = -w * inverse
         gx, gy, gz = s * (ax - cosine * kx), s * (ay - cosine * ky), s * (az - cosine * kz)
         # Through k = h x v: d/dh = v x g, d/dv = g x h; then along the neighbours' rays.
         ux, uy, uz = vy * gz - vz * gy, vz * gx - vx * gz, vx * gy - vy * gx
         wx, wy, wz = gy * hz - gz * hy, gz * hx - gx * hz, gx * hy - gy * hx
         across, down = rx * ux + ry * uy + uz, rx * wx + ry * wy + wz
-        push[0, x] = step_x * ux - across
-        push[1, x] = step_x * ux + across
-        push[2, x] = down - step_y * wy
-        push[3, x] = -down - step_y * wy
+        to_left[i] = step_x * ux - across
+        to_right[i] = step_x * ux + across
+        to_above[i] = down - step_y * wy
+        to_below[i] = -down - step_y * wy
     return total
+
+
+@njit(**PART)
+def add_normal_gradient(lines, y, g_normal):
+    """Adds the gradients of row ``y``'s normals, which have none at the border."""
+    gx, gy, gz = lines[3], lines[4], lines[5]
+    for x in range(1, g_normal.shape[1] - 1):
+        g_normal[y, x, 0] += gx[x]
+        g_normal[y, x, 1] += gy[x]
+        g_normal[y, x, 2] += gz[x]
 
 
 @njit(**PART)
@@ -172,7 +199,7 @@ def single_view_rows(
     low, high = max(first - 2, 0), min(last + 2, depth.shape[0])
     for y in range(low, high):
         known_depth(depth, alpha, prior, y, settings.min_alpha, clean, y - low)
-    unused = np.zeros((1, depth.shape[1], 3), np.float32)
+    lines = np.zeros((6, depth.shape[1]), np.float32)
     for y in range(low, high):
         r, own, total = y - low, first <= y < last, ZERO
         if own:
@@ -183,9 +210,11 @@ def single_view_rows(
             if settings.normal > ZERO and len(prior_normal) > 0:
                 total += normal_terms(clean, r, normal, prior_normal, y, settings, g_normal)
         if settings.consistency > ZERO and 0 < r < high - low - 1:
-            g, g_y = (g_normal, y) if own else (unused, 0)
-            total += consistency_terms(clean, r, normal, edge, y, settings, push, g, g_y)
+            split_normals(normal, y, lines)
+            total += consistency_terms(clean, r, edge, y, settings, lines, push)
             add_consistency(pull, r, push)
+            if own:
+                add_normal_gradient(lines, y, g_normal)
         if settings.smoothness > ZERO and r < high - low - 1:
             total += smoothness_terms(clean, r, gradient, y, settings, scale, pull)
         if own:
