@@ -5,6 +5,7 @@ normal in the camera frame (not of unit length), alpha in [0, 1] and the distort
 returns the loss of every pixel and the mask where it counts, outside which it is 0.
 """
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -26,6 +27,9 @@ SMOOTHNESS_ETA = 10.0
 """Decay of smoothness with the image gradient (image in [0, 1]); the paper's eta."""
 OUTSIDE = -1.0
 """Prior depth where a mask says that nothing of the scene is."""
+ONE_SURFACE = 0.08
+"""Relative difference of inverse depth within a pixel of half the resolution up to which it has one
+depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,35 @@ class ViewConstants:
             confidence=confidence.float(),
             prior_normal=None if prior_normal is None else prior_normal.float(),
         )
+
+    @functools.cached_property
+    def halved(self) -> "ViewConstants":
+        """The same for maps of half the resolution.
+
+        A pixel's depth, confidence and normal are means of those in it, and unknown where some are
+        unknown or of another surface; it is ``OUTSIDE`` where most of it is.
+        """
+        camera = self.camera.resized(self.camera.width // 2, self.camera.height // 2)
+        size = (camera.height, camera.width)
+        known, outside = self.prior_depth > 0, self.prior_depth < 0
+        inverse = torch.where(known, 1 / self.prior_depth.clamp(min=1e-9), 0.0)
+        weight = torch.where(known, self.confidence, 0.0)
+        maps = torch.stack(
+            [self.edge, self.image_gradient, inverse, weight, known.float(), outside.float()]
+        )
+        edge, gradient, inverse_mean, mean_weight, share, beyond = F.adaptive_avg_pool2d(maps, size)
+        most, least = F.adaptive_max_pool2d(torch.stack([inverse, -inverse]), size)
+        one = (share > 0.999) & (most + least < ONE_SURFACE * inverse_mean)
+        depth = torch.where(one, 1 / inverse_mean.clamp(min=1e-9), 0.0)
+        normal = None
+        if self.prior_normal is not None:
+            mean = F.adaptive_avg_pool2d(self.prior_normal.movedim(-1, 0), size).movedim(0, -1)
+            length = mean.norm(dim=-1, keepdim=True)
+            normal = torch.where(length > 0.5, mean / length.clamp(min=1e-6), 0.0)
+        return ViewConstants(
+            camera, edge, gradient, torch.where(beyond > 0.5, OUTSIDE, depth),
+            torch.where(one, mean_weight, 0.0), normal,
+        )  # fmt: skip
 
 
 def edge_strength(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:

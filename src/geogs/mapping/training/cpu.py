@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.multi_view import enlarge_depth
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.training.map_trainer import GRADIENT_LIMIT, LR_SCALE, Batch, learning_rates
@@ -23,6 +24,11 @@ from geogs.world.disks import DiskParameters, GaussianMap
 
 # Part of the map up to which an excerpt is trained rather than all of it.
 _LARGE_EXCERPT = 0.7
+COARSE_PART = 0.5
+"""Part of a training over all keyframes for which half the resolution does: what is coarse is
+learned there, in half of the time."""
+LEAST_COARSE = 100
+"""Long edge of such a rendering, below which all is trained at the full one."""
 # Standard deviations at which a disk of any opacity has faded below what the renderer shows.
 REACH = 3.4
 
@@ -33,17 +39,21 @@ def view_loss(
     output: RenderOutput,
     config: MappingConfig,
     unit: float,
+    coarse: bool = False,
 ) -> Float[Tensor, ""]:
     """L_geo of one rendered view: single-view terms, and L_mv averaged over its partners.
 
-    Partners without a rendering yet are matched without occlusion test.
+    Partners without a rendering yet are matched without occlusion test. The view may be rendered
+    ``coarse``, at half the resolution.
     """
+    known = view.known.halved if coarse else view.known
     loss = fused_single_view(
-        output.depth, output.normal, output.alpha, output.distortion,
-        view.known, config.loss, unit,
-    )  # fmt: skip
+        output.depth, output.normal, output.alpha, output.distortion, known, config.loss, unit
+    )
     if partners:
-        depth = _within(view, output.shown_depth(MIN_ALPHA))
+        depth = output.shown_depth(MIN_ALPHA)
+        if view.mask is not None:
+            depth = torch.where(known.prior_depth >= 0, depth, 0.0)
         for other in partners:
             loss = loss + fused_multi_view(
                 depth, view.photo, other.photo, other.rendered_depth, config.loss
@@ -72,31 +82,41 @@ class CpuTrainer:
         self.config = config
         self.unit = unit
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
+        render = cameras.render
+        self.coarse_camera = render.resized(render.width // 2, render.height // 2)
+        self.coarse_part = COARSE_PART if self.coarse_camera.long_edge >= LEAST_COARSE else 0.0
 
-    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
+    def train(
+        self,
+        batches: Sequence[Batch],
+        factors: Sequence[float] | None = None,
+        coarse: bool = False,
+    ) -> None:
         """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
 
-        On an excerpt of the map where the views can see no more than that, which changes nothing
-        but rounding.
+        At half the resolution if ``coarse``. On an excerpt of the map where the views can see no
+        more than that, which changes nothing but rounding.
         """
         whole, optimizer, seen = self.disks, self.optimizer, self._in_view(batches)
         if not 0 < len(seen) <= _LARGE_EXCERPT * len(whole):
-            self._train(batches, factors)
+            self._train(batches, factors, coarse)
             return
         part = whole.excerpt(seen)
         try:
             self.disks = part
             self.optimizer = MapOptimizer(part, optimizer.learning_rates)
-            self._train(batches, factors)
+            self._train(batches, factors, coarse)
         finally:
             self.disks, self.optimizer = whole, optimizer
             whole.take_back(seen, part)
 
-    def _train(self, batches: Sequence[Batch], factors: Sequence[float] | None) -> None:
+    def _train(
+        self, batches: Sequence[Batch], factors: Sequence[float] | None, coarse: bool
+    ) -> None:
         for n, batch in enumerate(batches):
             factor = 1.0 if factors is None else factors[n]
             self.optimizer.learning_rates = learning_rates(self.config, self.unit, factor)
-            self.step(batch)
+            self.step(batch, coarse)
         self.optimizer.learning_rates = learning_rates(self.config, self.unit)
 
     def _in_view(self, batches: Sequence[Batch]) -> Int[Tensor, "m"]:
@@ -124,14 +144,14 @@ class CpuTrainer:
         for view in views:
             view.rendered_depth = None
 
-    def step(self, batch: Batch) -> float:
+    def step(self, batch: Batch, coarse: bool = False) -> float:
         """One Adam step on the summed losses of views with their partners; returns the loss."""
         if len(self.disks) == 0:
             return 0.0
         if self.config.photo.fresh:
             self._show_partners(batch)
         # Side by side, as much of a pass is done by one thread; added up in order.
-        passes = thread_map(lambda pair: self._pass(*pair), batch)
+        passes = thread_map(lambda pair: self._pass(*pair, coarse), batch)
         visible = torch.zeros(len(self.disks), dtype=torch.bool, device=self.disks.device)
         total = 0.0
         for (view, _), done in zip(batch, passes, strict=True):
@@ -147,14 +167,18 @@ class CpuTrainer:
         self._bound_scales()
         return total
 
-    def _pass(self, view: MapView, partners: list[MapView]) -> _Pass:
+    def _pass(self, view: MapView, partners: list[MapView], coarse: bool) -> _Pass:
         """One view forth and back; nothing that other views use is changed."""
         parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))
-        output = render(parameters, self.cameras.render, view.T_cw)
-        loss = view_loss(view, partners, output, self.config, self.unit)
+        full = self.cameras.render
+        output = render(parameters, self.coarse_camera if coarse else full, view.T_cw)
+        loss = view_loss(view, partners, output, self.config, self.unit, coarse)
         loss.backward()
         with torch.no_grad():
-            depth = _within(view, output.shown_depth(MIN_ALPHA))
+            shown = output.shown_depth(MIN_ALPHA)
+            if coarse:
+                shown = enlarge_depth(shown, full.height, full.width)
+            depth = _within(view, shown)
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
         return _Pass(gradients, float(loss.detach()), depth, output.visible)
 

@@ -23,7 +23,8 @@ _REHEARSED_STEPS, _ENOUGH_SECONDS, _REHEARSALS = 16, 0.2, 8
 class FullTraining:
     """Single-view steps over all mapped keyframes in random order, with falling learning rates.
 
-    On the way the map is pruned, filled and split, and poses are refined, as the settings say.
+    The first go at half the resolution, where the trainer has it so. On the way the map is pruned,
+    filled and split, and poses are refined, as the settings say.
     """
 
     def __init__(
@@ -47,7 +48,8 @@ class FullTraining:
         begin, seconds_to_prune = time.perf_counter() - table.place.seconds, 0.0
         prunes = max(total // 4, 1)
         fills, splits, poses = self._events(total)
-        events = fills | splits | poses | set(range(prunes, total, prunes))
+        coarse = int(self._trainer.coarse_part * total)
+        events = fills | splits | poses | set(range(prunes, total, prunes)) | {coarse} - {0}
         # Where time is short steps are few and slow, so that it is looked at the clock more often.
         at_once = _REPORTED_STEPS if until is None else min(_REPORTED_STEPS, max(total // 50, 1))
         stops = sorted(events | set(range(at_once, total, at_once)) | {total})
@@ -61,7 +63,8 @@ class FullTraining:
                 break
             batches = [self._draw() for _ in range(done, stop)]
             fractions = [max(step / total, late) for step in range(done + 1, stop + 1)]
-            self._trainer.train(batches, [config.lr_final**f for f in fractions])
+            is_coarse = stop <= coarse and late <= self._trainer.coarse_part
+            self._trainer.train(batches, [config.lr_final**f for f in fractions], is_coarse)
             done = stop
             seen = self._trained_lately(total)
             if done % prunes == 0 and done < total:

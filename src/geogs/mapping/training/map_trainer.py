@@ -82,9 +82,19 @@ class MapTrainer(Protocol):
     optimizer: MapOptimizer
     unit: float
     """Length in map units by which settings that are lengths are scaled."""
+    coarse_part: float
+    """Part of a training over all keyframes, its first, that goes at half the resolution."""
 
-    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
-        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates."""
+    def train(
+        self,
+        batches: Sequence[Batch],
+        factors: Sequence[float] | None = None,
+        coarse: bool = False,
+    ) -> None:
+        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
+
+        At half the resolution if ``coarse``, which is only for trainers with a ``coarse_part``.
+        """
         ...
 
     def refine_poses(

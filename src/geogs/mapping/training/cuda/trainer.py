@@ -45,9 +45,16 @@ class CudaTrainer:
         self.known = KnownViews(cameras, disks.device, resident)
         self._programs: dict[tuple[int, int], _TrainingStep] = {}
         self._pose_pass: WindowPass | None = None
+        self.coarse_part = 0.0
 
-    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
+    def train(
+        self,
+        batches: Sequence[Batch],
+        factors: Sequence[float] | None = None,
+        coarse: bool = False,
+    ) -> None:
         """Adam steps on the summed losses of each batch of views with their partners."""
+        assert not coarse, "a GPU trains at the full resolution"
         if not batches or len(self.disks) == 0:
             return
         everyone = {v.id: v for batch in batches for own, others in batch for v in (own, *others)}
