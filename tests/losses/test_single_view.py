@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,6 +10,7 @@ from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.single_view import (
     MIN_ALPHA,
+    OUTSIDE,
     ViewConstants,
     depth_l1,
     depth_smoothness,
@@ -166,3 +168,30 @@ def test_views_without_depth_give_no_loss_and_no_gradient(bad: str) -> None:
     assert float(loss.detach()) == 0
     for m in maps:
         assert (m.grad == 0).all()
+
+
+def test_half_the_resolution_knows_planes_but_nothing_across_an_edge() -> None:
+    camera = Camera(fx=30.0, fy=31.0, cx=11.2, cy=9.7, width=24, height=20)
+    near, far = ((torch.tensor([0.3, -0.2, -1.0]).double(), k) for k in (2.0, 4.0))
+    depth = plane_depth(*near, camera)
+    depth[:, 13:] = plane_depth(*far, camera)[:, 13:]
+    depth[:4], depth[-2:, :5] = OUTSIDE, 0.0
+    normals = torch.zeros(20, 24, 3)
+    normals[..., 2] = -1.0
+    normals[:, 14, 2] = 1.0  # with the column beside it the mean is none
+    confidence = torch.full((20, 24), 0.4)
+    image = np.zeros((20, 24, 3), np.uint8)
+    half = ViewConstants.prepare(image, camera, depth.float(), confidence, normals).halved
+    assert (half.camera.width, half.camera.height) == (12, 10)
+    assert half.camera.fx == 15.0
+    assert half.camera.cx == pytest.approx((11.2 + 0.5) / 2 - 0.5)
+    expected = plane_depth(*near, half.camera)
+    expected[:, 7:] = plane_depth(*far, half.camera)[:, 7:]
+    expected[:, 6] = 0.0  # of both
+    expected[:2], expected[-1, :3] = OUTSIDE, 0.0
+    assert half.prior_depth.numpy() == pytest.approx(expected.numpy(), rel=1e-5)
+    weight = torch.where(expected > 0, 0.4, 0.0)
+    assert half.confidence.numpy() == pytest.approx(weight.numpy(), rel=1e-6)
+    assert half.prior_normal is not None
+    assert not half.prior_normal[:, 7].any()
+    torch.testing.assert_close(half.prior_normal[:, :7], normals[::2, :14:2])

@@ -113,6 +113,19 @@ def test_a_short_training_looks_only_where_it_trained(sequence, monkeypatch):
     assert filled == 2 * list(range(9))
 
 
+def test_the_first_part_of_a_training_goes_at_half_the_resolution(sequence, monkeypatch):
+    mapper = build(sequence[0], replace(MAPPING, iterations=1))
+    steps: list[bool] = []
+
+    def noted(batches, factors, coarse):
+        steps.extend([coarse] * len(batches))
+
+    monkeypatch.setattr(mapper.trainer, "coarse_part", 0.4)
+    monkeypatch.setattr(mapper.trainer, "train", noted)
+    mapper.train(30)
+    assert steps == [True] * 12 + [False] * 18
+
+
 @pytest.mark.long
 def test_same_seed_same_map(sequence):
     first, second = (build(sequence[0][:6]) for _ in range(2))

@@ -6,6 +6,7 @@ import torch
 
 from geogs import threads
 from geogs.mapping.training.cpu import CpuTrainer, view_loss
+from geogs.mapping.view_arrays import MapCameras
 from geogs.splat.render import render
 from trained_room import (
     CAMERAS,
@@ -70,3 +71,26 @@ def test_results_do_not_depend_on_the_number_of_threads(rendered, monkeypatch):
             assert torch.equal(p, q)
     start = make_map(rendered, CPU).parameters[0].detach()
     assert np.median((results[0][0] - start).norm(dim=1)) > 0
+
+
+def test_a_step_at_half_the_resolution_is_nearly_one_at_the_full(rendered):
+    moves, shown = [], []
+    for coarse in (False, True):
+        made, views = trainer(rendered), make_views(rendered, CPU)
+        start = made.disks.parameters.position.detach().clone()
+        for _ in range(4):
+            made.train([[(views[0], [views[1]])]], coarse=coarse)
+        moves.append((made.disks.parameters.position.detach() - start).flatten())
+        shown.append(views[0].rendered_depth)
+    assert shown[1].shape == shown[0].shape  # which the other views' occlusion tests ask for
+    both = (shown[0] > 0) & (shown[1] > 0)
+    assert both.float().mean() > 0.25
+    assert float((shown[1] / shown[0] - 1).abs()[both].median()) < 0.02
+    along = torch.nn.functional.cosine_similarity(*moves, dim=0)
+    assert 0.4 < float(along) < 0.999
+
+
+def test_small_renderings_are_trained_at_the_full_resolution(rendered):
+    assert trainer(rendered).coarse_part == 0.0
+    large = MapCameras.of(CAMERAS.working.with_long_edge(240), CONFIG)
+    assert CpuTrainer(make_map(rendered, CPU), large, CONFIG, UNIT).coarse_part == 0.5
