@@ -40,7 +40,7 @@ def clock(monkeypatch) -> FakeClock:
         clock.now += SEARCH * len(ids)
         search_depths(mapper, ids)
 
-    def step(trainer: CpuTrainer, batch: object) -> float:
+    def step(trainer: CpuTrainer, batch: object, coarse: bool = False) -> float:
         clock.now += STEP
         return 0.0
 
