@@ -60,10 +60,11 @@ def test_kernel_updates_voxels_like_torch(monkeypatch):
     for view in views(camera, 3):
         expected.integrate(view.depth, view.weight, camera, view.T_cw)
         valid = view.valid()
-        tested._allocate(blocks_seen(view.depth, valid, camera, view.T_cw, 0.09, 3.0))
-        planes = PixelPlanes.of(view.depth, view.weight, valid, camera, 0.27)
+        planes = PixelPlanes.of(view.depth, valid, camera)
+        tested._allocate(blocks_seen(planes, view.T_cw, 0.09, 3.0))
+        table, truncation = planes.table(view.weight), planes.truncation(0.27)
         far = torch.where(valid, view.depth, 0.0).amax() + widest(0.27)
-        tested.update_by_kernel(planes, camera, view.T_cw, far)
+        tested.update_by_kernel(table, truncation, camera, view.T_cw, far)
     assert (tested.coordinates == expected.coordinates).all()
     seen = expected.weight > 0
     assert seen.double().mean() > 0.2
@@ -79,8 +80,9 @@ def test_blocks_out_of_view_stay_untouched(monkeypatch):
     (view,) = views(camera, 1)
     volume = SparseTsdf(0.09, 3.0)
     volume._allocate(torch.tensor([[0, 0, -4], [60, 0, 2], [0, -60, 2], [0, 0, 40], [0, 0, 2]]))
-    planes = PixelPlanes.of(view.depth, view.weight, view.valid(), camera, 0.27)
-    volume.update_by_kernel(planes, camera, view.T_cw, view.depth.amax() + 0.27)
+    planes = PixelPlanes.of(view.depth, view.valid(), camera)
+    table, truncation = planes.table(view.weight), planes.truncation(0.27)
+    volume.update_by_kernel(table, truncation, camera, view.T_cw, view.depth.amax() + 0.27)
     touched = (volume.weight > 0).flatten(1).any(1)
     assert touched.tolist() == [False, False, False, False, True]
 

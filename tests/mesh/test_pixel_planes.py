@@ -10,7 +10,7 @@ from geogs.config import MeshConfig
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.pixel_planes import LEAST_BAND, PixelPlanes, footprint_points, widest
+from geogs.mesh.pixel_planes import LEAST_BAND, PixelPlanes, widest
 from geogs.mesh.triangle_mesh import DepthMapView
 
 CAMERA = Camera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
@@ -33,7 +33,7 @@ def slanted(degrees: float) -> torch.Tensor:
 def test_truncation_is_half_along_the_normal_at_least(degrees):
     normal = slanted(degrees)
     depth = plane_depth(normal, 6.0)
-    planes = PixelPlanes.of(depth, torch.ones_like(depth), depth > 0, CAMERA, 0.08)
+    truncation = PixelPlanes.of(depth, depth > 0, CAMERA).truncation(0.08)
     # Of a step along the axis at the pixel, the part along the unit normal.
     along_axis = (CAMERA.rays(torch.float64) @ normal).float().flatten()
     reference = 0.08 * (LEAST_BAND / along_axis).clamp(min=1)
@@ -45,14 +45,14 @@ def test_truncation_is_half_along_the_normal_at_least(degrees):
     inside &= depth < 4  # away from where it ends
     inside = inside.flatten()
     assert inside.float().mean() > 0.1
-    assert planes.truncation[inside] == pytest.approx(reference[inside], rel=2e-3)
-    assert planes.truncation.max() <= widest(0.08)
+    assert truncation[inside] == pytest.approx(reference[inside], rel=2e-3)
+    assert truncation.max() <= widest(0.08)
 
 
 def test_footprints_leave_no_gaps_on_a_floor():
     """Points along the floor's footprints lie on it, one behind the other no farther than asked."""
     depth = plane_depth(torch.tensor([0.0, 1.0, 0.0]).double(), 8.0)  # the floor, 1 below the eye
-    points = footprint_points(depth, depth > 0, CAMERA, 0.05).double()
+    points = PixelPlanes.of(depth, depth > 0, CAMERA).footprints(0.05).double()
     assert (points[:, 1] - 1).abs().max() < 1e-4
     column = points[:, 0] / points[:, 2] * CAMERA.fx + CAMERA.cx
     gaps = points[(column - 80).abs() < 0.4, 2].sort().values.diff()
@@ -68,10 +68,9 @@ def test_a_pixel_between_two_walls_is_no_slope():
     depth = torch.full((120, 160), 2.0)
     depth[:, 81:] = 1.0
     depth[:, 80] = 1.4
-    valid = depth > 0
-    planes = PixelPlanes.of(depth, torch.ones_like(depth), valid, CAMERA, 0.08)
-    assert (planes.truncation == 0.08).all()
-    assert len(footprint_points(depth, valid, CAMERA, 0.01)) == depth.numel()
+    planes = PixelPlanes.of(depth, depth > 0, CAMERA)
+    assert (planes.truncation(0.08) == 0.08).all()
+    assert len(planes.footprints(0.01)) == depth.numel()
 
 
 def test_a_floor_seen_at_a_slant_is_whole():

@@ -1,5 +1,6 @@
 """What the mapper asks of whatever finds keyframe depths."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -7,6 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
+from geogs.geometry.camera import Camera
+from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""
@@ -75,3 +78,29 @@ class AlternativeSearch:
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """As in the protocol."""
         return self.classical.keep(points, depths)
+
+
+class RevisedSearch(AlternativeSearch, ABC):
+    """Another engine's search, of which each depth is looked at once more by itself."""
+
+    def __init__(self, search: DepthEngine, render: Camera) -> None:
+        super().__init__(search)
+        self.render = render
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+        searched = self.classical.estimate(references, neighbours, progress, limits)
+        tasks = list(zip(references, neighbours, searched, strict=True))
+        return thread_map(lambda task: self.revised(*task), tasks)
+
+    @abstractmethod
+    def revised(
+        self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
+    ) -> DenseDepth:
+        """What is made of the depth of a view that was matched with some others."""

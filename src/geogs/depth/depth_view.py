@@ -104,13 +104,16 @@ class DenseDepth:
         return replace(self, confidence=confidence, median=median, written=written)
 
     def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
-        """Nothing known in the mask; the depth there, and the median, stay what they are."""
+        """Nothing known in the mask, and no normals anywhere: of bare walls the network's are worse
+        than those of the map. The depth there, and the median, stay what they are."""
         confidence = torch.where(mask.to(self.confidence.device), 0.0, self.confidence)
         return replace(self, confidence=confidence, normal=None)
 
     def under(self, sky: Bool[Tensor, "h w"] | None) -> "DenseDepth":
-        """With that sky."""
-        return self if sky is None else replace(self.unsure_where(sky), normal=self.normal, sky=sky)
+        """With that sky, if there is one."""
+        if sky is None:
+            return self
+        return replace(self, confidence=torch.where(sky, 0.0, self.confidence), sky=sky)
 
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""

@@ -8,12 +8,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 from geogs.depth.photo_vote import photo_vote
-from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import minmod_slopes
-from geogs.threads import thread_map
 
 APART = 0.03
 """Relative difference of inverse depth from which what is around is a farther surface."""
@@ -26,32 +24,17 @@ MOVED_CONFIDENCE = 0.35
 _AROUND = [step for step in product((-1, 0, 1), repeat=2) if step != (0, 0)]
 
 
-class FarSideSearch(AlternativeSearch):
+class FarSideSearch(RevisedSearch):
     """The classical search, whose windows grow the foreground by some pixels, without these.
 
     Where a farther surface lies beside a pixel, its plane goes on to it, and the pixel takes it if
     the neighbours' images agree better there (``photo_vote``).
     """
 
-    def __init__(self, classical: DepthEngine, render: Camera) -> None:
-        super().__init__(classical)
-        self.render = render
-
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
-        """As in the protocol."""
-        searched = self.classical.estimate(references, neighbours, progress, limits)
-        tasks = list(zip(references, neighbours, searched, strict=True))
-        return thread_map(lambda task: self._resolved(*task), tasks)
-
-    def _resolved(
+    def revised(
         self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
     ) -> DenseDepth:
+        """With the far side where that is likelier."""
         if not others:
             return searched
         depth, confidence = searched.depth, searched.confidence

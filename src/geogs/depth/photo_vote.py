@@ -45,30 +45,19 @@ def photo_vote(
         same: where both are of one surface, from which the neighbours' noise and light are learned.
         camera: of the depths and of the views' ``grey``.
     """
-    guide, costs = _single_pixels(reference, neighbours, depths, same, camera)
+    guide, costs = pixel_costs(reference, neighbours, depths, same, camera)
     return averaged_by_colour(costs[0] - costs[1], guide)
 
 
-def photo_costs(
-    reference: DepthView,
-    neighbours: Sequence[DepthView],
-    depths: Float[Tensor, "2 h w"],
-    same: Bool[Tensor, "h w"],
-    camera: Camera,
-) -> Float[Tensor, "2 h w"]:
-    """How badly the images agree at each of two depths, in [0, 1]; arguments as above."""
-    guide, costs = _single_pixels(reference, neighbours, depths, same, camera)
-    return averaged_by_colour(costs, guide)
-
-
-def _single_pixels(
+def pixel_costs(
     reference: DepthView,
     neighbours: Sequence[DepthView],
     depths: Float[Tensor, "2 h w"],
     same: Bool[Tensor, "h w"],
     camera: Camera,
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "2 h w"]]:
-    """Colours of the reference in [0, 1], and the cost of each pixel at each depth."""
+    """Colours of the reference in [0, 1], and how badly the neighbours' images agree at each of two
+    depths, in [0, 1], of each pixel by itself; arguments as of :func:`photo_vote`."""
     device, size = depths.device, (camera.width, camera.height)
     grey = torch.from_numpy(np.stack([v.grey for v in (reference, *neighbours)])).to(device)
     poses = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)

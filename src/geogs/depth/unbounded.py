@@ -7,12 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
-from geogs.depth.photo_vote import photo_costs
+from geogs.depth.photo_vote import averaged_by_colour, pixel_costs
 from geogs.geometry.camera import Camera
 from geogs.on_demand import OnDemand
-from geogs.threads import thread_map
 
 FAR = 2.0
 """Times the median depth from which a pixel is asked: a bare wall nearby looks the same at any
@@ -30,24 +29,14 @@ _INFINITY = 1e6
 """Times the median depth."""
 
 
-class SkySearch(AlternativeSearch):
+class SkySearch(RevisedSearch):
     """A search that finds sky where the images agree as well at infinity."""
 
-    def __init__(self, search: DepthEngine, render: Camera) -> None:
-        super().__init__(search)
-        self.render = render
-
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
-        """As in the protocol."""
-        searched = self.classical.estimate(references, neighbours, progress, limits)
-        tasks = list(zip(references, neighbours, searched, strict=True))
-        return thread_map(lambda t: t[2].under(unbounded(*t, self.render)), tasks)
+    def revised(
+        self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
+    ) -> DenseDepth:
+        """With its sky."""
+        return searched.under(unbounded(view, others, searched, self.render))
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
@@ -77,7 +66,7 @@ def unbounded(
     """Far pixels where the other views agree at infinity, and not worse than at the depth found.
 
     At infinity only the rotations between the views count. What is asked is a mean over single
-    pixels of like colour (``photo_costs``), so that a roof says nothing of the sky beside it.
+    pixels of like colour (``pixel_costs``), so that a roof says nothing of the sky beside it.
     None where hardly a pixel is far, or there is nothing to compare with.
     """
     sure = found.confidence > _SURE
@@ -88,5 +77,6 @@ def unbounded(
     if float(is_far.float().mean()) < _ASKED:
         return None
     depths = torch.stack([found.depth, (_INFINITY * typical).expand_as(found.depth)])
-    here, beyond = photo_costs(view, others, depths, sure, render)
+    guide, costs = pixel_costs(view, others, depths, sure, render)
+    here, beyond = averaged_by_colour(costs, guide)
     return is_far & (beyond < AGREES) & (beyond < here + WORSE)

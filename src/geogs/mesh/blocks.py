@@ -18,7 +18,7 @@ from geogs.mesh.clean import cleaned
 from geogs.mesh.extract import VolumePlan, integrate
 from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.level_set import CHUNK, SurfacePart, stitched, surface_parts
-from geogs.mesh.pixel_planes import widest
+from geogs.mesh.pixel_planes import PixelPlanes, widest
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, blocks_seen, meets_frustum
 from geogs.threads import on_one_torch_thread
@@ -36,7 +36,8 @@ def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a view lies, with its band."""
     valid = view.valid() & (view.depth <= plan.max_depth)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
-    return blocks_seen(view.depth.float(), valid, view.camera, T_cw, plan.voxel, plan.truncation)
+    planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
+    return blocks_seen(planes, T_cw, plan.voxel, plan.truncation)
 
 
 def boxes_of(blocks: Int[np.ndarray, "k 3"], most: int) -> list[BlockBox]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
-from geogs.mesh.pixel_planes import PixelPlanes, footprint_points
+from geogs.mesh.pixel_planes import PixelPlanes
 from geogs.threads import run_chunks, worker_count
 
 BLOCK = 8
@@ -74,19 +74,14 @@ def band_blocks(
 
 
 def blocks_seen(
-    depth: Float[Tensor, "h w"],
-    valid: Bool[Tensor, "h w"],
-    camera: Camera,
-    T_cw: Float[Tensor, "4 4"],
-    voxel: float,
-    truncation: float,
+    planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], voxel: float, truncation: float
 ) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a depth map lies, with its band.
 
     Footprints are followed from one half block to the next, so that a floor that is seen at a
     slant has no gaps between the rows of the image.
     """
-    points = footprint_points(depth, valid, camera, voxel * _HALF).double()
+    points = planes.footprints(voxel * _HALF).double()
     return band_blocks((points - T_cw[:3, 3]) @ T_cw[:3, :3], voxel, truncation)
 
 
@@ -195,21 +190,22 @@ class SparseTsdf:
         if not bool(valid.any()):
             return
         T_cw = T_cw.to(self.device, torch.float64)
-        blocks = blocks_seen(depth, valid, camera, T_cw, self.voxel, self.truncation)
-        self._allocate(self._kept(blocks))
+        planes = PixelPlanes.of(depth, valid, camera)
+        self._allocate(self._kept(blocks_seen(planes, T_cw, self.voxel, self.truncation)))
         if not len(self):
             return
-        planes = PixelPlanes.of(depth, weight, valid, camera, self.truncation * self.voxel)
-        far = torch.where(valid, depth + planes.truncation.view_as(depth), 0.0).amax()
+        table, truncation = planes.table(weight), planes.truncation(self.truncation * self.voxel)
+        far = torch.where(valid, depth + truncation.view_as(depth), 0.0).amax()
         if self.device.type == "cuda":
-            self.update_by_kernel(planes, camera, T_cw, far)
+            self.update_by_kernel(table, truncation, camera, T_cw, far)
             return
-        projection = camera.matrix() @ T_cw[:3]
-        self._update(self._in_view(camera, T_cw, float(far)), projection, planes, camera)
+        projection, slots = camera.matrix() @ T_cw[:3], self._in_view(camera, T_cw, float(far))
+        self._update(slots, projection, table, truncation, camera)
 
     def update_by_kernel(
         self,
-        planes: PixelPlanes,
+        table: Float[Tensor, "p 4"],
+        truncation: Float[Tensor, "p"],
         camera: Camera,
         T_cw: Float[Tensor, "4 4"],
         far: Float[Tensor, ""],
@@ -220,8 +216,8 @@ class SparseTsdf:
         """
         c = camera
         kernels_for(_SOURCE, self.device)["integrate"](
-            len(self), BLOCK**3, self._coordinates, self._distance, self._weight, planes.table,
-            planes.truncation, T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
+            len(self), BLOCK**3, self._coordinates, self._distance, self._weight, table,
+            truncation, T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
             self.voxel,
         )  # fmt: skip
 
@@ -267,7 +263,8 @@ class SparseTsdf:
         self,
         slots: Int[Tensor, "k"],
         projection: Float[Tensor, "3 4"],
-        planes: PixelPlanes,
+        table: Float[Tensor, "p 4"],
+        truncation: Float[Tensor, "p"],
         camera: Camera,
     ) -> None:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
@@ -277,12 +274,12 @@ class SparseTsdf:
         block = (corner + projection[:, 3:]).float().mT.contiguous().numpy()
         local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float().numpy()
         distance, weight = self._distance.numpy(), self._weight.numpy()
-        table, truncation = planes.table.numpy(), planes.truncation.numpy()
+        planes, reach = table.numpy(), truncation.numpy()
 
         def update(chunk: int) -> None:
             some = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
             average_in(
-                slots.numpy()[some], block[some], local, table, truncation, camera.width,
+                slots.numpy()[some], block[some], local, planes, reach, camera.width,
                 camera.height, distance, weight,
             )  # fmt: skip
 

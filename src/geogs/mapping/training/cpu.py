@@ -82,9 +82,8 @@ class CpuTrainer:
         self.config = config
         self.unit = unit
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
-        render = cameras.render
-        self.coarse_camera = render.resized(render.width // 2, render.height // 2)
-        self.coarse_part = COARSE_PART if self.coarse_camera.long_edge >= LEAST_COARSE else 0.0
+        is_large = cameras.render.long_edge // 2 >= LEAST_COARSE
+        self.coarse_part = COARSE_PART if is_large else 0.0
 
     def train(
         self,
@@ -171,7 +170,8 @@ class CpuTrainer:
         """One view forth and back; nothing that other views use is changed."""
         parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))
         full = self.cameras.render
-        output = render(parameters, self.coarse_camera if coarse else full, view.T_cw)
+        camera = view.known.halved.camera if coarse else full
+        output = render(parameters, camera, view.T_cw)
         loss = view_loss(view, partners, output, self.config, self.unit, coarse)
         loss.backward()
         with torch.no_grad():
