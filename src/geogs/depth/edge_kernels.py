@@ -22,6 +22,41 @@ def _cost_at(costs, first, spacing, rho):
 
 
 @njit(**_FAST)
+def _add_sides(
+    y, v, dx, first, last, rho, slope_x, slope_y, confidence, guide, contrast, apart, sums
+):
+    """What the pixels (dx, v - y) away say to the pixels ``first`` to ``last`` of row y.
+
+    ``sums`` (5, w) grows by the weight of those of the same surface, by that of farther ones, of
+    nearer ones, and by the weighted inverse depths of the farther and of the nearer ones.
+    """
+    # Views, because an index that could be negative would keep the loop from vectorising.
+    own, there = rho[y, first:last], rho[v, first + dx : last + dx]
+    gx, gy = slope_x[v, first + dx : last + dx], slope_y[v, first + dx : last + dx]
+    sure = confidence[v, first + dx : last + dx]
+    g0, g1, g2 = guide[0, y, first:last], guide[1, y, first:last], guide[2, y, first:last]
+    k0, k1 = guide[0, v, first + dx : last + dx], guide[1, v, first + dx : last + dx]
+    k2 = guide[2, v, first + dx : last + dx]
+    same, far, near = sums[0, first:last], sums[1, first:last], sums[2, first:last]
+    far_sum, near_sum = sums[3, first:last], sums[4, first:last]
+    right, down = np.float32(dx), np.float32(v - y)
+    low, high = ONE - apart, ONE + apart
+    for x in range(last - first):
+        d0, d1, d2 = k0[x] - g0[x], k1[x] - g1[x], k2[x] - g2[x]
+        like = ONE + contrast * (d0 * d0 + d1 * d1 + d2 * d2)
+        value = there[x] - gx[x] * right - gy[x] * down
+        weight = sure[x] / (like * like)
+        is_far, is_near = value <= own[x] * low, value >= own[x] * high
+        of_far = weight if is_far & (value > ZERO) else ZERO
+        of_near = weight if is_near else ZERO
+        same[x] += ZERO if is_far | is_near else weight
+        far[x] += of_far
+        near[x] += of_near
+        far_sum[x] += of_far * value
+        near_sum[x] += of_near * value
+
+
+@njit(**_FAST)
 def _around(y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, samples):
     """Planes of the pixels around, extended to (x, y), with their weights; how many there are.
 
@@ -51,25 +86,26 @@ def _mode(samples, count, low, high, start, width, rounds, mode):
     Mean shift from ``start`` with Cauchy's kernel of relative ``width``. ``mode`` receives inverse
     depth, slopes and confidence; returns the weight behind it.
     """
-    mode[0] = start
-    total = ZERO
+    centre, total = start, ZERO
+    across = down = sure = ZERO
+    values, slopes_x, slopes_y = samples[0], samples[1], samples[2]
+    weights, confidences = samples[3], samples[4]
     for _ in range(rounds):
-        total = ZERO
-        centre, inverse = mode[0], ONE / (width * mode[0])
-        mode[:] = ZERO
+        inverse = ONE / (width * centre)
+        total = place = across = down = sure = ZERO
         for i in range(count):
-            value = samples[0, i]
-            if low < value < high:
-                away = (value - centre) * inverse
-                weight = samples[3, i] / (ONE + away * away)
-                total += weight
-                mode[0] += weight * value
-                mode[1] += weight * samples[1, i]
-                mode[2] += weight * samples[2, i]
-                mode[3] += weight * samples[4, i]
+            value = values[i]
+            away = (value - centre) * inverse
+            is_within = (low < value) & (value < high)
+            weight = weights[i] / (ONE + away * away) if is_within else ZERO
+            total += weight
+            place += weight * value
+            across += weight * slopes_x[i]
+            down += weight * slopes_y[i]
+            sure += weight * confidences[i]
         scale = ONE / max(total, np.float32(1e-12))
-        for k in range(4):
-            mode[k] *= scale
+        centre, across, down, sure = place * scale, across * scale, down * scale, sure * scale
+    mode[0], mode[1], mode[2], mode[3] = centre, across, down, sure
     return total
 
 
@@ -83,43 +119,42 @@ def resolve_edges(
     Candidates are the modes of what is farther and what is nearer by a relative ``apart``; less
     apart is the pixel's own surface. A candidate's score is the log ratio of its weight to the own
     surface's plus ``trust`` times how much less its matching cost is; the best above 0 is taken,
-    with ``moved`` times the mean confidence of those that are for it.
+    with ``moved`` times the mean confidence of those that are for it. Row by row all pixels are
+    asked how much there is of each side; only those are looked at alone whom that could move.
     """
-    size = (2 * reach + 1) ** 2
-    samples = np.empty((5, size), np.float32)
-    mode = np.empty(4, np.float32)
-    weights, sums = np.empty(2, np.float32), np.empty(2, np.float32)
+    h, w = rho.shape
+    samples = np.empty((5, (2 * reach + 1) ** 2), np.float32)
+    mode, sums = np.empty(4, np.float32), np.empty((5, w), np.float32)
     little, enough = np.float32(0.1), np.float32(0.3)
     for y in range(first, last):
-        for x in range(rho.shape[1]):
-            own = rho[y, x]
+        sums[:] = ZERO
+        for v in range(max(y - reach, 0), min(y + reach + 1, h)):
+            for dx in range(-reach, reach + 1):
+                _add_sides(
+                    y, v, dx, max(0, -dx), min(w, w - dx), rho, slope_x, slope_y, confidence,
+                    guide, contrast, apart, sums,
+                )  # fmt: skip
+        for x in range(w):
+            own, same = rho[y, x], sums[0, x]
             new_rho[y, x], new_x[y, x], new_y[y, x] = own, slope_x[y, x], slope_y[y, x]
             new_confidence[y, x] = confidence[y, x]
-            count = _around(
-                y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, samples
-            )
+            if max(sums[1, x], sums[2, x]) < enough:
+                continue
             far, near = own * (ONE - apart), own * (ONE + apart)
-            same = ZERO
-            weights[:] = ZERO
-            sums[:] = ZERO
-            for i in range(count):
-                value, weight = samples[0, i], samples[3, i]
-                if value <= far or value >= near:
-                    side = 0 if value <= far else 1
-                    if value > ZERO:
-                        weights[side] += weight
-                        sums[side] += weight * value
-                else:
-                    same += weight
-            best = ZERO
+            best, count = ZERO, 0
             here = _cost_at(costs[y, x], plane, spacing, own)
             for side in range(2):
-                if weights[side] < enough:
+                weight = sums[1 + side, x]
+                if weight < enough:
                     continue
-                if np.log((weights[side] + little) / (same + little)) + trust * here < best:
+                if np.log((weight + little) / (same + little)) + trust * here < best:
                     continue  # even with all of that weight and no cost
+                if count == 0:
+                    count = _around(
+                        y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, samples
+                    )
                 low, high = (ZERO, far) if side == 0 else (near, np.float32(1e30))
-                start = sums[side] / weights[side]
+                start = sums[3 + side, x] / weight
                 weight = _mode(samples, count, low, high, start, width, rounds, mode)
                 if weight < enough:
                     continue

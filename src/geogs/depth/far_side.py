@@ -1,6 +1,6 @@
 """Pixels that a search has put on the nearer side of an edge, and the images on the farther one."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 
 import torch
@@ -38,16 +38,44 @@ class FarSideSearch(RevisedSearch):
         if not others:
             return searched
         depth, confidence = searched.depth, searched.confidence
+        beyond_of, vote_on = _asked(view, others, self.render, depth.is_cuda)
         for _ in range(PASSES):
-            beyond = farther_surface(depth, round(REACH * max(depth.shape)))
-            there = beyond > 0
-            other = torch.where(there, beyond, depth)
-            vote = photo_vote(view, others, torch.stack([depth, other]), ~there, self.render)
-            moved = there & (vote > 0)
-            depth = torch.where(moved, other, depth)
+            beyond = beyond_of(depth)
+            moved = (beyond > 0) & (vote_on(depth, beyond) > 0)
+            depth = torch.where(moved, beyond, depth)
             confidence = torch.where(moved, MOVED_CONFIDENCE, confidence)
         (found,) = dense_depths([(depth, confidence)])
         return found
+
+
+_Surface = Callable[[Tensor], Tensor]
+_Vote = Callable[[Tensor, Tensor], Tensor]
+
+
+def _asked(
+    view: DepthView, others: Sequence[DepthView], camera: Camera, on_gpu: bool
+) -> tuple[_Surface, _Vote]:
+    """What finds the surface beyond each pixel of a depth (0 where there is none), and what asks
+    the images about a depth and what is beyond: compiled loops on a CPU."""
+    if not on_gpu:
+        from geogs.depth.far_side_cpu import CompiledPhotoVote, compiled_farther_surface
+
+        def compiled(depth: Tensor) -> Tensor:
+            return compiled_farther_surface(depth, _reach(depth), APART)
+
+        return compiled, CompiledPhotoVote(view, others, camera)
+
+    def vote(depth: Tensor, beyond: Tensor) -> Tensor:
+        there = beyond > 0
+        depths = torch.stack([depth, torch.where(there, beyond, depth)])
+        return photo_vote(view, others, depths, ~there, camera)
+
+    return lambda depth: farther_surface(depth, _reach(depth)), vote
+
+
+def _reach(depth: Float[Tensor, "h w"]) -> int:
+    """Pixels that ``REACH`` is in a map."""
+    return round(REACH * max(depth.shape))
 
 
 def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:

@@ -234,11 +234,11 @@ def _add_samples(
     gx, gy = slope_x[y, first:last], slope_y[y, first:last]
     sure = confidence[yy, first + dx : last + dx]
     fx, fy = np.float32(dx), np.float32(yy - y)
-    own_sums = sums[:, first:last]
-    t0, t1, t2, t3, t4 = own_sums[0], own_sums[1], own_sums[2], own_sums[3], own_sums[4]
-    own, other = guide[:, y, first:last], guide[:, yy, first + dx : last + dx]
-    g0, g1, g2 = own[0], own[1], own[2]
-    k0, k1, k2 = other[0], other[1], other[2]
+    t0, t1, t2 = sums[0, first:last], sums[1, first:last], sums[2, first:last]
+    t3, t4 = sums[3, first:last], sums[4, first:last]
+    g0, g1, g2 = guide[0, y, first:last], guide[1, y, first:last], guide[2, y, first:last]
+    k0, k1 = guide[0, yy, first + dx : last + dx], guide[1, yy, first + dx : last + dx]
+    k2 = guide[2, yy, first + dx : last + dx]
     for x in range(last - first):
         r = there[x] - here[x] - fx * gx[x] - fy * gy[x]
         c0, c1, c2 = g0[x] - k0[x], g1[x] - k1[x], g2[x] - k2[x]
