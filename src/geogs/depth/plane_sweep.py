@@ -9,6 +9,7 @@ from jaxtyping import Float32
 
 from geogs.depth import plane_sweep_kernels as kernels
 from geogs.depth.depth_view import DepthView, homographies
+from geogs.depth.sampling_kernels import pixel_pairs
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
 
@@ -142,10 +143,11 @@ def matching_costs(
     square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
     scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
     a, b = homographies(reference, neighbours, camera, camera)
+    pairs, wide = pixel_pairs(images), np.pad(grey, ((0, 0), (radius, radius)), mode="edge")
     volume = np.empty((*grey.shape, len(planes)), np.float32)
     over_rows(
         lambda *rows: kernels.match_planes(
-            *rows, grey, mean, scale, images, a, b, planes, radius, floor, volume
+            *rows, wide, mean, scale, pairs, a, b, planes, radius, floor, volume
         ),
         len(grey),
     )

@@ -8,6 +8,8 @@ those that are given the first row and the one behind the last do the rows betwe
 import numpy as np
 from numba import njit
 
+from geogs.depth.sampling_kernels import fetch_pairs
+
 BLOCK = 16
 """Planes matched before their costs are transposed into the volume: one cache line of float32."""
 STRIP = 32
@@ -20,22 +22,24 @@ _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 
 @njit(**_FAST)
-def _warp_row(image, a, b, rho, y, warped, lowest, index, fraction_u, fraction_v):
-    """Sample ``image`` where row ``y`` of the plane of inverse depth ``rho`` projects.
+def _warp_row(
+    pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fraction_v, top, low
+):
+    """Sample an image where row ``y`` of the plane of inverse depth ``rho`` projects.
 
-    Homogeneous pixel q = a p + rho b. ``lowest``, the least cost a pixel may get, is OUTSIDE where
-    the sample leaves the image and 0 elsewhere. The loop over x is split so that all but the
-    gathering of samples vectorises.
+    ``pairs`` are its ``pixel_pairs``. Homogeneous pixel q = a p + rho b. ``warped`` receives the
+    samples with ``radius`` repeats of the first and last on either side. ``lowest``, the least cost
+    a pixel may get, is OUTSIDE where the sample leaves the image and 0 elsewhere. The loop over x is
+    split so that all but the copying of samples (``top`` and ``low`` are scratch) vectorises.
     """
-    h, w = image.shape
-    flat = image.ravel()
-    right, down = np.uint32(1), np.uint32(w)
+    h, w = pairs.shape
     last_u, last_v = np.float32(w - 1.001), np.float32(h - 1.001)
     s0, s1, s2 = np.float32(a[0, 0]), np.float32(a[1, 0]), np.float32(a[2, 0])
     c0 = np.float32(a[0, 1] * y + a[0, 2] + rho * b[0])
     c1 = np.float32(a[1, 1] * y + a[1, 2] + rho * b[1])
     c2 = np.float32(a[2, 1] * y + a[2, 2] + rho * b[2])
-    for x in range(warped.shape[0]):
+    count = index.shape[0]
+    for x in range(count):
         column = np.float32(np.int32(x))
         q2 = c2 + s2 * column
         inverse = np.float32(1.0) / max(q2, np.float32(1e-3))
@@ -49,45 +53,43 @@ def _warp_row(image, a, b, rho, y, warped, lowest, index, fraction_u, fraction_v
         fraction_u[x] = cu - whole_u
         fraction_v[x] = cv - whole_v
         index[x] = np.uint32(np.int32(whole_v * np.float32(w) + whole_u))
-    for x in range(warped.shape[0]):
-        k = index[x]
-        top = flat[k] + fraction_u[x] * (flat[k + right] - flat[k])
-        k += down
-        bottom = flat[k] + fraction_u[x] * (flat[k + right] - flat[k])
-        warped[x] = top + fraction_v[x] * (bottom - top)
-
-
-@njit(**_FAST)
-def _column_sums(reference, warped, first, radius, ones, squares, products):
-    """Sums of b, b^2 and a b down 2 radius + 1 rows; ``reference`` starts ``first`` rows away."""
-    h, w = reference.shape
-    # Views, because an index that could be negative would keep the loops from vectorising.
-    one, square, product = ones[radius:], squares[radius:], products[radius:]
-    for x in range(w):
-        one[x] = np.float32(0.0)
-        square[x] = np.float32(0.0)
-        product[x] = np.float32(0.0)
-    for i in range(2 * radius + 1):
-        row, other = warped[i], reference[min(max(first + i, 0), h - 1)]
-        for x in range(w):
-            b = row[x]
-            one[x] += b
-            square[x] += b * b
-            product[x] += b * other[x]
-
-
-@njit(**_FAST)
-def _window_sums(column, radius, out):
-    """Horizontal window sums of the column sums; ``column`` carries ``radius`` repeats a side."""
-    w = out.shape[0]
+    fetch_pairs(pairs, index, top, low)
+    upper, lower, own = top.view(np.float32), low.view(np.float32), warped[radius:]
+    for x in range(count):
+        above = upper[2 * x] + fraction_u[x] * (upper[2 * x + 1] - upper[2 * x])
+        below = lower[2 * x] + fraction_u[x] * (lower[2 * x + 1] - lower[2 * x])
+        own[x] = above + fraction_v[x] * (below - above)
     for i in range(radius):
-        column[i] = column[radius]
-        column[radius + w + i] = column[radius + w - 1]
-    for x in range(w):
-        out[x] = column[x] + column[x + 1] + column[x + 2]
+        warped[i] = warped[radius]
+        warped[radius + count + i] = warped[radius + count - 1]
+
+
+@njit(**_FAST)
+def _row_sums(reference, warped, radius, ones, squares, products):
+    """Sums of b, b^2 and a b over 2 radius + 1 columns; both rows have ``radius`` repeats a side."""
+    for x in range(ones.shape[0]):
+        b0, b1, b2 = warped[x], warped[x + 1], warped[x + 2]
+        ones[x] = b0 + b1 + b2
+        squares[x] = b0 * b0 + b1 * b1 + b2 * b2
+        products[x] = b0 * reference[x] + b1 * reference[x + 1] + b2 * reference[x + 2]
     for i in range(3, 2 * radius + 1):
-        for x in range(w):
-            out[x] += column[x + i]
+        for x in range(ones.shape[0]):
+            b = warped[x + i]
+            ones[x] += b
+            squares[x] += b * b
+            products[x] += b * reference[x + i]
+
+
+@njit(**_FAST)
+def _column_sums(rows, first, radius, out):
+    """Sums of 2 radius + 1 rows from the ``first`` on."""
+    r0, r1, r2 = rows[first], rows[first + 1], rows[first + 2]
+    for x in range(out.shape[0]):
+        out[x] = r0[x] + r1[x] + r2[x]
+    for i in range(first + 3, first + 2 * radius + 1):
+        row = rows[i]
+        for x in range(out.shape[0]):
+            out[x] += row[x]
 
 
 @njit(**_FAST)
@@ -119,18 +121,17 @@ def _count_inside(lowest, seen):
 
 
 @njit(**_FAST)
-def _mean_of_better_half(sorted_costs, seen, shares, out):
-    """Mean of the smallest costs: half as many as ``seen`` neighbours, rounded up, or two.
-
-    ``shares[n]`` is what each of the costs counts where n neighbours see the point.
-    """
+def _mean_of_better_half(sorted_costs, seen, least, out):
+    """Mean of the smallest costs: half as many as ``seen`` neighbours, rounded up, or ``least``."""
     keep, w = sorted_costs.shape
     for x in range(w):
         out[x] = np.float32(0.0)
     for k in range(keep):
         row = sorted_costs[k]
         for x in range(w):
-            out[x] += shares[seen[x], k] * row[x]
+            out[x] += row[x] if k < max((seen[x] + np.int32(1)) >> np.int32(1), least) else np.float32(0.0)
+    for x in range(w):
+        out[x] /= np.float32(max((seen[x] + np.int32(1)) >> np.int32(1), least))
 
 
 @njit(**_FAST)
@@ -142,30 +143,28 @@ def _transpose(block, count, volume, start):
 
 
 @njit(**_FAST)
-def match_planes(first, last, reference, mean, scale, images, a, b, planes, radius, floor, volume):
+def match_planes(first, last, reference, mean, scale, pairs, a, b, planes, radius, floor, volume):
     """volume[y, x, k] = mean of the smaller half of 1 - NCC over the neighbours, at plane k.
 
     That is half of those into whose images the pixel falls, rounded up, but at least two (one if
     there is but one), so that what few look at is matched with these; who is missing costs OUTSIDE.
-    ``a`` (n, 3, 3), ``b`` (n, 3): homographies a + rho b e_3^T of the neighbours (float64).
-    Windows have (2 radius + 1)^2 pixels; image borders repeat. Images should be centred about zero,
-    so that little is lost to cancellation in the variances.
+    ``pairs`` (n, h, w) are the ``pixel_pairs`` of the neighbours; ``a`` (n, 3, 3), ``b`` (n, 3):
+    their homographies a + rho b e_3^T (float64). Windows have (2 radius + 1)^2 pixels; image
+    borders repeat: ``reference`` has ``radius`` more columns a side that do. Images should be
+    centred about zero, so that little is lost to cancellation in the variances.
     """
-    h, w = reference.shape
-    warped = np.empty((STRIP + 2 * radius, w), np.float32)
-    lowest = np.empty_like(warped)
+    h, w = mean.shape
+    warped = np.empty(w + 2 * radius, np.float32)
+    lowest = np.empty((STRIP + 2 * radius, w), np.float32)
     index = np.empty(w, np.uint32)
     fraction_u, fraction_v = np.empty(w, np.float32), np.empty(w, np.float32)
-    columns = np.empty((3, w + 2 * radius), np.float32)
+    top, low = np.empty(w, np.uint64), np.empty(w, np.uint64)
+    rows_of = np.empty((3, STRIP + 2 * radius, w), np.float32)
     sums = np.empty((3, w), np.float32)
-    least = min(2, images.shape[0])
-    keep = max(least, (images.shape[0] + 1) // 2)
+    least = np.int32(min(2, pairs.shape[0]))
+    keep = max(least, (pairs.shape[0] + 1) // 2)
     best = np.empty((STRIP, keep, w), np.float32)
     seen = np.empty((STRIP, w), np.int32)
-    shares = np.zeros((images.shape[0] + 1, keep), np.float32)
-    for n in range(images.shape[0] + 1):
-        used = max((n + 1) // 2, least)
-        shares[n, :used] = np.float32(1.0) / np.float32(used)
     block = np.empty((STRIP, BLOCK, w), np.float32)
     norm = np.float32(1.0 / (2 * radius + 1) ** 2)
     for y0 in range(first, last, STRIP):
@@ -175,28 +174,28 @@ def match_planes(first, last, reference, mean, scale, images, a, b, planes, radi
             for k in range(count):
                 best[:] = FAR
                 seen[:] = 0
-                for j in range(images.shape[0]):
+                for j in range(pairs.shape[0]):
                     for i in range(rows + 2 * radius):
                         y = min(max(y0 + i - radius, 0), h - 1)
                         _warp_row(
-                            images[j], a[j], b[j], planes[start + k], y, warped[i], lowest[i],
-                            index, fraction_u, fraction_v,
+                            pairs[j], a[j], b[j], planes[start + k], y, radius, warped, lowest[i],
+                            index, fraction_u, fraction_v, top, low,
+                        )  # fmt: skip
+                        _row_sums(
+                            reference[y], warped, radius, rows_of[0, i], rows_of[1, i],
+                            rows_of[2, i],
                         )  # fmt: skip
                     for i in range(rows):
                         y = y0 + i
-                        _column_sums(
-                            reference, warped[i:], y - radius, radius, columns[0], columns[1],
-                            columns[2],
-                        )  # fmt: skip
                         for s in range(3):
-                            _window_sums(columns[s], radius, sums[s])
+                            _column_sums(rows_of[s], i, radius, sums[s])
                         _ncc_row(
                             sums[0], sums[1], sums[2], mean[y], scale[y], lowest[i + radius],
                             norm, floor, best[i],
                         )  # fmt: skip
                         _count_inside(lowest[i + radius], seen[i])
                 for i in range(rows):
-                    _mean_of_better_half(best[i], seen[i], shares, block[i, k])
+                    _mean_of_better_half(best[i], seen[i], least, block[i, k])
             for i in range(rows):
                 _transpose(block[i], count, volume[y0 + i], start)
 

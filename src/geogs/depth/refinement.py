@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt64
 
 from geogs.depth import refinement_kernels as kernels
 from geogs.depth.depth_view import DepthView, homographies
 from geogs.depth.evidence import TrackerEvidence
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
+from geogs.depth.sampling_kernels import pixel_pairs
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows
 
@@ -62,7 +63,8 @@ class _Patches:
     samples: Float32[np.ndarray, "s h w"]
     offsets: Float32[np.ndarray, "s 2"]
     weights: Float32[np.ndarray, "s h w"]
-    images: Float32[np.ndarray, "n fh fw"]
+    pairs: UInt64[np.ndarray, "n fh fw"]
+    """``pixel_pairs`` of the neighbours' images."""
     a: np.ndarray
     b: np.ndarray
 
@@ -117,7 +119,7 @@ def _photometric_step(state: SlantedDepth, patches: _Patches) -> Float32[np.ndar
     floor = np.float32(0.5 * VARIANCE_FLOOR)
     over_rows(
         lambda *rows: kernels.photometric_step(
-            *rows, patches.samples, patches.offsets, patches.weights, patches.images, patches.a,
+            *rows, patches.samples, patches.offsets, patches.weights, patches.pairs, patches.a,
             patches.b, rho, state.slope_x, state.slope_y, floor, step, curvature,
         ),
         len(rho),
@@ -183,7 +185,7 @@ def _gather_patches(
         samples=samples,
         offsets=offsets,
         weights=weights,
-        images=np.stack([v.fine for v in neighbours]) - np.float32(0.5),
+        pairs=pixel_pairs(np.stack([v.fine for v in neighbours]) - np.float32(0.5)),
         a=a,
         b=b,
     )

@@ -9,21 +9,21 @@ first row and the one behind the last do the rows between them alone.
 import numpy as np
 from numba import njit
 
+from geogs.depth.sampling_kernels import fetch_pairs
+
 _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 
 
 @njit(**_FAST)
-def _sample_row(image, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, value, slope, inside):
-    """Samples of one image along one row, and their derivatives by inverse depth.
+def _place_row(pairs, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, du, dv, inside):
+    """Where the samples of one row lie in an image, and how they move with inverse depth.
 
     The patch sample (ox, oy) of pixel (x, y) has inverse depth rho + slope_x ox + slope_y oy and
     projects to a p + rho b (homogeneous).
     """
-    h, w = image.shape
-    flat = image.ravel()
-    right, down = np.uint32(1), np.uint32(w)
+    h, w = pairs.shape
     last_u, last_v = np.float32(w - 1.001), np.float32(h - 1.001)
     s0, s1, s2 = np.float32(a[0, 0]), np.float32(a[1, 0]), np.float32(a[2, 0])
     b0, b1, b2 = np.float32(b[0]), np.float32(b[1]), np.float32(b[2])
@@ -46,37 +46,54 @@ def _sample_row(image, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, va
         fu[x] = cu - whole_u
         fv[x] = cv - whole_v
         index[x] = np.uint32(np.int32(whole_v * np.float32(w) + whole_u))
-        value[x] = (b0 - cu * b2) * inverse
-        slope[x] = (b1 - cv * b2) * inverse
-    for x in range(rho.shape[0]):
-        k = index[x]
-        left_top, right_top = flat[k], flat[k + right]
-        k += down
-        left_low, right_low = flat[k], flat[k + right]
-        top = left_top + fu[x] * (right_top - left_top)
-        low = left_low + fu[x] * (right_low - left_low)
-        across = (right_top - left_top) * (ONE - fv[x]) + (right_low - left_low) * fv[x]
-        slope[x] = across * value[x] + (low - top) * slope[x]
-        value[x] = top + fv[x] * (low - top)
+        du[x] = (b0 - cu * b2) * inverse
+        dv[x] = (b1 - cv * b2) * inverse
+
+
+@njit(**_FAST)
+def _add_samples_of_row(reference, weight, top, low, fu, fv, du, dv, sums):
+    """Weighted first and second moments of reference a with sample b and its derivative g by
+    inverse depth, and of these: b, g, bb, gg, ab, ag, bg. ``top`` and ``low`` are the samples'
+    pixels in pairs."""
+    sb, sg, sbb, sgg, sab, sag, sbg = (
+        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
+    )  # fmt: skip
+    for x in range(fu.shape[0]):
+        left_top, left_low = top[2 * x], low[2 * x]
+        right_top, right_low = top[2 * x + 1] - left_top, low[2 * x + 1] - left_low
+        above, below = left_top + fu[x] * right_top, left_low + fu[x] * right_low
+        down = below - above
+        across = right_top + (right_low - right_top) * fv[x]
+        q, g = above + fv[x] * down, across * du[x] + down * dv[x]
+        m, p = weight[x], reference[x]
+        mp, mq, mg = m * p, m * q, m * g
+        sb[x] += mq
+        sg[x] += mg
+        sbb[x] += mq * q
+        sgg[x] += mg * g
+        sab[x] += mp * q
+        sag[x] += mp * g
+        sbg[x] += mq * g
 
 
 @njit(**_FAST)
 def photometric_step(
-    first, last, patches, offsets, weights, images, a, b, rho, slope_x, slope_y, floor, step,
+    first, last, patches, offsets, weights, pairs, a, b, rho, slope_x, slope_y, floor, step,
     curvature,
 ):  # fmt: skip
     """One Gauss-Newton step per pixel on the zero-mean normalised patches of all neighbours.
 
     patches (s, h, w): the reference at each patch sample; offsets (s, 2): (x, y) in render pixels;
-    weights (s, h, w): support weights. Writes the step of inverse depth and the curvature of the
+    weights (s, h, w): support weights; pairs: ``pixel_pairs`` of the neighbours. Writes the step of inverse depth and the curvature of the
     sum of (1 - NCC) by inverse depth; neighbours that do not match (NCC below 0.4, or partly out
     of view) count for nothing, better ones for more.
     """
     count, _, w = patches.shape
-    n = images.shape[0]
+    n = pairs.shape[0]
     index = np.empty(w, np.uint32)
+    top, low = np.empty(w, np.uint64), np.empty(w, np.uint64)
     fu, fv = np.empty(w, np.float32), np.empty(w, np.float32)
-    value, slope = np.empty(w, np.float32), np.empty(w, np.float32)
+    du, dv = np.empty(w, np.float32), np.empty(w, np.float32)
     inside = np.empty(w, np.float32)
     own = np.empty((3, w), np.float32)
     sums = np.empty((7, w), np.float32)
@@ -90,24 +107,15 @@ def photometric_step(
             sums[:] = ZERO
             inside[:] = ONE
             for s in range(count):
-                _sample_row(
-                    images[j],
-                    a[j],
-                    b[j],
-                    np.float32(y),
-                    offsets[s, 0],
-                    offsets[s, 1],
-                    rho[y],
-                    slope_x[y],
-                    slope_y[y],
-                    index,
-                    fu,
-                    fv,
-                    value,
-                    slope,
-                    inside,
-                )
-                _accumulate(patches[s, y], weights[s, y], value, slope, sums)
+                _place_row(
+                    pairs[j], a[j], b[j], np.float32(y), offsets[s, 0], offsets[s, 1], rho[y],
+                    slope_x[y], slope_y[y], index, fu, fv, du, dv, inside,
+                )  # fmt: skip
+                fetch_pairs(pairs[j], index, top, low)
+                _add_samples_of_row(
+                    patches[s, y], weights[s, y], top.view(np.float32), low.view(np.float32), fu,
+                    fv, du, dv, sums,
+                )  # fmt: skip
             _add_neighbour(own, sums, inside, floor, total)
         for x in range(w):
             curvature[y, x] = total[1, x]
@@ -123,24 +131,6 @@ def _accumulate_own(reference, weight, own):
         sw[x] += m
         sa[x] += m * p
         saa[x] += m * p * p
-
-
-@njit(**_FAST)
-def _accumulate(reference, weight, value, slope, sums):
-    """Weighted first and second moments with sample b and derivative g, and of these."""
-    sb, sg, sbb, sgg, sab, sag, sbg = (
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
-    )  # fmt: skip
-    for x in range(value.shape[0]):
-        m, p, q, g = weight[x], reference[x], value[x], slope[x]
-        mp, mq, mg = m * p, m * q, m * g
-        sb[x] += mq
-        sg[x] += mg
-        sbb[x] += mq * q
-        sgg[x] += mg * g
-        sab[x] += mp * q
-        sag[x] += mp * g
-        sbg[x] += mq * g
 
 
 @njit(**_FAST)
