@@ -189,7 +189,7 @@ def test_photometric_step_climbs_the_ncc():
     def step(rho):
         out = [np.empty_like(zero) for _ in range(2)]
         refinement.photometric_step(
-            0, len(rho), patches.samples, patches.offsets, patches.weights, patches.images,
+            0, len(rho), patches.samples, patches.offsets, patches.weights, patches.pairs,
             patches.a, patches.b, rho, zero, zero, F(1e-6), *out,
         )  # fmt: skip
         return out

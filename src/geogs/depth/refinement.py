@@ -19,8 +19,9 @@ PATCH_REACH = 2
 """Patches of 5 x 5 samples, one render pixel apart."""
 PATCH_CONTRAST = 500.0
 """How fast a patch sample's weight falls with its grey difference, squared."""
-REFINE_STEPS = 3
-"""Photometric steps, each with a fit of local planes."""
+REFINE_STEPS = (2, 2, 1)
+"""Photometric steps, each with a fit of local planes: of a patch each compares every so many-th
+sample. Every second is those of one colour on a chessboard, which do for all steps but the last."""
 STEP_LIMIT = 0.03
 """Largest step, relative to inverse depth: beyond it patches are no longer alike."""
 PHOTO_DEVIATION = 0.07
@@ -68,6 +69,13 @@ class _Patches:
     a: np.ndarray
     b: np.ndarray
 
+    def every(self, step: int) -> "_Patches":
+        """With every so many-th sample."""
+        if step == 1:
+            return self
+        picked = [x[::step].copy() for x in (self.samples, self.offsets, self.weights)]
+        return _Patches(*picked, self.pairs, self.a, self.b)
+
 
 def refine_depth(
     reference: DepthView,
@@ -87,12 +95,13 @@ def refine_depth(
     and the local plane.
     """
     patches = _gather_patches(reference, neighbours, render, working)
+    compared = {step: patches.every(step) for step in set(REFINE_STEPS)}
     state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
         _fit_planes(state, confidence, guide, radius, tolerance, 0.0)
     state.inverse_depth = rho.copy()
-    for _ in range(REFINE_STEPS):
-        photo_precision = _photometric_step(state, patches)
+    for step in REFINE_STEPS:
+        photo_precision = _photometric_step(state, compared[step])
         rho = state.inverse_depth
         misfit = (tracker.inverse_depth / rho - 1.0) ** 2 * tracker.precision
         tracker_precision = tracker.precision / (1.0 + misfit / 4.0)

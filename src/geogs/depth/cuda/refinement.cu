@@ -77,14 +77,15 @@ __device__ __forceinline__ float2 weigh_neighbour(const Moments& m, bool inside,
                      weight * fmaxf(vg / vb - slant * slant, 0.f));
 }
 
-// Climb and curvature of one neighbour at one pixel.
+// Climb and curvature of one neighbour at one pixel, from every so many-th sample of its patch.
 __device__ __forceinline__ float2 match_patch(
     const float* samples, const float* image, const float* hom, int pixel, int pixels, int x,
-    int y, float rho, float slope_x, float slope_y, float contrast, float floor, int fh, int fw) {
+    int y, float rho, float slope_x, float slope_y, float contrast, float floor, int fh, int fw,
+    int every) {
   const float centre = samples[(SAMPLES / 2) * pixels + pixel];
   Moments m = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};
   bool inside = true;
-  for (int s = 0; s < SAMPLES; s++) {
+  for (int s = 0; s < SAMPLES; s += every) {
     const float ox = s % PATCH - REACH, oy = s / PATCH - REACH;
     const float r = rho + ox * slope_x + oy * slope_y, px = x + ox, py = y + oy;
     const ImagePoint q = project_into(
@@ -112,7 +113,7 @@ __device__ __forceinline__ float2 match_patch(
 extern "C" __global__ void photometric_step(
     const float* samples, const float* images, const float* homographies, const float* rho,
     const float* slope_x, const float* slope_y, const float* tracker, const float* tracker_weight,
-    int h, int w, int fh, int fw, float contrast, float floor, float step_limit,
+    int h, int w, int fh, int fw, int every, float contrast, float floor, float step_limit,
     float photo_variance, float least_variance, float fit_variance, float* data, float* precision,
     float* sure) {
   __shared__ float2 sums[MAX_NEIGHBOURS][32];
@@ -120,7 +121,7 @@ extern "C" __global__ void photometric_step(
   const int x = min((int)(blockIdx.x * 32 + lane), w - 1), p = y * w + x;
   const float start = rho[p];
   sums[j][lane] = match_patch(samples, images + j * fh * fw, homographies + 12 * j, p, h * w, x, y,
-                              start, slope_x[p], slope_y[p], contrast, floor, fh, fw);
+                              start, slope_x[p], slope_y[p], contrast, floor, fh, fw, every);
   __syncthreads();
   if (j > 0 || blockIdx.x * 32 + lane >= w) return;
   float climb = 0.f, curvature = 0.f;

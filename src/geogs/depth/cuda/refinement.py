@@ -116,14 +116,18 @@ def photometric_step(
     images: Float32[Tensor, "n fh fw"],
     homographies: Float32[Tensor, "n 12"],
     tracker: TrackerMaps,
+    every: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Move ``state`` one step, averaged with the tracker; returns precision and plane weight."""
+    """Move ``state`` one step, averaged with the tracker; returns precision and plane weight.
+
+    Of the samples of a patch ``every`` so many-th is compared.
+    """
     h, w = state.inverse_depth.shape
     data, precision, confidence = (torch.empty_like(state.inverse_depth) for _ in range(3))
     kernels_for(SOURCE, samples.device)["photometric_step"](
         (-(-w // 32), h), (32, len(images)), samples, images, homographies, state.inverse_depth,
         state.slope_x, state.slope_y, tracker.inverse_depth, tracker.precision, h, w,
-        *images.shape[1:], PATCH_CONTRAST, 0.5 * VARIANCE_FLOOR, STEP_LIMIT,
+        *images.shape[1:], every, PATCH_CONTRAST, 0.5 * VARIANCE_FLOOR, STEP_LIMIT,
         PHOTO_DEVIATION**2, FLOOR_DEVIATION**2, FIT_DEVIATION**2, data, precision,
         confidence,
     )  # fmt: skip
@@ -167,8 +171,10 @@ def refine(
     for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
         fit_planes(state, confidence, reference.colours, radius, tolerance, 0.0)
     state.inverse_depth = rho
-    for _ in range(REFINE_STEPS):
-        precision, confidence = photometric_step(state, samples, images, homographies, tracker)
+    for every in REFINE_STEPS:
+        precision, confidence = photometric_step(
+            state, samples, images, homographies, tracker, every
+        )
         fit_planes(
             state, confidence, reference.colours, FIT_RADIUS, FIT_TOLERANCE,
             FIT_STIFFNESS, precision,
