@@ -11,6 +11,7 @@ from torch import Tensor
 from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 from geogs.depth.photo_vote import photo_vote
+from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import minmod_slopes
 
 APART = 0.03
