@@ -1,8 +1,8 @@
 """What lies beyond each pixel and what the images say of it, in compiled loops on a CPU.
 
 The same as :func:`geogs.depth.far_side.farther_surface` and
-:func:`geogs.depth.photo_vote.photo_vote`, which a GPU takes and which the loops are held to; but the
-images are asked only where there is something beyond.
+:func:`geogs.depth.photo_vote.photo_vote`, which a GPU takes and which the loops are held to; but
+the images are asked only where there is something beyond.
 """
 
 from collections.abc import Sequence

@@ -28,9 +28,9 @@ def goes_on(planes, v, u, dy, dx, farthest, most):
 def farther_planes(planes, farthest, near_share, reach, found):
     """Planes of farther surfaces within ``reach`` pixels, gone on from pixel to pixel.
 
-    A surface is farther whose inverse depth at a pixel is below ``near_share`` of its own. ``found``
-    (3, h, w), zero on entry, receives inverse depth and slopes. Round by round only what the last
-    one has found can add anything: all else has been asked.
+    A surface is farther whose inverse depth at a pixel is below ``near_share`` of its own.
+    ``found`` (3, h, w), zero on entry, receives inverse depth and slopes. Round by round only what
+    the last one has found can add anything: all else has been asked.
     """
     height, width = found.shape[1], found.shape[2]
     age = np.zeros((height, width), np.int32)
@@ -102,15 +102,16 @@ def grey_at(image, u, v):
 @njit(**_FAST)
 def grey_differences(reference, images, T, lens, depth, differences):
     """Grey value of each neighbour (n, h, w) where it sees a pixel, less the reference's; NaN where
-    it sees it not. Pixels without depth are left as they are."""
+    it sees it not, or there is no depth."""
     place = np.empty((2, depth.shape[1]), np.float32)
     for n in range(images.shape[0]):
         for y in range(depth.shape[0]):
             project_row(T[n], lens, y, depth, place)
             for x in range(depth.shape[1]):
+                seen = np.float32(np.nan)
                 if depth[y, x] > ZERO:
                     seen = grey_at(images[n], place[0, x], place[1, x])
-                    differences[n, y, x] = seen - reference[y, x]
+                differences[n, y, x] = seen - reference[y, x]
 
 
 @njit(**_FAST)

@@ -22,15 +22,13 @@ _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 
 @njit(**_FAST)
-def _warp_row(
-    pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fraction_v, top, low
-):
+def _warp_row(pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fraction_v, top, low):
     """Sample an image where row ``y`` of the plane of inverse depth ``rho`` projects.
 
     ``pairs`` are its ``pixel_pairs``. Homogeneous pixel q = a p + rho b. ``warped`` receives the
     samples with ``radius`` repeats of the first and last on either side. ``lowest``, the least cost
-    a pixel may get, is OUTSIDE where the sample leaves the image and 0 elsewhere. The loop over x is
-    split so that all but the copying of samples (``top`` and ``low`` are scratch) vectorises.
+    a pixel may get, is OUTSIDE where the sample leaves the image and 0 elsewhere. The loop over x
+    is split so that all but the copying of samples (``top`` and ``low`` are scratch) vectorises.
     """
     h, w = pairs.shape
     last_u, last_v = np.float32(w - 1.001), np.float32(h - 1.001)
@@ -66,7 +64,7 @@ def _warp_row(
 
 @njit(**_FAST)
 def _row_sums(reference, warped, radius, ones, squares, products):
-    """Sums of b, b^2 and a b over 2 radius + 1 columns; both rows have ``radius`` repeats a side."""
+    """Sums of b, b^2 and a b over 2 radius + 1 columns; rows have ``radius`` repeats a side."""
     for x in range(ones.shape[0]):
         b0, b1, b2 = warped[x], warped[x + 1], warped[x + 2]
         ones[x] = b0 + b1 + b2
@@ -129,7 +127,8 @@ def _mean_of_better_half(sorted_costs, seen, least, out):
     for k in range(keep):
         row = sorted_costs[k]
         for x in range(w):
-            out[x] += row[x] if k < max((seen[x] + np.int32(1)) >> np.int32(1), least) else np.float32(0.0)
+            count = max((seen[x] + np.int32(1)) >> np.int32(1), least)
+            out[x] += row[x] if k < count else np.float32(0.0)
     for x in range(w):
         out[x] /= np.float32(max((seen[x] + np.int32(1)) >> np.int32(1), least))
 

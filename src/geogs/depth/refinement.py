@@ -1,7 +1,7 @@
 """Depth beyond the sweep's planes: slanted patches at the working resolution, and local planes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -73,8 +73,9 @@ class _Patches:
         """With every so many-th sample."""
         if step == 1:
             return self
-        picked = [x[::step].copy() for x in (self.samples, self.offsets, self.weights)]
-        return _Patches(*picked, self.pairs, self.a, self.b)
+        samples, weights = self.samples[::step].copy(), self.weights[::step].copy()
+        offsets = self.offsets[::step].copy()
+        return replace(self, samples=samples, offsets=offsets, weights=weights)
 
 
 def refine_depth(

@@ -84,9 +84,9 @@ def photometric_step(
     """One Gauss-Newton step per pixel on the zero-mean normalised patches of all neighbours.
 
     patches (s, h, w): the reference at each patch sample; offsets (s, 2): (x, y) in render pixels;
-    weights (s, h, w): support weights; pairs: ``pixel_pairs`` of the neighbours. Writes the step of inverse depth and the curvature of the
-    sum of (1 - NCC) by inverse depth; neighbours that do not match (NCC below 0.4, or partly out
-    of view) count for nothing, better ones for more.
+    weights (s, h, w): support weights; pairs: ``pixel_pairs`` of the neighbours. Writes the step
+    of inverse depth and the curvature of the sum of (1 - NCC) by inverse depth; neighbours that do
+    not match (NCC below 0.4, or partly out of view) count for nothing, better ones for more.
     """
     count, _, w = patches.shape
     n = pairs.shape[0]
