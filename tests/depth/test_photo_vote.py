@@ -5,11 +5,20 @@ import pytest
 import torch
 from torch.nn.functional import max_pool2d
 
+from cuda_emulator import use_emulator
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.classical import CpuDepthEngine
+from geogs.depth.cuda import photo_vote as cuda_photo_vote
+from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch
 from geogs.depth.depth_view import DenseDepth
-from geogs.depth.far_side import APART, REACH, FarSideSearch, farther_surface
+from geogs.depth.far_side import (
+    APART,
+    REACH,
+    FarSideSearch,
+    compiled_surface,
+    farther_surface,
+)
 from geogs.depth.photo_vote import (
     CONTRAST,
     DEVIATIONS,
@@ -17,7 +26,7 @@ from geogs.depth.photo_vote import (
     RADIUS,
     averaged_by_colour,
     best_half,
-    photo_vote,
+    photo_costs,
     seen_from,
     truncated,
 )
@@ -89,30 +98,84 @@ def test_the_images_speak_for_the_true_depth():
     depths = torch.stack([torch.where(left, truth, wrong), torch.where(left, wrong, truth)])
     depths[:, :, 80:] = truth[:, 80:]
     same = (depths[0] - depths[1]).abs() < 1e-6
-    vote = photo_vote(scene.views[0], scene.views[1:], depths, same, RENDER)
-    assert float(vote.abs().max()) <= 1
+    costs = photo_costs(scene.views[0], scene.views[1:], depths, same, RENDER)
+    assert float(costs.min()) >= 0
+    assert float(costs.max()) <= 1
+    vote = costs[0] - costs[1]
     inner = torch.zeros_like(left)
     inner[8:-8, 8:72] = True
     assert float((vote[inner & left] < 0).float().mean()) > 0.95
     assert float((vote[inner & ~left] > 0).float().mean()) > 0.95
-    turned = photo_vote(scene.views[0], scene.views[1:], depths.flip(0), same, RENDER)
+    turned = photo_costs(scene.views[0], scene.views[1:], depths.flip(0), same, RENDER)
     # The light is learned from the first of two depths that are the same where it counts.
-    assert torch.allclose(turned, -vote, atol=1e-5)
+    assert torch.allclose(turned, costs.flip(0), atol=1e-5)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_a_gpu_says_the_same():
+def asked_of(scene):
+    """Two depths of each pixel, where they are the same, and where something is asked."""
+    depth = torch.from_numpy(scene.truth[0]).clone()
+    depth[20:40, 30:60] *= 0.8
+    depth[:, :4] = 0
+    beyond = depth.clone()
+    beyond[15:45, 25:70] *= 1.1
+    beyond[25:30, 40:45] *= 40  # out of most images
+    return torch.stack([depth, beyond]), beyond == depth, beyond != depth
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_compiled_loops_say_the_same(everywhere):
     scene = make_scene()
-    truth = torch.from_numpy(scene.truth[0])
-    depths = torch.stack([truth, 1.1 * truth])
-    depths[1, :20] = truth[:20]
-    same = depths[0] == depths[1]
-    views = scene.views[0], scene.views[1:]
-    expected = photo_vote(*views, depths, same, RENDER)
-    found = photo_vote(*views, depths.cuda(), same.cuda(), RENDER)
-    assert float((found.cpu() - expected).abs().max()) < 1e-3
-    beyond = torch.where(truth < 2.1, truth, 1.3 * truth)
-    assert torch.allclose(farther_surface(beyond.cuda(), 4).cpu(), farther_surface(beyond, 4))
+    depths, same, asked = asked_of(scene)
+    views, asked = (scene.views[0], scene.views[1:]), None if everywhere else asked
+    expected = photo_costs(*views, depths, same, RENDER, asked)
+    found = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, asked)
+    assert float((expected[0] - expected[1]).abs().max()) > 0.3
+    assert float((found - expected).abs().max()) < 2e-3
+    if not everywhere:
+        assert not found[:, ~(depths[0] != depths[1])].any()
+    again = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, asked)
+    assert torch.equal(found, again)  # whatever was in memory
+
+
+@pytest.mark.parametrize("device", ["emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_a_gpu_says_the_same(device, everywhere, monkeypatch):
+    if device == "emulated":
+        use_emulator(monkeypatch, cuda_photo_vote)
+        device = "cpu"
+    elif not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    scene = make_scene()
+    depths, same, asked = asked_of(scene)
+    views, asked = (scene.views[0], scene.views[1:]), None if everywhere else asked
+    expected = photo_costs(*views, depths, same, RENDER, asked)
+    engine = CudaDepthEngine(torch.device(device), RENDER, WORKING, 128, 8)
+    asked = None if asked is None else asked.to(device)
+    found = engine.photo_costs(*views, depths.to(device), same.to(device), asked)
+    assert float((found.cpu() - expected).abs().max()) < 2e-3
+
+
+def steps(seed: int) -> torch.Tensor:
+    """A rough depth map of slanted pieces that end at each other."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:60.0, :80.0]
+    inverse = 0.3 + 0.001 * u + 0.0007 * v
+    for _ in range(12):
+        y, x = rng.integers(0, (60, 80))
+        inside = (abs(v - y) < rng.integers(2, 15)) & (abs(u - x) < rng.integers(2, 20))
+        slope = rng.normal(0, 0.002, 2)
+        inverse[inside] = (rng.uniform(0.3, 0.9) + slope[0] * (u - x) + slope[1] * (v - y))[inside]
+    return torch.from_numpy(1 / inverse.clip(0.1)).float()
+
+
+@pytest.mark.parametrize("reach", [1, 3, 6])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_compiled_loops_find_the_same_surfaces(seed, reach):
+    depth = steps(seed)
+    expected, found = farther_surface(depth, reach), compiled_surface(depth, reach)
+    assert 0.02 < float((expected > 0).float().mean()) < 0.6
+    same = (found - expected).abs() <= 1e-4 * expected
+    assert float((~same).float().mean()) < 2e-3  # a plane that is at a limit by one rounding
 
 
 def test_a_farther_plane_goes_on_beneath_the_foreground():
@@ -131,8 +194,8 @@ def test_a_farther_plane_goes_on_beneath_the_foreground():
 class _Grown(AlternativeSearch):
     """Finds the true depth, but for a foreground that is some pixels too large."""
 
-    def __init__(self, depth, confidence):
-        super().__init__(CpuDepthEngine(RENDER, WORKING, 8))
+    def __init__(self, depth, confidence, render):
+        super().__init__(CpuDepthEngine(render, WORKING, 8))
         self.found = DenseDepth(depth, confidence, depth.median())
 
     def estimate(self, references, neighbours, progress=None, limits=None):
@@ -148,7 +211,7 @@ def test_a_foreground_that_has_grown_gives_back_what_is_behind_it():
     fringe = (max_pool2d(ball, 5, 1, 2) > ball)[0, 0]
     nearest = max_pool2d(ball / truth, 5, 1, 2)[0, 0]
     depth = torch.where(fringe, 1 / nearest.clamp(min=1e-6), truth)
-    engine = FarSideSearch(_Grown(depth, torch.full_like(depth, 0.9)), render)
+    engine = FarSideSearch(_Grown(depth, torch.full_like(depth, 0.9), render))
     (found,) = engine.estimate([scene.views[0]], [scene.views[1:]])
     wrong = lambda z, where: float(((z / truth - 1).abs() > 0.05)[where].float().mean())  # noqa: E731
     assert round(REACH * 192) >= 3

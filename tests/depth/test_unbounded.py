@@ -1,6 +1,6 @@
 """A sky with clouds above a wall: its depth is unknown, whatever the search says of it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from depth_scene import RENDER, WORKING, make_scene
+from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, depth_images
 from geogs.depth.unbounded import FAR, SkySearch, unbounded
 from geogs.geometry.camera import Camera
 
+ENGINE = CpuDepthEngine(RENDER, WORKING, 8)
 HORIZON = -0.05
 """Of y / z in the world: what is above is sky."""
 
@@ -66,7 +68,7 @@ def inner(mask: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("noise", [0.0, 2.0, 6.0])
 def test_a_sky_is_told_from_a_wall(noise):
     views, depth, sky = outside(noise)
-    found = unbounded(views[0], views[1:], dense(depth), RENDER)
+    found = unbounded(views[0], views[1:], dense(depth), ENGINE)
     assert found is not None
     found = found.numpy()
     assert found[inner(sky)].mean() > 0.95
@@ -79,7 +81,7 @@ def test_a_wall_that_was_found_too_far_away_is_no_sky():
     wrong = np.where(sky, truth, 3 * truth)
     wrong[:, :48] = truth[:, :48]
     views = make_scene().views
-    found = unbounded(views[0], views[1:], dense(wrong.astype(np.float32)), RENDER)
+    found = unbounded(views[0], views[1:], dense(wrong.astype(np.float32)), ENGINE)
     assert found is not None
     assert found.float().mean() < 0.01
 
@@ -87,15 +89,16 @@ def test_a_wall_that_was_found_too_far_away_is_no_sky():
 def test_where_nothing_is_far_nothing_is_asked():
     views, depth, _ = outside()
     near = np.minimum(depth, 0.99 * FAR * np.median(depth)).astype(np.float32)
-    assert unbounded(views[0], views[1:], dense(near), RENDER) is None
-    assert unbounded(views[0], [], dense(depth), RENDER) is None
+    assert unbounded(views[0], views[1:], dense(near), ENGINE) is None
+    assert unbounded(views[0], [], dense(depth), ENGINE) is None
 
 
-@dataclass
 class Found(AlternativeSearch):
     """A search that finds what it was given."""
 
-    depth: DenseDepth
+    def __init__(self, depth: DenseDepth) -> None:
+        super().__init__(ENGINE)
+        self.depth = depth
 
     def estimate(self, references, neighbours, progress=None, limits=None):
         return [self.depth for _ in references]
@@ -106,7 +109,7 @@ def test_the_search_is_sure_of_no_sky():
     normal = torch.zeros(*depth.shape, 3)
     normal[..., 2] = -1
     given = replace(dense(depth), normal=normal)
-    (found,) = SkySearch(Found(given), RENDER).estimate([views[0]], [views[1:]])
+    (found,) = SkySearch(Found(given)).estimate([views[0]], [views[1:]])
     unsure = found.confidence == 0
     assert unsure[torch.from_numpy(inner(sky))].float().mean() > 0.95
     assert (found.confidence[~unsure] == given.confidence[~unsure]).all()

@@ -86,3 +86,16 @@ class CpuDepthEngine:
             views = ((d.T_cw, d.depth.arrays()) for d in posed)
             kept[seen] = torch.from_numpy(vote(some, views, self.render))
         return kept
+
+    def photo_costs(
+        self,
+        view: DepthView,
+        others: Sequence[DepthView],
+        depths: Float[Tensor, "2 h w"],
+        same: Bool[Tensor, "h w"],
+        asked: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, "2 h w"]:
+        """As in the protocol."""
+        from geogs.depth.photo_vote_cpu import photo_costs
+
+        return photo_costs(view, others, depths, same, self.render, asked)

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
-from geogs.geometry.camera import Camera
 from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
@@ -55,6 +54,17 @@ class DepthEngine(Protocol):
         """World points that do not stand in the free space of the depths (``vote``)."""
         ...
 
+    def photo_costs(
+        self,
+        view: DepthView,
+        others: Sequence[DepthView],
+        depths: Float[Tensor, "2 h w"],
+        same: Bool[Tensor, "h w"],
+        asked: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, "2 h w"]:
+        """How badly the images of the others agree at each of two depths (``photo_costs``)."""
+        ...
+
 
 class AlternativeSearch:
     """Finds depths in a way of its own and leaves everything else to the ``classical`` engine.
@@ -79,13 +89,20 @@ class AlternativeSearch:
         """As in the protocol."""
         return self.classical.keep(points, depths)
 
+    def photo_costs(
+        self,
+        view: DepthView,
+        others: Sequence[DepthView],
+        depths: Float[Tensor, "2 h w"],
+        same: Bool[Tensor, "h w"],
+        asked: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, "2 h w"]:
+        """As in the protocol."""
+        return self.classical.photo_costs(view, others, depths, same, asked)
+
 
 class RevisedSearch(AlternativeSearch, ABC):
     """Another engine's search, of which each depth is looked at once more by itself."""
-
-    def __init__(self, search: DepthEngine, render: Camera) -> None:
-        super().__init__(search)
-        self.render = render
 
     def estimate(
         self,

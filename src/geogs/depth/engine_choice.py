@@ -23,12 +23,12 @@ def depth_engine(
     """
     classical = _classical(device, render, working, config, resident)
     if torch.device(device).type == "cpu":  # tried nowhere else
-        classical = FarSideSearch(classical, render)
+        classical = FarSideSearch(classical)
     engine = config.engine
     if engine == "auto":
         engine = "joint" if torch.device(device).type == "cuda" else "classical"
     if engine == "classical":
-        return SkySearch(classical, render)
+        return SkySearch(classical)
     if engine == "tracker":
         from geogs.depth.tracker_depth import TrackerDepthEngine
 
@@ -42,10 +42,10 @@ def depth_engine(
         trained, classical, torch.device(device), render, working, resident
     )
     if engine == "network":
-        return SkySearch(network, render)
+        return SkySearch(network)
     from geogs.depth.network.joint import JointDepthEngine
 
-    return SkySearch(JointDepthEngine(network, classical, render), render)
+    return SkySearch(JointDepthEngine(network, classical))
 
 
 def _classical(

@@ -1,8 +1,9 @@
 """Pixels that a search has put on the nearer side of an edge, and the images on the farther one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -10,8 +11,6 @@ from torch import Tensor
 
 from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
-from geogs.depth.photo_vote import photo_vote
-from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import minmod_slopes
 
 APART = 0.03
@@ -26,10 +25,10 @@ _AROUND = [step for step in product((-1, 0, 1), repeat=2) if step != (0, 0)]
 
 
 class FarSideSearch(RevisedSearch):
-    """The classical search, whose windows grow the foreground by some pixels, without these.
+    """A search whose windows grow the foreground by some pixels, without these.
 
     Where a farther surface lies beside a pixel, its plane goes on to it, and the pixel takes it if
-    the neighbours' images agree better there (``photo_vote``).
+    the neighbours' images agree better there (``photo_costs``).
     """
 
     def revised(
@@ -39,44 +38,33 @@ class FarSideSearch(RevisedSearch):
         if not others:
             return searched
         depth, confidence = searched.depth, searched.confidence
-        beyond_of, vote_on = _asked(view, others, self.render, depth.is_cuda)
         for _ in range(PASSES):
-            beyond = beyond_of(depth)
-            moved = (beyond > 0) & (vote_on(depth, beyond) > 0)
-            depth = torch.where(moved, beyond, depth)
-            confidence = torch.where(moved, MOVED_CONFIDENCE, confidence)
+            beyond = _beyond(depth)
+            there = beyond > 0
+            depths = torch.stack([depth, torch.where(there, beyond, depth)])
+            here, other = self.classical.photo_costs(view, others, depths, ~there, there)
+            depth = torch.where(other < here, beyond, depth)
+            confidence = torch.where(other < here, MOVED_CONFIDENCE, confidence)
         (found,) = dense_depths([(depth, confidence)])
         return found
 
 
-_Surface = Callable[[Tensor], Tensor]
-_Vote = Callable[[Tensor, Tensor], Tensor]
+def _beyond(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The farther surface of a map, by compiled loops on a CPU."""
+    reach = round(REACH * max(depth.shape))
+    return farther_surface(depth, reach) if depth.is_cuda else compiled_surface(depth, reach)
 
 
-def _asked(
-    view: DepthView, others: Sequence[DepthView], camera: Camera, on_gpu: bool
-) -> tuple[_Surface, _Vote]:
-    """What finds the surface beyond each pixel of a depth (0 where there is none), and what asks
-    the images about a depth and what is beyond: compiled loops on a CPU."""
-    if not on_gpu:
-        from geogs.depth.far_side_cpu import CompiledPhotoVote, compiled_farther_surface
+def compiled_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
+    """As :func:`farther_surface`, by compiled loops on a CPU."""
+    from geogs.depth.far_side_kernels import farther_planes
 
-        def compiled(depth: Tensor) -> Tensor:
-            return compiled_farther_surface(depth, _reach(depth), APART)
-
-        return compiled, CompiledPhotoVote(view, others, camera)
-
-    def vote(depth: Tensor, beyond: Tensor) -> Tensor:
-        there = beyond > 0
-        depths = torch.stack([depth, torch.where(there, beyond, depth)])
-        return photo_vote(view, others, depths, ~there, camera)
-
-    return lambda depth: farther_surface(depth, _reach(depth)), vote
-
-
-def _reach(depth: Float[Tensor, "h w"]) -> int:
-    """Pixels that ``REACH`` is in a map."""
-    return round(REACH * max(depth.shape))
+    inverse = 1 / depth
+    planes = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)]).numpy()
+    found = np.zeros_like(planes)
+    farther_planes(planes, planes[0].min(), np.float32(1 - APART), reach, found)
+    beyond = torch.from_numpy(found[0])
+    return torch.where(beyond > 0, 1 / beyond.clamp(min=1e-12), 0.0)
 
 
 def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:

@@ -29,44 +29,45 @@ CONTRAST = 8 / 255
 """Mean difference of their colours by which their say falls to 1 / e."""
 
 
-def photo_vote(
+def photo_costs(
     reference: DepthView,
     neighbours: Sequence[DepthView],
     depths: Float[Tensor, "2 h w"],
     same: Bool[Tensor, "h w"],
     camera: Camera,
-) -> Float[Tensor, "h w"]:
-    """How much better the images agree at the second depth than at the first, in [-1, 1].
+    asked: Bool[Tensor, "h w"] | None = None,
+) -> Float[Tensor, "2 h w"]:
+    """How badly the neighbours' images agree at each of two depths, in [0, 1]: means over the
+    pixels around that have the same colour. What the engines are held to.
 
     Args:
         reference: the view that the depths are of.
         neighbours: what it is compared with, at least one.
-        depths: two depths of each pixel, z in map units.
+        depths: two depths of each pixel, z in map units; 0 where there is none.
         same: where both are of one surface, from which the neighbours' noise and light are learned.
         camera: of the depths and of the views' ``grey``.
+        asked: where that is asked: elsewhere the result is 0, and the second depth is taken for the
+            first. By default everywhere.
     """
-    guide, costs = pixel_costs(reference, neighbours, depths, same, camera)
-    return averaged_by_colour(costs[0] - costs[1], guide)
-
-
-def pixel_costs(
-    reference: DepthView,
-    neighbours: Sequence[DepthView],
-    depths: Float[Tensor, "2 h w"],
-    same: Bool[Tensor, "h w"],
-    camera: Camera,
-) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "2 h w"]]:
-    """Colours of the reference in [0, 1], and how badly the neighbours' images agree at each of two
-    depths, in [0, 1], of each pixel by itself; arguments as of :func:`photo_vote`."""
+    if asked is not None:
+        depths = torch.stack([depths[0], torch.where(asked, depths[1], depths[0])])
     device, size = depths.device, (camera.width, camera.height)
     grey = torch.from_numpy(np.stack([v.grey for v in (reference, *neighbours)])).to(device)
-    poses = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+    poses = relative_poses(reference, neighbours)
     differences = torch.stack(
         [seen_from(grey[1:], poses, depth, camera) - grey[0] for depth in depths]
     )
     colour = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
     guide = torch.from_numpy(colour).to(device).movedim(-1, 0).float() / 255
-    return guide, best_half(truncated(differences, same))
+    costs = averaged_by_colour(best_half(truncated(differences, same)), guide)
+    return costs if asked is None else torch.where(asked, costs, 0.0)
+
+
+def relative_poses(
+    reference: DepthView, neighbours: Sequence[DepthView]
+) -> Float[np.ndarray, "n 4 4"]:
+    """What takes the reference's frame to the neighbours'."""
+    return np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
 
 
 def seen_from(
@@ -84,7 +85,7 @@ def seen_from(
     z = points[..., 2].clamp(min=1e-9)
     x = camera.fx * points[..., 0] / z + camera.cx
     y = camera.fy * points[..., 1] / z + camera.cy
-    inside = (points[..., 2] > 0) & (x >= 0) & (y >= 0)
+    inside = (depth > 0) & (points[..., 2] > 0) & (x >= 0) & (y >= 0)
     inside &= (x <= camera.width - 1) & (y <= camera.height - 1)
     place = torch.stack([2 * x / (camera.width - 1) - 1, 2 * y / (camera.height - 1) - 1], -1)
     found = F.grid_sample(grey[:, None], place, align_corners=True, padding_mode="border")[:, 0]
@@ -96,11 +97,19 @@ def truncated(
 ) -> Float[Tensor, "2 n h w"]:
     """Differences of grey values without that of the light, over what each neighbour's noise makes
     of them, at most 1."""
-    known = torch.where(same, differences[0], torch.nan).flatten(1)
+    light, most = light_and_noise(differences[0], same)
+    return ((differences - light[:, None, None]).abs() / most[:, None, None]).clamp(max=1)
+
+
+def light_and_noise(
+    differences: Float[Tensor, "n h w"], same: Bool[Tensor, "h w"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Median difference of each neighbour where there is one depth, and the deviation from it that
+    counts in full."""
+    known = torch.where(same, differences, torch.nan).flatten(1)
     light = known.nanmedian(1).values.nan_to_num()
     deviation = (known - light[:, None]).abs().nanmedian(1).values.nan_to_num()
-    most = DEVIATIONS * deviation.clamp(min=LEAST_DEVIATION)
-    return ((differences - light[:, None, None]).abs() / most[:, None, None]).clamp(max=1)
+    return light, DEVIATIONS * deviation.clamp(min=LEAST_DEVIATION)
 
 
 def best_half(costs: Float[Tensor, "*b n h w"]) -> Float[Tensor, "*b h w"]:

@@ -7,10 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import RevisedSearch
+from geogs.depth.depth_engine import DepthEngine, RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
-from geogs.depth.photo_vote import averaged_by_colour, pixel_costs
-from geogs.geometry.camera import Camera
 from geogs.on_demand import OnDemand
 
 FAR = 2.0
@@ -36,7 +34,7 @@ class SkySearch(RevisedSearch):
         self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
     ) -> DenseDepth:
         """With its sky."""
-        return searched.under(unbounded(view, others, searched, self.render))
+        return searched.under(unbounded(view, others, searched, self.classical))
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
@@ -61,12 +59,12 @@ def _with_sky_far_away(posed: PosedDepth) -> PosedDepth:
 
 
 def unbounded(
-    view: DepthView, others: Sequence[DepthView], found: DenseDepth, render: Camera
+    view: DepthView, others: Sequence[DepthView], found: DenseDepth, engine: DepthEngine
 ) -> Bool[Tensor, "h w"] | None:
     """Far pixels where the other views agree at infinity, and not worse than at the depth found.
 
     At infinity only the rotations between the views count. What is asked is a mean over single
-    pixels of like colour (``pixel_costs``), so that a roof says nothing of the sky beside it.
+    pixels of like colour (``photo_costs``), so that a roof says nothing of the sky beside it.
     None where hardly a pixel is far, or there is nothing to compare with.
     """
     sure = found.confidence > _SURE
@@ -77,6 +75,5 @@ def unbounded(
     if float(is_far.float().mean()) < _ASKED:
         return None
     depths = torch.stack([found.depth, (_INFINITY * typical).expand_as(found.depth)])
-    guide, costs = pixel_costs(view, others, depths, sure, render)
-    here, beyond = averaged_by_colour(costs, guide)
+    here, beyond = engine.photo_costs(view, others, depths, sure)
     return is_far & (beyond < AGREES) & (beyond < here + WORSE)

@@ -15,11 +15,13 @@ from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.edges import resolve_edges
 from geogs.depth.cuda.fusion import check, vote
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
+from geogs.depth.cuda.photo_vote import photo_costs
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
 from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
 from geogs.depth.depth_engine import Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
 from geogs.depth.evidence import prior_weight, relative_precision
+from geogs.depth.photo_vote import relative_poses
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
@@ -119,6 +121,20 @@ class CudaDepthEngine:
         if not depths:
             return torch.isfinite(points).all(1)
         return vote(points, depths, self.render)
+
+    def photo_costs(
+        self,
+        view: DepthView,
+        others: Sequence[DepthView],
+        depths: Float[Tensor, "2 h w"],
+        same: Bool[Tensor, "h w"],
+        asked: Bool[Tensor, "h w"] | None = None,
+    ) -> Float[Tensor, "2 h w"]:
+        """As in the protocol; at most 16 others are used."""
+        others = others[:MAX_NEIGHBOURS]
+        images = [self._images_of(v) for v in others]
+        own, poses = self._images_of(view), relative_poses(view, others)
+        return photo_costs(own, images, poses, depths, same, self.render, asked)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""

@@ -1,6 +1,7 @@
 """Keyframe depths by the network, on the CPU or a GPU."""
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -61,6 +62,22 @@ class NetworkDepthEngine(AlternativeSearch):
             lambda *views: self._at_render(self.network(StereoViews(*views))), "The depth network"
         )
         self._images: LruCache[int, UInt8[Tensor, "h w 3"]] = LruCache(resident)
+        if device.type == "cuda":
+            threading.Thread(target=self._warm_up, name="depth network", daemon=True).start()
+
+    @torch.no_grad()
+    def _warm_up(self) -> None:
+        """Run it on nothing once: cuDNN is loaded and chooses its kernels for a second, which the
+        first keyframe need not wait for."""
+        with torch.cuda.stream(torch.cuda.Stream(self.device)):
+            black = torch.zeros(1, 3, self.seen.height, self.seen.width, device=self.device)
+            one, many = torch.ones(1, device=self.device), (1, MOST_NEIGHBOURS)
+            others = black[None].expand(*many, -1, -1, -1)
+            lenses = self._intrinsics[:, None].expand(*many, -1)
+            poses = torch.eye(4, device=self.device).expand(*many, -1, -1)
+            valid = torch.ones(many, dtype=torch.bool, device=self.device)
+            views = (black, others, self._intrinsics, lenses, poses, valid, one, 4 * one, 2 * one)
+            self.network(StereoViews(*views))
 
     def estimate(
         self,

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
-from geogs.depth.photo_vote import photo_vote
-from geogs.geometry.camera import Camera
 
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""
@@ -28,9 +26,9 @@ _BOUND = 0.02
 class JointDepthEngine(AlternativeSearch):
     """Searches with both engines, and takes of each what it knows; normals are the network's."""
 
-    def __init__(self, network: DepthEngine, classical: DepthEngine, render: Camera) -> None:
+    def __init__(self, network: DepthEngine, classical: DepthEngine) -> None:
         super().__init__(classical)
-        self.network, self.render = network, render
+        self.network = network
 
     def estimate(
         self,
@@ -60,8 +58,8 @@ class JointDepthEngine(AlternativeSearch):
     ) -> DenseDepth:
         depths = torch.stack([searched.depth, learned.depth])
         same = agreement(searched, learned)
-        vote = photo_vote(reference, neighbours, depths, same, self.render)
-        return joined(searched, learned, vote)
+        costs = self.classical.photo_costs(reference, neighbours, depths, same)
+        return joined(searched, learned, costs[0] - costs[1])
 
 
 def agreement(first: DenseDepth, second: DenseDepth) -> Bool[Tensor, "h w"]:
@@ -74,8 +72,8 @@ def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) ->
 
     Where they agree it is the mean of their logarithms, weighted by the squared precision of normal
     errors that are below 2 % with the chance that the confidences say; elsewhere that which the
-    ``vote`` of the images (``photo_vote``) makes likelier. Squared, because the most confident are
-    more precise than a chance tells.
+    ``vote`` of the images makes likelier: how much less the second costs by ``photo_costs``.
+    Squared, because the most confident are more precise than a chance tells.
     """
     confidence = torch.stack([first.confidence, second.confidence])
     logs = torch.stack([first.depth, second.depth]).log()

@@ -1,0 +1,49 @@
+"""What the images say of depths, on a GPU."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+from geogs.depth.cuda.images import KeyframeImages
+from geogs.depth.photo_vote import CONTRAST, RADIUS, light_and_noise
+from geogs.geometry.camera import Camera
+from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import upload
+
+SOURCE = Path(__file__).with_name("photo_vote.cu")
+
+
+def photo_costs(
+    own: KeyframeImages,
+    others: Sequence[KeyframeImages],
+    poses: Float[np.ndarray, "n 4 4"],
+    depths: Float32[Tensor, "2 h w"],
+    same: Bool[Tensor, "h w"],
+    camera: Camera,
+    asked: Bool[Tensor, "h w"] | None = None,
+) -> Float32[Tensor, "2 h w"]:
+    """As :func:`geogs.depth.photo_vote.photo_costs`; ``poses`` take the frame of the depths to that
+    of the others, of which there are at most 16."""
+    device, n = depths.device, len(others)
+    h, w = depths.shape[1:]
+    if asked is not None:
+        depths = torch.stack([depths[0], torch.where(asked, depths[1], depths[0])])
+    kernels = kernels_for(SOURCE, device)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    numbers = np.concatenate([lens, poses[:, :3].ravel()]).astype(np.float32)
+    lens, T = upload(numbers, device).split([4, 12 * n])
+    differences = depths.new_empty(2, n, h, w)
+    tiles = -(-w // 32), -(-h // 4)
+    kernels["grey_differences"](
+        (*tiles, 2 * n), (32, 4), own.grey, torch.stack([o.grey for o in others]), T, lens,
+        depths.contiguous(), n, h, w, differences,
+    )  # fmt: skip
+    light, most = light_and_noise(differences[0], same)
+    costs, means = torch.empty_like(depths), torch.empty_like(depths)
+    kernels["pixel_costs"]((-(-h * w // 128), 2), (128,), differences, light, most, n, h * w, costs)
+    kernels["average_costs"](tiles, (32, 4), costs, own.colours, RADIUS, -1 / CONTRAST, h, w, means)
+    return means if asked is None else torch.where(asked, means, 0.0)

@@ -1,0 +1,70 @@
+"""What the images say of depths, in compiled loops on a CPU."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor
+
+from geogs.depth import photo_vote_kernels as kernels
+from geogs.depth.depth_view import DepthView
+from geogs.depth.photo_vote import (
+    CONTRAST,
+    DEVIATIONS,
+    LEAST_DEVIATION,
+    RADIUS,
+    relative_poses,
+)
+from geogs.geometry.camera import Camera
+
+
+def photo_costs(
+    view: DepthView,
+    neighbours: Sequence[DepthView],
+    depths: Float32[Tensor, "2 h w"],
+    same: Bool[Tensor, "h w"],
+    camera: Camera,
+    asked: Bool[Tensor, "h w"] | None = None,
+) -> Float32[Tensor, "2 h w"]:
+    """As :func:`geogs.depth.photo_vote.photo_costs`."""
+    size = (camera.width, camera.height)
+    colour = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+    guide = colour.astype(np.float32) / np.float32(255)
+    where = np.ones(guide.shape[:2], bool) if asked is None else asked.numpy()
+    images = np.stack([v.grey for v in neighbours])
+    poses = relative_poses(view, neighbours)[:, :3].astype(np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    first, second = np.ascontiguousarray(depths.numpy(), np.float32)
+    differences, costs = np.empty_like(images), np.empty(depths.shape, np.float32)
+    kernels.grey_differences(view.grey, images, poses, lens, first, differences)
+    light, most = _light_and_noise(differences, same.numpy())
+    kernels.pixel_costs(differences, light, most, costs[0])
+    other = np.where(where, second, np.float32(0))
+    kernels.grey_differences(view.grey, images, poses, lens, other, differences)
+    kernels.pixel_costs(differences, light, most, costs[1])
+    costs[1] = np.where(where, costs[1], costs[0])
+    mean = np.empty_like(costs)
+    kernels.average_costs(costs, where, guide, RADIUS, np.float32(CONTRAST), mean)
+    return torch.from_numpy(mean)
+
+
+def _light_and_noise(
+    differences: Float32[np.ndarray, "n h w"], same: Bool[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """As the tensors' of that name, only of what is known."""
+    light, most = np.zeros((2, len(differences)), np.float32)
+    for n, known in enumerate(differences[:, same]):
+        known = known[~np.isnan(known)]
+        deviation = np.float32(0)
+        if len(known):
+            light[n] = _lower_median(known)
+            deviation = _lower_median(np.abs(known - light[n]))
+        most[n] = DEVIATIONS * max(deviation, np.float32(LEAST_DEVIATION))
+    return light, most
+
+
+def _lower_median(values: Float32[np.ndarray, "k"]) -> np.float32:
+    middle = (len(values) - 1) // 2
+    return np.float32(np.partition(values, middle)[middle])
