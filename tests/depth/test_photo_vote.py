@@ -8,6 +8,7 @@ from torch.nn.functional import max_pool2d
 from cuda_emulator import use_emulator
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.classical import CpuDepthEngine
+from geogs.depth.cuda import far_side as cuda_far_side
 from geogs.depth.cuda import photo_vote as cuda_photo_vote
 from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch
@@ -31,6 +32,7 @@ from geogs.depth.photo_vote import (
     truncated,
 )
 from geogs.geometry.camera import Camera
+from geogs.geometry.jumps import minmod_slopes
 
 
 def test_grey_values_are_looked_up_as_a_loop_does():
@@ -168,11 +170,22 @@ def steps(seed: int) -> torch.Tensor:
     return torch.from_numpy(1 / inverse.clip(0.1)).float()
 
 
+@pytest.mark.parametrize("where", ["cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("reach", [1, 3, 6])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_compiled_loops_find_the_same_surfaces(seed, reach):
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_same_surfaces_go_on(seed, reach, where, monkeypatch):
     depth = steps(seed)
-    expected, found = farther_surface(depth, reach), compiled_surface(depth, reach)
+    expected = farther_surface(depth, reach)
+    if where == "emulated":
+        use_emulator(monkeypatch, cuda_far_side)
+        inverse = 1 / depth
+        planes = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
+        beyond = cuda_far_side.farther_planes(planes, 1 - APART, reach)
+        found = torch.where(beyond > 0, 1 / beyond, 0.0)
+    elif where == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    else:
+        found = compiled_surface(depth.to(where), reach).cpu()
     assert 0.02 < float((expected > 0).float().mean()) < 0.6
     same = (found - expected).abs() <= 1e-4 * expected
     assert float((~same).float().mean()) < 2e-3  # a plane that is at a limit by one rounding

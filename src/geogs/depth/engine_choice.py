@@ -21,9 +21,7 @@ def depth_engine(
 
     Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
-    classical = _classical(device, render, working, config, resident)
-    if torch.device(device).type == "cpu":  # tried nowhere else
-        classical = FarSideSearch(classical)
+    classical = FarSideSearch(_classical(device, render, working, config, resident))
     engine = config.engine
     if engine == "auto":
         engine = "joint" if torch.device(device).type == "cuda" else "classical"

@@ -39,7 +39,7 @@ class FarSideSearch(RevisedSearch):
             return searched
         depth, confidence = searched.depth, searched.confidence
         for _ in range(PASSES):
-            beyond = _beyond(depth)
+            beyond = compiled_surface(depth, round(REACH * max(depth.shape)))
             there = beyond > 0
             depths = torch.stack([depth, torch.where(there, beyond, depth)])
             here, other = self.classical.photo_costs(view, others, depths, ~there, there)
@@ -49,21 +49,21 @@ class FarSideSearch(RevisedSearch):
         return found
 
 
-def _beyond(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """The farther surface of a map, by compiled loops on a CPU."""
-    reach = round(REACH * max(depth.shape))
-    return farther_surface(depth, reach) if depth.is_cuda else compiled_surface(depth, reach)
-
-
 def compiled_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
-    """As :func:`farther_surface`, by compiled loops on a CPU."""
-    from geogs.depth.far_side_kernels import farther_planes
-
+    """As :func:`farther_surface`, by compiled loops or the kernel of a GPU."""
     inverse = 1 / depth
-    planes = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)]).numpy()
-    found = np.zeros_like(planes)
-    farther_planes(planes, planes[0].min(), np.float32(1 - APART), reach, found)
-    beyond = torch.from_numpy(found[0])
+    planes = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
+    if depth.is_cuda:
+        from geogs.depth.cuda.far_side import farther_planes
+
+        beyond = farther_planes(planes, 1 - APART, reach)
+    else:
+        from geogs.depth.far_side_kernels import farther_planes as compiled_planes
+
+        found = np.zeros_like(planes.numpy())
+        least = planes[0].amin().numpy()
+        compiled_planes(planes.numpy(), least, np.float32(1 - APART), reach, found)
+        beyond = torch.from_numpy(found[0])
     return torch.where(beyond > 0, 1 / beyond.clamp(min=1e-12), 0.0)
 
 
