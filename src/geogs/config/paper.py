@@ -82,7 +82,7 @@ def paper_mapping() -> MappingConfig:
         max_spread=_UNBOUNDED,
         disk=paper_disks(),
         photo=PhotoConfig(per_step=1, fresh=True, compensate_exposure=False),
-        depth=DepthConfig(engine="tracker"),
+        depth=DepthConfig(engine="tracker", bare_planes=False),
         loss=paper_losses(),
         ablation=MapAblation(map_update="coherent"),
     )
@@ -95,6 +95,7 @@ def paper_known_pose_mapping(usual: MappingConfig) -> MappingConfig:
     """
     return replace(
         usual,
+        depth=replace(usual.depth, bare_planes=False),
         photo_scale=1.0,
         max_spread=_UNBOUNDED,
         disk=replace(paper_disks(), insert_confidence=0.3, fill_confidence=0.1),

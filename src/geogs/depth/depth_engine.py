@@ -1,6 +1,5 @@
 """What the mapper asks of whatever finds keyframe depths."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -8,7 +7,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
-from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""
@@ -65,6 +63,12 @@ class DepthEngine(Protocol):
         """How badly the images of the others agree at each of two depths (``photo_costs``)."""
         ...
 
+    def farther_surface(
+        self, depth: Float[Tensor, "h w"], reach: int, apart: float
+    ) -> Float[Tensor, "h w"]:
+        """Depth of the farther surface beside each pixel, or 0 (``farther_surface``)."""
+        ...
+
 
 class AlternativeSearch:
     """Finds depths in a way of its own and leaves everything else to the ``classical`` engine.
@@ -100,24 +104,8 @@ class AlternativeSearch:
         """As in the protocol."""
         return self.classical.photo_costs(view, others, depths, same, asked)
 
-
-class RevisedSearch(AlternativeSearch, ABC):
-    """Another engine's search, of which each depth is looked at once more by itself."""
-
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def farther_surface(
+        self, depth: Float[Tensor, "h w"], reach: int, apart: float
+    ) -> Float[Tensor, "h w"]:
         """As in the protocol."""
-        searched = self.classical.estimate(references, neighbours, progress, limits)
-        tasks = list(zip(references, neighbours, searched, strict=True))
-        return thread_map(lambda task: self.revised(*task), tasks)
-
-    @abstractmethod
-    def revised(
-        self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
-    ) -> DenseDepth:
-        """What is made of the depth of a view that was matched with some others."""
+        return self.classical.farther_surface(depth, reach, apart)

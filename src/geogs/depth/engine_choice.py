@@ -4,8 +4,8 @@ import torch
 
 from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthEngine
-from geogs.depth.far_side import FarSideSearch
-from geogs.depth.unbounded import SkySearch
+from geogs.depth.revision.far_side import FarSideSearch
+from geogs.depth.revision.unbounded import SkySearch
 from geogs.geometry.camera import Camera
 
 

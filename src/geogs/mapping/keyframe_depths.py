@@ -9,6 +9,7 @@ from torch import Tensor
 from geogs.config import DepthSensorConfig
 from geogs.depth.depth_engine import DepthEngine, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView
+from geogs.depth.revision.segment_planes import planar_depth
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.dense_depths import get_depth, put_depth
@@ -16,6 +17,7 @@ from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
 from geogs.on_demand import OnDemand
 from geogs.priors.depth_sensor import sensor_depth
+from geogs.threads import thread_map
 from geogs.world.arrays import ArrayTable
 from geogs.world.keyframes import Keyframe
 
@@ -33,10 +35,13 @@ class KeyframeDepths:
         engine: DepthEngine,
         views: KeyframeViews,
         sensor: DepthSensorConfig | None = None,
+        bare_planes: bool = False,
     ) -> None:
+        """With ``bare_planes``, bare segments lie on planes where a depth is unsure."""
         self.engine = engine
         self.views = views
         self.sensor = sensor or DepthSensorConfig()
+        self.bare_planes = bare_planes
 
     def estimate(self, views: Sequence[MapView], progress: Progress = silent) -> None:
         """Search the depths of some views, not too many at once."""
@@ -51,7 +56,7 @@ class KeyframeDepths:
                 [v.depth_view for v in batch], [self._neighbours(v) for v in batch], on,
                 [None if s is None else (s.near, s.far) for s in searches],
             )  # fmt: skip
-            for view, depth in zip(batch, depths, strict=True):
+            for view, depth in zip(batch, self._planar(batch, depths), strict=True):
                 view.set_depth(self._with_sensor(view, depth))
 
     def check(self, views: Sequence[MapView]) -> None:
@@ -61,6 +66,7 @@ class KeyframeDepths:
             batch = views[start : start + SEARCHED_TOGETHER]
             others = [[o.posed for o in self.near(view)] for view in batch]
             depths = self.engine.check([view.posed for view in batch], others)
+            depths = self._planar(batch, depths)
             if len(views) == len(batch):
                 for view, depth in zip(views, depths, strict=True):
                     view.set_depth(depth)
@@ -95,6 +101,18 @@ class KeyframeDepths:
         places, camera = [v.place for v in others], self.views.arrays.cameras.render
         chosen = select_sweep_neighbours(view.place, places, depth, camera)
         return [others[i] for i in chosen]
+
+    def _planar(self, views: Sequence[MapView], depths: list[DenseDepth]) -> list[DenseDepth]:
+        """The depths of views, on planes where the images are bare."""
+        if not self.bare_planes:
+            return depths
+        camera = self.views.arrays.cameras.render
+
+        def one(pair: tuple[MapView, DenseDepth]) -> DenseDepth:
+            view, depth = pair
+            return planar_depth(view.keyframe.image, depth, camera, view.id)
+
+        return thread_map(one, list(zip(views, depths, strict=True)))
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
         """The searched depth, joined with what a sensor measured where it did."""

@@ -85,7 +85,7 @@ class Mapper:
             config.depth,
             keyframes.arrays.resident,
         )
-        self.depths = KeyframeDepths(engine, self.views, sensor)
+        self.depths = KeyframeDepths(engine, self.views, sensor, config.depth.bare_planes)
         self.partners = Partners(self.views, table, config.photo)
         self.growth = DiskGrowth(table, self.depths, config)
         self._trainer: MapTrainer | None = None

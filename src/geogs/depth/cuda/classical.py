@@ -13,6 +13,7 @@ from torch import Tensor
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.edges import resolve_edges
+from geogs.depth.cuda.far_side import farther_surface
 from geogs.depth.cuda.fusion import check, vote
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
 from geogs.depth.cuda.photo_vote import photo_costs
@@ -21,8 +22,8 @@ from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_star
 from geogs.depth.depth_engine import Limits, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
 from geogs.depth.evidence import prior_weight, relative_precision
-from geogs.depth.photo_vote import relative_poses
 from geogs.depth.plane_sweep import sweep_planes
+from geogs.depth.revision.photo_vote import relative_poses
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import upload
@@ -135,6 +136,12 @@ class CudaDepthEngine:
         images = [self._images_of(v) for v in others]
         own, poses = self._images_of(view), relative_poses(view, others)
         return photo_costs(own, images, poses, depths, same, self.render, asked)
+
+    def farther_surface(
+        self, depth: Float[Tensor, "h w"], reach: int, apart: float
+    ) -> Float[Tensor, "h w"]:
+        """As in the protocol."""
+        return farther_surface(depth, reach, apart)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from geogs.depth.cuda.images import KeyframeImages
-from geogs.depth.photo_vote import CONTRAST, RADIUS, light_and_noise
+from geogs.depth.revision.photo_vote import CONTRAST, RADIUS, light_and_noise
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import upload
@@ -26,8 +26,8 @@ def photo_costs(
     camera: Camera,
     asked: Bool[Tensor, "h w"] | None = None,
 ) -> Float32[Tensor, "2 h w"]:
-    """As :func:`geogs.depth.photo_vote.photo_costs`; ``poses`` take the frame of the depths to that
-    of the others, of which there are at most 16."""
+    """As :func:`geogs.depth.revision.photo_vote.photo_costs`; ``poses`` take the frame of the
+    depths to that of the others, of which there are at most 16."""
     device, n = depths.device, len(others)
     h, w = depths.shape[1:]
     if asked is not None:

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import DepthEngine, RevisedSearch
+from geogs.depth.depth_engine import DepthEngine
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
+from geogs.depth.revision.revised_search import RevisedSearch
 from geogs.on_demand import OnDemand
 
 FAR = 2.0

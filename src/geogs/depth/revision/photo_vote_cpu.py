@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from geogs.depth import photo_vote_kernels as kernels
 from geogs.depth.depth_view import DepthView
-from geogs.depth.photo_vote import (
+from geogs.depth.revision import photo_vote_kernels as kernels
+from geogs.depth.revision.photo_vote import (
     CONTRAST,
     DEVIATIONS,
     LEAST_DEVIATION,
@@ -28,7 +28,7 @@ def photo_costs(
     camera: Camera,
     asked: Bool[Tensor, "h w"] | None = None,
 ) -> Float32[Tensor, "2 h w"]:
-    """As :func:`geogs.depth.photo_vote.photo_costs`."""
+    """As :func:`geogs.depth.revision.photo_vote.photo_costs`."""
     size = (camera.width, camera.height)
     colour = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
     guide = colour.astype(np.float32) / np.float32(255)

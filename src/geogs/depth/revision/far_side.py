@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
+from geogs.depth.revision.revised_search import RevisedSearch
 from geogs.geometry.jumps import minmod_slopes
 
 APART = 0.03
@@ -39,7 +39,7 @@ class FarSideSearch(RevisedSearch):
             return searched
         depth, confidence = searched.depth, searched.confidence
         for _ in range(PASSES):
-            beyond = compiled_surface(depth, round(REACH * max(depth.shape)))
+            beyond = self.classical.farther_surface(depth, round(REACH * max(depth.shape)), APART)
             there = beyond > 0
             depths = torch.stack([depth, torch.where(there, beyond, depth)])
             here, other = self.classical.photo_costs(view, others, depths, ~there, there)
@@ -49,41 +49,48 @@ class FarSideSearch(RevisedSearch):
         return found
 
 
-def compiled_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
-    """As :func:`farther_surface`, by compiled loops or the kernel of a GPU."""
+def compiled_surface(
+    depth: Float[Tensor, "h w"], reach: int, apart: float = APART
+) -> Float[Tensor, "h w"]:
+    """As :func:`farther_surface`, by compiled loops on a CPU."""
+    from geogs.depth.revision.far_side_kernels import farther_planes
+
+    planes = inverse_planes(depth)
+    found, least = np.zeros_like(planes.numpy()), planes[0].amin().numpy()
+    farther_planes(planes.numpy(), least, np.float32(1 - apart), reach, found)
+    return as_depth(torch.from_numpy(found[0]))
+
+
+def inverse_planes(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
+    """Inverse depth and its slopes per pixel; the depth is positive."""
     inverse = 1 / depth
-    planes = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
-    if depth.is_cuda:
-        from geogs.depth.cuda.far_side import farther_planes
-
-        beyond = farther_planes(planes, 1 - APART, reach)
-    else:
-        from geogs.depth.far_side_kernels import farther_planes as compiled_planes
-
-        found = np.zeros_like(planes.numpy())
-        least = planes[0].amin().numpy()
-        compiled_planes(planes.numpy(), least, np.float32(1 - APART), reach, found)
-        beyond = torch.from_numpy(found[0])
-    return torch.where(beyond > 0, 1 / beyond.clamp(min=1e-12), 0.0)
+    return torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
 
 
-def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
+def as_depth(inverse: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Depth of an inverse depth, 0 where that is none."""
+    return torch.where(inverse > 0, 1 / inverse.clamp(min=1e-12), 0.0)
+
+
+def farther_surface(
+    depth: Float[Tensor, "h w"], reach: int, apart: float = APART
+) -> Float[Tensor, "h w"]:
     """Depth of the nearest farther surface within ``reach`` pixels, its plane gone on to the pixel.
 
-    0 where there is none, or it would be farther than all that was found. ``depth`` is positive;
-    inverse depth is linear along a plane.
+    0 where there is none that is farther by ``apart`` of the inverse depth, or it would be farther
+    than all that was found. ``depth`` is positive; inverse depth is linear along a plane. What the
+    engines are held to.
     """
-    inverse = 1 / depth
-    source = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
-    found = torch.zeros_like(source)
+    source = inverse_planes(depth)
+    inverse, found = source[0], torch.zeros_like(source)
     (height, width), farthest = depth.shape, inverse.amin()
     for _ in range(reach):
         around = F.pad(source, (1, 1, 1, 1))
         for dy, dx in _AROUND:
             plane = around[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
             here = plane[0] - dx * plane[1] - dy * plane[2]
-            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - APART) * inverse)
+            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - apart) * inverse)
             new = goes_on & (found[0] == 0)
             found = torch.where(new, torch.stack([here, plane[1], plane[2]]), found)
         source = found
-    return torch.where(found[0] > 0, 1 / found[0].clamp(min=1e-12), 0.0)
+    return as_depth(found[0])

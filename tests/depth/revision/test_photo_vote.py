@@ -13,14 +13,14 @@ from geogs.depth.cuda import photo_vote as cuda_photo_vote
 from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch
 from geogs.depth.depth_view import DenseDepth
-from geogs.depth.far_side import (
+from geogs.depth.revision.far_side import (
     APART,
     REACH,
     FarSideSearch,
     compiled_surface,
     farther_surface,
 )
-from geogs.depth.photo_vote import (
+from geogs.depth.revision.photo_vote import (
     CONTRAST,
     DEVIATIONS,
     LEAST_DEVIATION,
@@ -32,7 +32,6 @@ from geogs.depth.photo_vote import (
     truncated,
 )
 from geogs.geometry.camera import Camera
-from geogs.geometry.jumps import minmod_slopes
 
 
 def test_grey_values_are_looked_up_as_a_loop_does():
@@ -178,14 +177,13 @@ def test_the_same_surfaces_go_on(seed, reach, where, monkeypatch):
     expected = farther_surface(depth, reach)
     if where == "emulated":
         use_emulator(monkeypatch, cuda_far_side)
-        inverse = 1 / depth
-        planes = torch.stack([inverse, *minmod_slopes(inverse, depth > 0)])
-        beyond = cuda_far_side.farther_planes(planes, 1 - APART, reach)
-        found = torch.where(beyond > 0, 1 / beyond, 0.0)
-    elif where == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs an NVIDIA GPU")
+        found = cuda_far_side.farther_surface(depth, reach, APART)
+    elif where == "cpu":
+        found = compiled_surface(depth, reach)
+    elif torch.cuda.is_available():
+        found = cuda_far_side.farther_surface(depth.cuda(), reach, APART).cpu()
     else:
-        found = compiled_surface(depth.to(where), reach).cpu()
+        pytest.skip("needs an NVIDIA GPU")
     assert 0.02 < float((expected > 0).float().mean()) < 0.6
     same = (found - expected).abs() <= 1e-4 * expected
     assert float((~same).float().mean()) < 2e-3  # a plane that is at a limit by one rounding

@@ -11,7 +11,7 @@ from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, depth_images
-from geogs.depth.unbounded import FAR, SkySearch, unbounded
+from geogs.depth.revision.unbounded import FAR, SkySearch, unbounded
 from geogs.geometry.camera import Camera
 
 ENGINE = CpuDepthEngine(RENDER, WORKING, 8)

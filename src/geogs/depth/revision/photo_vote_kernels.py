@@ -1,7 +1,7 @@
 """Compiled loops of what the images say of depths: costs of single pixels, and their means.
 
-The same as :func:`geogs.depth.photo_vote.photo_costs`, but of no pixel that is not asked about.
-Arrays are float32 and C-contiguous; every kernel releases the interpreter lock.
+The same as :func:`geogs.depth.revision.photo_vote.photo_costs`, but of no pixel that is not asked
+about. Arrays are float32 and C-contiguous; every kernel releases the interpreter lock.
 """
 
 import numpy as np
