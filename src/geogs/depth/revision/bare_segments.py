@@ -23,8 +23,11 @@ def bare_segments(image: UInt8[np.ndarray, "ih iw 3"]) -> Int32[np.ndarray, "h w
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small.astype(np.float32), (0, 0), SMOOTHING)
     change = np.zeros(smooth.shape[:2], np.float32)
-    change[:, 1:-1] = np.abs(smooth[:, 2:] - smooth[:, :-2]).max(-1)
-    change[1:-1] = np.maximum(change[1:-1], np.abs(smooth[2:] - smooth[:-2]).max(-1))
+    for channel in cv2.split(smooth):
+        across = cv2.absdiff(channel[:, 2:], channel[:, :-2])
+        down = cv2.absdiff(channel[2:], channel[:-2])
+        change[:, 1:-1] = np.maximum(change[:, 1:-1], across)
+        change[1:-1] = np.maximum(change[1:-1], down)
     is_bare = (change < 2 * BARE).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(is_bare, connectivity=4)
     is_large = stats[:, cv2.CC_STAT_AREA] > LEAST * labels.size

@@ -36,7 +36,9 @@ CONFIDENCE = 0.5
 """Of a depth that is a segment's plane, about as measured."""
 SKY = 0.2
 """Part of a segment from which sky makes all of it none of these."""
-_LEAST, _MOST, _TRIES, _ROUNDS = 40, 3000, 64, 4
+FARTHEST = 5.0
+"""Times nearer or farther than what was found a plane may be at a pixel."""
+_LEAST, _MOST, _TRIES, _ROUNDS = 40, 1500, 64, 4
 """Pixels that a fit needs and takes, triples of them that are tried, and fits of the inliers."""
 
 
@@ -109,7 +111,7 @@ class SegmentPlane:
     def deviation(self, places: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         """Relative deviation of that: as the fit carries on half the tolerance of its pixels."""
         inverse = np.linalg.inv(self.information + 1e-9 * np.eye(3))
-        variance = ALIKE * np.einsum("ni,ij,nj->n", places, inverse, places)
+        variance = ALIKE * ((places @ inverse) * places).sum(-1)
         own = np.maximum(self.at(places), 1e-9)
         return np.sqrt(variance) * TOLERANCE / 2 * self.typical / own
 
@@ -128,36 +130,69 @@ def on_planes(
         sky: where nothing is.
         seed: of the samples that are tried.
     """
-    height, width = found.depth.shape
-    labels = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
-    y, x = np.mgrid[:height, :width]
-    places = np.stack([x / width - 0.5, y / height - 0.5, np.ones((height, width))], -1)
-    inverse, rng = 1 / found.depth.astype(np.float64), np.random.default_rng(seed)
-    rim = 2 * max(1, round(RIM * max(height, width))) + 1
-    depth, slopes = found.depth.copy(), np.zeros((height, width, 2))
-    taken, sure = np.zeros((height, width), bool), found.confidence > SURE
+    planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
+    depth, slopes = found.depth.copy(), np.zeros((*found.depth.shape, 2))
+    which = _resized(which, found.depth.shape)
+    (pixels,) = np.nonzero(((which > 0) & (found.confidence <= SURE)).ravel())
+    if len(pixels):
+        plane = np.stack([p.coefficients for p in planes])[which.ravel()[pixels] - 1]
+        value = (plane * _places(found.depth.shape, pixels)).sum(-1)
+        own = 1 / found.depth.ravel()[pixels]
+        good = (value > own / FARTHEST) & (value < FARTHEST * own)
+        pixels = pixels[good]
+        depth.ravel()[pixels] = 1 / value[good]
+        slopes.reshape(-1, 2)[pixels] = plane[good, :2] / found.depth.shape[::-1]
+    taken = np.zeros(found.depth.shape, bool)
+    taken.ravel()[pixels] = True
+    return PlanarDepth(depth, slopes, taken)
+
+
+def _planes_of_segments(
+    found: KeyframeDepth,
+    labels: Int32[np.ndarray, "sh sw"],
+    sky: Bool[np.ndarray, "h w"] | None,
+    rng: np.random.Generator,
+) -> tuple[list[SegmentPlane], Int32[np.ndarray, "sh sw"]]:
+    """Planes, and which of them, from 1 on, the pixels of the segments lie on where that is known
+    well; 0 for none."""
+    depth, confidence = (_resized(m, labels.shape) for m in (found.depth, found.confidence))
+    sky = None if sky is None else _resized(sky.astype(np.uint8), labels.shape)
+    places = _places(labels.shape, np.arange(labels.size))
+    inverse, sure = 1 / depth.astype(np.float64), confidence > SURE
+    rim = np.ones((2 * max(1, round(RIM * max(labels.shape))) + 1,) * 2, np.uint8)
+    planes, which = list[SegmentPlane](), np.zeros(labels.shape, np.int32)
     for label in range(1, int(labels.max(initial=0)) + 1):
         segment = labels == label
         if sky is not None and sky[segment].mean() > SKY:
             continue
-        known = cv2.dilate(segment.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
-        planes = list(segment_planes(places, inverse, found.confidence, known & sure, rng))
-        unsure = segment & ~sure
-        for plane, mine in zip(planes, _nearest(planes, unsure), strict=True):
-            at = places[mine]
-            value, own = plane.at(at), inverse[mine]
-            good = (value > 0.2 * own) & (value < 5 * own) & (plane.deviation(at) < STABLE)
-            v, u = (index[good] for index in np.nonzero(mine))
-            depth[v, u], taken[v, u] = 1 / value[good], True
-            slopes[v, u] = plane.coefficients[:2] / (width, height)
-    return PlanarDepth(depth, slopes, taken)
+        known = (cv2.dilate(segment.astype(np.uint8), rim) > 0) & sure
+        own = list(segment_planes(places, inverse.ravel(), confidence.ravel(), known.ravel(), rng))
+        for plane, mine in zip(own, _nearest(own, segment), strict=True):
+            planes.append(plane)
+            pixels = np.flatnonzero(mine)
+            stable = plane.deviation(places[pixels]) < STABLE
+            which.ravel()[pixels[stable]] = len(planes)
+    return planes, which
+
+
+def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Those of the nearest pixels at another size of the same image."""
+    if values.shape == shape:
+        return values
+    return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def _places(shape: tuple[int, ...], pixels: Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    """(x, y, 1) of flat indices, over the image's width and height."""
+    y, x = np.divmod(pixels, shape[1])
+    return np.stack([(x + 0.5) / shape[1] - 0.5, (y + 0.5) / shape[0] - 0.5, np.ones(len(x))], -1)
 
 
 def segment_planes(
-    places: Float64[np.ndarray, "h w 3"],
-    inverse: Float64[np.ndarray, "h w"],
-    confidence: Float32[np.ndarray, "h w"],
-    known: Bool[np.ndarray, "h w"],
+    places: Float64[np.ndarray, "n 3"],
+    inverse: Float64[np.ndarray, "n"],
+    confidence: Float32[np.ndarray, "n"],
+    known: Bool[np.ndarray, "n"],
     rng: np.random.Generator,
 ) -> Iterator[SegmentPlane]:
     """The planes that explain what is known of a segment, that of most first.
@@ -172,12 +207,12 @@ def segment_planes(
     pixels = np.flatnonzero(known)
     if len(pixels) > _MOST:
         pixels = np.sort(rng.choice(pixels, _MOST, replace=False))
-    total = float(confidence.ravel()[pixels].sum())
+    total = float(confidence[pixels].sum())
     for _ in range(MOST_PLANES):
         if len(pixels) < _LEAST:
             return
-        at, value = places.reshape(-1, 3)[pixels], inverse.ravel()[pixels]
-        weight = confidence.ravel()[pixels].astype(np.float64)
+        at, value = places[pixels], inverse[pixels]
+        weight = confidence[pixels].astype(np.float64)
         fit = _plane(at, value, weight, rng)
         if fit is None or weight[fit[2]].sum() < LEAST_SHARE * total:
             return
@@ -211,15 +246,15 @@ def _plane(
 
 
 def _nearest(
-    planes: Sequence[SegmentPlane], asked: Bool[np.ndarray, "h w"]
+    planes: Sequence[SegmentPlane], segment: Bool[np.ndarray, "h w"]
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Which of the pixels asked for are nearest to what lies on each plane."""
+    """Which of a segment's pixels are nearest to what lies on each plane."""
     if len(planes) < 2:
-        return [asked] * len(planes)
+        return [segment] * len(planes)
     distances = []
     for plane in planes:
-        empty = np.ones(asked.shape, np.uint8)
+        empty = np.ones(segment.shape, np.uint8)
         empty.ravel()[plane.pixels] = 0
         distances.append(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
     nearest = np.argmin(distances, 0)
-    return [asked & (nearest == number) for number in range(len(planes))]
+    return [segment & (nearest == number) for number in range(len(planes))]

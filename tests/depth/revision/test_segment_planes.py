@@ -1,0 +1,143 @@
+"""A bare wall around a corner, a ball, and the sky: what lies on planes, and what stays."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth
+from geogs.depth.revision.bare_segments import LEAST, bare_segments
+from geogs.depth.revision.segment_planes import (
+    CONFIDENCE,
+    SURE,
+    on_planes,
+    planar_depth,
+    segment_planes,
+)
+from geogs.geometry.camera import Camera
+
+CAMERA = Camera(fx=150.0, fy=150.0, cx=79.5, cy=59.5, width=160, height=120)
+V, U = np.mgrid[:120.0, :160.0]
+
+
+def textured(seed: int = 0) -> np.ndarray:
+    """An image of which no part is bare."""
+    rng = np.random.default_rng(seed)
+    return cv2.resize(rng.integers(0, 255, (60, 80, 3), np.uint8), (160, 120))
+
+
+def wall(a: float = 0.0008, b: float = 0.0004, c: float = 0.3) -> np.ndarray:
+    """Inverse depth of a plane."""
+    return a * U + b * V + c
+
+
+def bowed(inverse: np.ndarray, inside: np.ndarray) -> KeyframeDepth:
+    """A search that knows a plane but inside, where it is off by up to 30 % and unsure."""
+    off = 0.3 * np.sin(np.pi * U / 160) * np.sin(np.pi * V / 120)
+    found = np.where(inside, inverse * (1 + off), inverse)
+    confidence = np.where(inside, 0.2, 0.9)
+    return KeyframeDepth((1 / found).astype(np.float32), confidence.astype(np.float32))
+
+
+def box(left: int, right: int, top: int = 20, low: int = 100) -> np.ndarray:
+    return (left <= U) & (right > U) & (top <= V) & (low > V)
+
+
+def image_with(bare: np.ndarray) -> np.ndarray:
+    image = textured()
+    image[bare] = (180, 170, 160)
+    return image
+
+
+def test_bare_parts_are_found_at_any_size():
+    bare = box(30, 130)
+    for factor in (1, 4):
+        size = (160 * factor, 120 * factor)
+        image = cv2.resize(image_with(bare), size, interpolation=cv2.INTER_NEAREST)
+        labels = bare_segments(image)
+        assert max(labels.shape) == min(320, 160 * factor)
+        found = cv2.resize(labels, (160, 120), interpolation=cv2.INTER_NEAREST)
+        assert set(np.unique(found)) == {0, 1}
+        assert (found[24:96, 34:126] == 1).all()
+        assert not found[~bare].any()
+    small = box(70, 77, 50, 57)
+    assert small.sum() < LEAST * small.size
+    assert not bare_segments(image_with(small)).any()
+
+
+def test_a_bare_wall_is_flat():
+    inverse, bare = wall(), box(30, 130)
+    found = bowed(inverse, box(36, 124, 26, 94))
+    planar = on_planes(found, bare_segments(image_with(bare)), None, 0)
+    off = np.abs(planar.depth * inverse - 1)
+    assert np.abs(found.depth * inverse - 1).max() > 0.2
+    assert (planar.taken == box(36, 124, 26, 94)).mean() > 0.99
+    assert off[planar.taken].max() < 0.002
+    assert (planar.depth[~planar.taken] == found.depth[~planar.taken]).all()
+    again = on_planes(found, bare_segments(image_with(bare)), None, 0)
+    assert (again.depth == planar.depth).all()
+
+
+def test_a_corner_is_of_two_planes():
+    inverse = np.where(U < 80, wall(0.003), wall(-0.003, c=0.3 + 0.006 * 80))
+    bare = box(20, 140)
+    found = bowed(inverse, box(28, 132, 28, 92))
+    planar = on_planes(found, bare_segments(image_with(bare)), None, 0)
+    off = np.abs(planar.depth * inverse - 1)
+    assert (off[planar.taken] < 0.01).mean() > 0.9
+    assert planar.taken[box(28, 132, 28, 92)].mean() > 0.9
+
+
+def test_what_is_sure_and_what_is_no_plane_stay():
+    ball = 0.3 + 0.2 * np.sqrt(np.clip(1 - ((U - 80) / 60) ** 2 - ((V - 60) / 45) ** 2, 0, 1))
+    image = image_with(box(30, 130))
+    sure = KeyframeDepth((1 / ball).astype(np.float32), np.full(ball.shape, 0.8, np.float32))
+    assert not on_planes(sure, bare_segments(image), None, 0).taken.any()
+    unsure = bowed(ball, box(60, 100, 40, 80))
+    assert not on_planes(unsure, bare_segments(image), None, 0).taken.any()
+
+
+def test_a_plane_is_not_gone_on_with_far_from_where_it_is_known():
+    inverse, bare = wall(), box(30, 130)
+    known = box(30, 44, 40, 54)  # a corner of the wall alone
+    noise = np.random.default_rng(0).normal(0, 0.005, inverse.shape)
+    found = bowed(inverse * (1 + noise), ~known)
+    planar = on_planes(found, bare_segments(image_with(bare)), None, 0)
+    assert not planar.taken[:, 90:].any()
+
+
+def test_the_sky_is_no_plane():
+    inverse, bare = wall(), box(30, 130)
+    found = bowed(inverse, box(36, 124, 26, 94))
+    labels = bare_segments(image_with(bare))
+    assert not on_planes(found, labels, box(30, 130, 20, 60), 0).taken.any()
+    assert on_planes(found, labels, box(30, 50, 20, 30), 0).taken.any()
+
+
+@pytest.mark.parametrize("slopes", [(0.0008, 0.0004), (0.0, 0.0), (-0.0015, 0.0005)])
+def test_normals_are_those_of_the_plane(slopes):
+    inverse, bare = wall(*slopes, c=0.4), box(30, 130)
+    found = bowed(inverse, box(36, 124, 26, 94))
+    depth, confidence = (torch.from_numpy(x) for x in (found.depth, found.confidence))
+    dense = DenseDepth(depth, confidence, depth.median(), normal=torch.zeros(120, 160, 3))
+    planar = planar_depth(image_with(bare), dense, CAMERA, 0)
+    taken = planar.depth != depth
+    assert (planar.confidence[taken] == CONFIDENCE).all()
+    assert (planar.confidence[~taken] == confidence[~taken]).all()
+    points = CAMERA.back_project(torch.from_numpy(1 / inverse))
+    across, down = points[60, 81] - points[60, 80], points[61, 80] - points[60, 80]
+    normal = torch.linalg.cross(across, down)
+    normal = -normal / normal.norm() * normal[2].sign()
+    assert torch.allclose(planar.normal[60, 80].double(), normal, atol=1e-3)
+    assert not planar.normal[0, 0].any()
+
+
+def test_no_plane_of_too_little():
+    inverse, rng = wall().ravel(), np.random.default_rng(0)
+    places = np.stack([U / 160 - 0.5, V / 120 - 0.5, np.ones_like(U)], -1).reshape(-1, 3)
+    confidence = np.full(len(inverse), 0.9, np.float32)
+    assert not list(segment_planes(places, inverse, confidence, box(0, 5, 0, 7).ravel(), rng))
+    (plane,) = segment_planes(places, inverse, confidence, np.ones(len(inverse), bool), rng)
+    assert plane.at(places) == pytest.approx(inverse, rel=1e-6)
+    assert float(plane.deviation(places).max()) < 0.02
+    assert SURE <= CONFIDENCE
