@@ -65,36 +65,57 @@ def test_bare_parts_are_found_at_any_size():
     assert not bare_segments(image_with(small)).any()
 
 
+def planes_of(found: KeyframeDepth, image: np.ndarray, sky: np.ndarray | None = None):
+    """Depth on planes, and where it is taken."""
+    planar = on_planes(found, bare_segments(image), sky, 0)
+    depth, taken = found.depth.copy(), np.zeros(found.depth.shape, bool)
+    depth.ravel()[planar.pixels] = planar.depth
+    taken.ravel()[planar.pixels] = True
+    return depth, taken
+
+
 def test_a_bare_wall_is_flat():
     inverse, bare = wall(), box(30, 130)
     found = bowed(inverse, box(36, 124, 26, 94))
-    planar = on_planes(found, bare_segments(image_with(bare)), None, 0)
-    off = np.abs(planar.depth * inverse - 1)
+    depth, taken = planes_of(found, image_with(bare))
     assert np.abs(found.depth * inverse - 1).max() > 0.2
-    assert (planar.taken == box(36, 124, 26, 94)).mean() > 0.99
-    assert off[planar.taken].max() < 0.002
-    assert (planar.depth[~planar.taken] == found.depth[~planar.taken]).all()
-    again = on_planes(found, bare_segments(image_with(bare)), None, 0)
-    assert (again.depth == planar.depth).all()
+    assert (taken == box(36, 124, 26, 94)).mean() > 0.99
+    assert np.abs(depth * inverse - 1)[taken].max() < 0.002
+    again, _ = planes_of(found, image_with(bare))
+    assert (again == depth).all()
+
+
+def test_a_depth_of_another_size_than_the_segments_has_the_same_planes():
+    """As on a GPU, whose depths are larger."""
+    inverse, bare = wall(), box(30, 130)
+    found = bowed(inverse, box(36, 124, 26, 94))
+    large = [
+        cv2.resize(m, (480, 360), interpolation=cv2.INTER_NEAREST)
+        for m in (found.depth, found.confidence)
+    ]
+    depth, taken = planes_of(KeyframeDepth(*large), image_with(bare))
+    v, u = (np.mgrid[:360.0, :480.0] + 0.5) / 3 - 0.5
+    off = np.abs(depth * (0.0008 * u + 0.0004 * v + 0.3) - 1)
+    assert taken.mean() == pytest.approx(box(36, 124, 26, 94).mean(), rel=0.02)
+    assert off[taken].max() < 0.004
 
 
 def test_a_corner_is_of_two_planes():
     inverse = np.where(U < 80, wall(0.003), wall(-0.003, c=0.3 + 0.006 * 80))
     bare = box(20, 140)
     found = bowed(inverse, box(28, 132, 28, 92))
-    planar = on_planes(found, bare_segments(image_with(bare)), None, 0)
-    off = np.abs(planar.depth * inverse - 1)
-    assert (off[planar.taken] < 0.01).mean() > 0.9
-    assert planar.taken[box(28, 132, 28, 92)].mean() > 0.9
+    depth, taken = planes_of(found, image_with(bare))
+    assert (np.abs(depth * inverse - 1)[taken] < 0.01).mean() > 0.9
+    assert taken[box(28, 132, 28, 92)].mean() > 0.9
 
 
 def test_what_is_sure_and_what_is_no_plane_stay():
     ball = 0.3 + 0.2 * np.sqrt(np.clip(1 - ((U - 80) / 60) ** 2 - ((V - 60) / 45) ** 2, 0, 1))
     image = image_with(box(30, 130))
     sure = KeyframeDepth((1 / ball).astype(np.float32), np.full(ball.shape, 0.8, np.float32))
-    assert not on_planes(sure, bare_segments(image), None, 0).taken.any()
+    assert not planes_of(sure, image)[1].any()
     unsure = bowed(ball, box(60, 100, 40, 80))
-    assert not on_planes(unsure, bare_segments(image), None, 0).taken.any()
+    assert not planes_of(unsure, image)[1].any()
 
 
 def test_a_plane_is_not_gone_on_with_far_from_where_it_is_known():
@@ -102,16 +123,15 @@ def test_a_plane_is_not_gone_on_with_far_from_where_it_is_known():
     known = box(30, 44, 40, 54)  # a corner of the wall alone
     noise = np.random.default_rng(0).normal(0, 0.005, inverse.shape)
     found = bowed(inverse * (1 + noise), ~known)
-    planar = on_planes(found, bare_segments(image_with(bare)), None, 0)
-    assert not planar.taken[:, 90:].any()
+    _, taken = planes_of(found, image_with(bare))
+    assert not taken[:, 90:].any()
 
 
 def test_the_sky_is_no_plane():
     inverse, bare = wall(), box(30, 130)
     found = bowed(inverse, box(36, 124, 26, 94))
-    labels = bare_segments(image_with(bare))
-    assert not on_planes(found, labels, box(30, 130, 20, 60), 0).taken.any()
-    assert on_planes(found, labels, box(30, 50, 20, 30), 0).taken.any()
+    assert not planes_of(found, image_with(bare), box(30, 130, 20, 60))[1].any()
+    assert planes_of(found, image_with(bare), box(30, 50, 20, 30))[1].any()
 
 
 @pytest.mark.parametrize("slopes", [(0.0008, 0.0004), (0.0, 0.0), (-0.0015, 0.0005)])
@@ -135,9 +155,9 @@ def test_normals_are_those_of_the_plane(slopes):
 def test_no_plane_of_too_little():
     inverse, rng = wall().ravel(), np.random.default_rng(0)
     places = np.stack([U / 160 - 0.5, V / 120 - 0.5, np.ones_like(U)], -1).reshape(-1, 3)
-    confidence = np.full(len(inverse), 0.9, np.float32)
-    assert not list(segment_planes(places, inverse, confidence, box(0, 5, 0, 7).ravel(), rng))
-    (plane,) = segment_planes(places, inverse, confidence, np.ones(len(inverse), bool), rng)
+    confidence = np.full(len(inverse), 0.9)
+    assert not list(segment_planes(places[:35], inverse[:35], confidence[:35], rng))
+    (plane,) = segment_planes(places, inverse, confidence, rng)
     assert plane.at(places) == pytest.approx(inverse, rel=1e-6)
     assert float(plane.deviation(places).max()) < 0.02
     assert SURE <= CONFIDENCE

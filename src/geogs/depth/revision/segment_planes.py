@@ -52,40 +52,37 @@ def planar_depth(
     device = found.depth.device
     sky = None if found.sky is None else found.sky.cpu().numpy()
     planar = on_planes(found.arrays(), bare_segments(image), sky, seed)
-    if not planar.taken.any():
+    if not len(planar.pixels):
         return found
-    taken = torch.from_numpy(planar.taken).to(device)
-    normal = found.normal
+    pixels = torch.from_numpy(planar.pixels).to(device)
+    depth, confidence, normal = found.depth.clone(), found.confidence.clone(), found.normal
+    depth.view(-1)[pixels] = torch.from_numpy(planar.depth).to(device)
+    confidence.view(-1)[pixels] = CONFIDENCE
     if normal is not None:
-        facing = torch.from_numpy(planar.normals(camera)).to(device)
-        normal = torch.where(taken[..., None], facing, normal)
-    return replace(
-        found,
-        depth=torch.where(taken, torch.from_numpy(planar.depth).to(device), found.depth),
-        confidence=torch.where(taken, CONFIDENCE, found.confidence),
-        normal=normal,
-    )
+        normal = normal.clone()
+        normal.view(-1, 3)[pixels] = torch.from_numpy(planar.normals(camera)).to(device)
+    return replace(found, depth=depth, confidence=confidence, normal=normal)
 
 
 @dataclass(frozen=True)
 class PlanarDepth:
-    """Depth on the planes of segments."""
+    """Pixels on planes of segments that are known well, where the depth that was found is not."""
 
-    depth: Float32[np.ndarray, "h w"]
-    """z; as it was found where nothing is taken."""
-    slopes: Float64[np.ndarray, "h w 2"]
-    """Change of inverse depth per pixel to the right and down."""
-    taken: Bool[np.ndarray, "h w"]
-    """Where the plane is known well, and the depth that was found is not."""
+    pixels: Int[np.ndarray, "n"]
+    """Flat indices."""
+    depth: Float32[np.ndarray, "n"]
+    """z of the planes there."""
+    coefficients: Float64[np.ndarray, "n 3"]
+    """Of inverse depth in x and y over the image's width and height, from its middle, and 1."""
 
-    def normals(self, camera: Camera) -> Float32[np.ndarray, "h w 3"]:
-        """Unit normals, camera frame and facing it, where depth is taken.
+    def normals(self, camera: Camera) -> Float32[np.ndarray, "n 3"]:
+        """Unit normals, camera frame and facing it.
 
         With 1 / z = a u + b v + c a point X of the plane has n X = 1 for
         n = (a fx, b fy, a cx + b cy + c).
         """
-        v, u = np.mgrid[: camera.height, : camera.width]
-        a, b = self.slopes[..., 0], self.slopes[..., 1]
+        a, b = self.coefficients[:, 0] / camera.width, self.coefficients[:, 1] / camera.height
+        v, u = np.divmod(self.pixels, camera.width)
         c = 1 / self.depth - a * u - b * v
         n = np.stack([a * camera.fx, b * camera.fy, a * camera.cx + b * camera.cy + c], -1)
         return (-n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
@@ -96,11 +93,11 @@ class SegmentPlane:
     """Inverse depth as a linear function of the place in the image, and what it was fitted to."""
 
     coefficients: Float64[np.ndarray, "3"]
-    """Of x and y over the image's width and height, and of 1."""
+    """Of x and y over the image's width and height, from its middle, and of 1."""
     information: Float64[np.ndarray, "3 3"]
     """Sum of the weighted products of (x, y, 1)."""
-    pixels: Int[np.ndarray, "k"]
-    """Flat indices of those that lie on it."""
+    on: Bool[np.ndarray, "n"]
+    """Which of the pixels that told it lie on it."""
     typical: float
     """Their mean inverse depth."""
 
@@ -130,21 +127,15 @@ def on_planes(
         sky: where nothing is.
         seed: of the samples that are tried.
     """
+    shape = found.depth.shape
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
-    depth, slopes = found.depth.copy(), np.zeros((*found.depth.shape, 2))
-    which = _resized(which, found.depth.shape)
-    (pixels,) = np.nonzero(((which > 0) & (found.confidence <= SURE)).ravel())
-    if len(pixels):
-        plane = np.stack([p.coefficients for p in planes])[which.ravel()[pixels] - 1]
-        value = (plane * _places(found.depth.shape, pixels)).sum(-1)
-        own = 1 / found.depth.ravel()[pixels]
-        good = (value > own / FARTHEST) & (value < FARTHEST * own)
-        pixels = pixels[good]
-        depth.ravel()[pixels] = 1 / value[good]
-        slopes.reshape(-1, 2)[pixels] = plane[good, :2] / found.depth.shape[::-1]
-    taken = np.zeros(found.depth.shape, bool)
-    taken.ravel()[pixels] = True
-    return PlanarDepth(depth, slopes, taken)
+    which = _resized(which, shape).ravel()
+    pixels = np.flatnonzero((which > 0) & (found.confidence.ravel() <= SURE))
+    coefficients = np.array([p.coefficients for p in planes]).reshape(-1, 3)[which[pixels] - 1]
+    value = (coefficients * _places(shape, pixels)).sum(-1)
+    own = 1 / found.depth.ravel()[pixels]
+    good = (value > own / FARTHEST) & (value < FARTHEST * own)
+    return PlanarDepth(pixels[good], (1 / value[good]).astype(np.float32), coefficients[good])
 
 
 def _planes_of_segments(
@@ -155,24 +146,37 @@ def _planes_of_segments(
 ) -> tuple[list[SegmentPlane], Int32[np.ndarray, "sh sw"]]:
     """Planes, and which of them, from 1 on, the pixels of the segments lie on where that is known
     well; 0 for none."""
-    depth, confidence = (_resized(m, labels.shape) for m in (found.depth, found.confidence))
-    sky = None if sky is None else _resized(sky.astype(np.uint8), labels.shape)
-    places = _places(labels.shape, np.arange(labels.size))
-    inverse, sure = 1 / depth.astype(np.float64), confidence > SURE
-    rim = np.ones((2 * max(1, round(RIM * max(labels.shape))) + 1,) * 2, np.uint8)
-    planes, which = list[SegmentPlane](), np.zeros(labels.shape, np.int32)
+    shape = labels.shape
+    depth, confidence = (_resized(m, shape) for m in (found.depth, found.confidence))
+    sky = None if sky is None else _resized(sky.astype(np.uint8), shape)
+    sure, reach = confidence > SURE, max(1, round(RIM * max(shape)))
+    rim = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    planes, which = list[SegmentPlane](), np.zeros(shape, np.int32)
     for label in range(1, int(labels.max(initial=0)) + 1):
-        segment = labels == label
-        if sky is not None and sky[segment].mean() > SKY:
+        around = _box(labels == label, reach)
+        segment, is_sure = labels[around] == label, sure[around]
+        is_sky = sky is not None and sky[around][segment].mean() > SKY
+        if is_sky or np.count_nonzero(segment & ~is_sure) < _LEAST:
             continue
-        known = (cv2.dilate(segment.astype(np.uint8), rim) > 0) & sure
-        own = list(segment_planes(places, inverse.ravel(), confidence.ravel(), known.ravel(), rng))
-        for plane, mine in zip(own, _nearest(own, segment), strict=True):
+        known = np.flatnonzero((cv2.dilate(segment.astype(np.uint8), rim) > 0) & is_sure)
+        known = known[:: -(-len(known) // _MOST) or 1]
+        weight = confidence[around].ravel()[known].astype(np.float64)
+        value = 1 / depth[around].ravel()[known].astype(np.float64)
+        own = list(segment_planes(_places(shape, known, around), value, weight, rng))
+        for plane, mine in zip(own, _nearest(own, known, segment), strict=True):
             planes.append(plane)
             pixels = np.flatnonzero(mine)
-            stable = plane.deviation(places[pixels]) < STABLE
-            which.ravel()[pixels[stable]] = len(planes)
+            stable = plane.deviation(_places(shape, pixels, around)) < STABLE
+            v, u = np.divmod(pixels[stable], segment.shape[1])
+            which[v + around[0].start, u + around[1].start] = len(planes)
     return planes, which
+
+
+def _box(segment: Bool[np.ndarray, "h w"], reach: int) -> tuple[slice, slice]:
+    """Rows and columns around a segment, widened."""
+    x, y, width, height = cv2.boundingRect(segment.astype(np.uint8))
+    rows = slice(max(0, y - reach), min(segment.shape[0], y + height + reach))
+    return rows, slice(max(0, x - reach), min(segment.shape[1], x + width + reach))
 
 
 def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -182,43 +186,46 @@ def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_NEAREST)
 
 
-def _places(shape: tuple[int, ...], pixels: Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-    """(x, y, 1) of flat indices, over the image's width and height."""
-    y, x = np.divmod(pixels, shape[1])
-    return np.stack([(x + 0.5) / shape[1] - 0.5, (y + 0.5) / shape[0] - 0.5, np.ones(len(x))], -1)
+def _places(
+    shape: tuple[int, ...], pixels: Int[np.ndarray, "n"], box: tuple[slice, slice] | None = None
+) -> Float64[np.ndarray, "n 3"]:
+    """(x, y, 1) of flat indices in an image or a box of it, x and y over the image's width and
+    height and from its middle."""
+    height, width = shape
+    rows, columns = box or (slice(0, height), slice(0, width))
+    v, u = np.divmod(pixels, columns.stop - columns.start)
+    places = np.ones((len(pixels), 3))
+    places[:, 0] = (u + (columns.start + 0.5)) / width - 0.5
+    places[:, 1] = (v + (rows.start + 0.5)) / height - 0.5
+    return places
 
 
 def segment_planes(
     places: Float64[np.ndarray, "n 3"],
-    inverse: Float64[np.ndarray, "n"],
-    confidence: Float32[np.ndarray, "n"],
-    known: Bool[np.ndarray, "n"],
+    value: Float64[np.ndarray, "n"],
+    weight: Float64[np.ndarray, "n"],
     rng: np.random.Generator,
 ) -> Iterator[SegmentPlane]:
     """The planes that explain what is known of a segment, that of most first.
 
     Args:
-        places: of the pixels (x, y, 1).
-        inverse: their inverse depth.
-        confidence: their weights.
-        known: those that count.
+        places: of its pixels (x, y, 1).
+        value: their inverse depth.
+        weight: their confidence.
         rng: draws samples.
     """
-    pixels = np.flatnonzero(known)
-    if len(pixels) > _MOST:
-        pixels = np.sort(rng.choice(pixels, _MOST, replace=False))
-    total = float(confidence[pixels].sum())
+    left = np.arange(len(value))
     for _ in range(MOST_PLANES):
-        if len(pixels) < _LEAST:
+        if len(left) < _LEAST:
             return
-        at, value = places[pixels], inverse[pixels]
-        weight = confidence[pixels].astype(np.float64)
-        fit = _plane(at, value, weight, rng)
-        if fit is None or weight[fit[2]].sum() < LEAST_SHARE * total:
+        fit = _plane(places[left], value[left], weight[left], rng)
+        if fit is None or weight[left[fit[2]]].sum() < LEAST_SHARE * weight.sum():
             return
-        coefficients, information, on = fit
-        yield SegmentPlane(coefficients, information, pixels[on], float(value[on].mean()))
-        pixels = pixels[~on]
+        coefficients, information, is_on = fit
+        on = np.zeros(len(value), bool)
+        on[left[is_on]] = True
+        yield SegmentPlane(coefficients, information, on, float(value[on].mean()))
+        left = left[~is_on]
 
 
 def _plane(
@@ -233,10 +240,10 @@ def _plane(
     if not len(drawn):
         return None
     tried = np.linalg.solve(at[drawn], value[drawn][..., None])[..., 0]
-    on = np.abs(at @ tried.T - value[:, None]) < TOLERANCE * value[:, None]
-    on = on[:, np.argmax(weight @ on)]
+    on = np.abs(tried @ at.T - value) < TOLERANCE * value
+    on = on[np.argmax(on @ weight)]
     for _ in range(_ROUNDS):
-        if on.sum() < _LEAST:
+        if np.count_nonzero(on) < _LEAST:
             return None
         weighted = at[on] * weight[on, None]
         information = weighted.T @ at[on]
@@ -246,15 +253,15 @@ def _plane(
 
 
 def _nearest(
-    planes: Sequence[SegmentPlane], segment: Bool[np.ndarray, "h w"]
+    planes: Sequence[SegmentPlane], known: Int[np.ndarray, "n"], segment: Bool[np.ndarray, "h w"]
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Which of a segment's pixels are nearest to what lies on each plane."""
+    """Which of a segment's pixels are nearest to those of the known ones that lie on each plane."""
     if len(planes) < 2:
         return [segment] * len(planes)
     distances = []
     for plane in planes:
         empty = np.ones(segment.shape, np.uint8)
-        empty.ravel()[plane.pixels] = 0
+        empty.ravel()[known[plane.on]] = 0
         distances.append(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
     nearest = np.argmin(distances, 0)
     return [segment & (nearest == number) for number in range(len(planes))]
