@@ -9,7 +9,6 @@ from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.depth.revision.bare_segments import LEAST, bare_segments
 from geogs.depth.revision.segment_planes import (
     CONFIDENCE,
-    SURE,
     on_planes,
     planar_depth,
     segment_planes,
@@ -160,4 +159,3 @@ def test_no_plane_of_too_little():
     (plane,) = segment_planes(places, inverse, confidence, rng)
     assert plane.at(places) == pytest.approx(inverse, rel=1e-6)
     assert float(plane.deviation(places).max()) < 0.02
-    assert SURE <= CONFIDENCE

@@ -21,7 +21,7 @@ from geogs.geometry.camera import Camera
 
 RIM = 0.0125
 """Long edges of the image around a segment that say where it lies."""
-SURE = 0.5
+SURE = 0.7
 """Confidence from which a pixel says so, and below which it takes the plane's depth."""
 TOLERANCE = 0.02
 """Relative distance in inverse depth from a plane within which a pixel lies on it."""
