@@ -38,7 +38,7 @@ SKY = 0.2
 """Part of a segment from which sky makes all of it none of these."""
 FARTHEST = 5.0
 """Times nearer or farther than what was found a plane may be at a pixel."""
-_LEAST, _MOST, _TRIES, _ROUNDS = 40, 1500, 64, 4
+_LEAST, _MOST, _TRIES, _ROUNDS = 40, 750, 64, 4
 """Pixels that a fit needs and takes, triples of them that are tried, and fits of the inliers."""
 
 
@@ -103,14 +103,23 @@ class SegmentPlane:
 
     def at(self, places: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         """Inverse depth at some places."""
-        return places @ self.coefficients
+        return (places * self.coefficients).sum(-1)
 
     def deviation(self, places: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         """Relative deviation of that: as the fit carries on half the tolerance of its pixels."""
         inverse = np.linalg.inv(self.information + 1e-9 * np.eye(3))
-        variance = ALIKE * ((places @ inverse) * places).sum(-1)
+        variance = ALIKE * _quadratic(places, inverse)
         own = np.maximum(self.at(places), 1e-9)
         return np.sqrt(variance) * TOLERANCE / 2 * self.typical / own
+
+
+def _quadratic(
+    places: Float64[np.ndarray, "n 3"], form: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "n"]:
+    """Values of a symmetric form at (x, y, 1): written out, as a library's threads cost more."""
+    x, y = places[:, 0], places[:, 1]
+    mixed = form[0, 1] * x * y + form[0, 2] * x + form[1, 2] * y
+    return form[0, 0] * x * x + form[1, 1] * y * y + form[2, 2] + 2 * mixed
 
 
 def on_planes(
@@ -239,16 +248,18 @@ def _plane(
     drawn = drawn[np.abs(np.linalg.det(at[drawn])) > 1e-9]
     if not len(drawn):
         return None
-    tried = np.linalg.solve(at[drawn], value[drawn][..., None])[..., 0]
-    on = np.abs(tried @ at.T - value) < TOLERANCE * value
-    on = on[np.argmax(on @ weight)]
+    tried = np.linalg.solve(at[drawn], value[drawn][..., None])
+    off = tried[:, 0] * at[:, 0] + tried[:, 1] * at[:, 1] + (tried[:, 2] - value)
+    on = np.abs(off) < TOLERANCE * value
+    on = on[np.argmax(np.where(on, weight, 0.0).sum(1))]
     for _ in range(_ROUNDS):
         if np.count_nonzero(on) < _LEAST:
             return None
         weighted = at[on] * weight[on, None]
-        information = weighted.T @ at[on]
-        plane = np.linalg.solve(information + 1e-12 * np.eye(3), weighted.T @ value[on])
-        on = np.abs(at @ plane - value) < TOLERANCE * value
+        information = np.einsum("ni,nj->ij", weighted, at[on])
+        target = (weighted * value[on, None]).sum(0)
+        plane = np.linalg.solve(information + 1e-12 * np.eye(3), target)
+        on = np.abs((at * plane).sum(1) - value) < TOLERANCE * value
     return plane, information, on
 
 
