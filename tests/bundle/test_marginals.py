@@ -4,13 +4,22 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from bundle_scenes import CAMERA, scene
+from geogs.bundle import marginals as room
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.marginals import ALIKE, marginals
+from geogs.bundle.marginals import (
+    ALIKE,
+    COMMON_FLOW,
+    COMMON_PLACE,
+    common_covariance,
+    marginals,
+)
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.bundle.protocols import BundleOptions
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.world.grid import SampleGrid
 from oracles.bundle_reference import residuals
@@ -45,10 +54,12 @@ def test_the_block_inverse_is_that_of_the_whole():
     assert float(found.pose[:2].abs().max()) == 0
 
 
-def turning(sideways: float, seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
+def turning(
+    sideways: float, seed: int = 0, camera: Camera = CAMERA
+) -> tuple[SampleGrid, BundleProblem]:
     """Six views that turn by three degrees each and move sideways by so much of the depth."""
     g = torch.Generator().manual_seed(seed)
-    grid, n = SampleGrid(CAMERA), 6
+    grid, n = SampleGrid(camera), 6
     turn = torch.arange(n, dtype=torch.float64) * torch.pi / 60
     step = torch.arange(n, dtype=torch.float64) * sideways
     zero = torch.zeros(n, dtype=torch.float64)
@@ -56,7 +67,7 @@ def turning(sideways: float, seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
     d = 0.7 + 0.6 * torch.rand(n, grid.size, generator=g)
     pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
     source, target = (torch.tensor([p[k] for p in pairs]) for k in (0, 1))
-    pixels = project(CAMERA, grid.rays, relative_motion(T, source, target), d[source]).pixels
+    pixels = project(camera, grid.rays, relative_motion(T, source, target), d[source]).pixels
     weight = torch.full_like(pixels, 4.0)  # half a pixel
     free = torch.ones(n, dtype=torch.bool)
     free[0] = False
@@ -88,12 +99,9 @@ def test_noise_spreads_poses_and_depths_as_foretold(sideways):
         noise = 0.5 * torch.randn(truth.pixels.shape, generator=g)
         noisy = replace(truth, pixels=truth.pixels + noise)
         found = DenseBundle(grid).solve(noisy, BundleOptions(iterations=8, huber=50.0))
-        # Lengths relative to that of the path, as the variances are.
         t, length = found.T_cw[:, :3, 3], truth.T_cw[:, :3, 3].norm()
         scale = float((t * truth.T_cw[:, :3, 3]).sum() / length**2)
-        T = found.T_cw.clone()
-        T[:, :3, 3] /= scale
-        poses.append(se3_log(T @ se3_inverse(truth.T_cw)))
+        poses.append(of_common_length(found.T_cw, truth))
         depths.append(found.inverse_depth * scale / truth.inverse_depth - 1)
     spread = torch.stack(poses).square().mean(0)[1:]
     # These errors are independent of each other.
@@ -103,6 +111,61 @@ def test_noise_spreads_poses_and_depths_as_foretold(sideways):
     assert float(ratio[3:].max()) < 2.0
     square = torch.stack(depths).square().mean(0) / (foretold.relative_depth.square() / ALIKE)
     assert 0.6 < float(square.median()) < 1.5
+
+
+def of_common_length(T: Tensor, truth: BundleProblem) -> Tensor:
+    """Errors of poses whose lengths are brought to those of the truth, as covariances are."""
+    t, length = T[:, :3, 3], truth.T_cw[:, :3, 3].norm()
+    T = T.clone()
+    T[:, :3, 3] /= float((t * truth.T_cw[:, :3, 3]).sum() / length**2)
+    return se3_log(T @ se3_inverse(truth.T_cw))
+
+
+def test_errors_in_common_move_poses_as_foretold(monkeypatch):
+    monkeypatch.setattr(room, "PLACES", (2, 1))
+    grid, truth = turning(0.05)
+    found = common_covariance(grid, truth, EXACT, marginals(grid, truth, EXACT))
+    left = (grid.pixels[:, 0] < CAMERA.width / 2).float()
+    onward = (truth.target - truth.source).sign()[:, None].float()
+    expected = torch.zeros_like(found)
+    for part in (left, 1 - left):
+        for axis in (0, 1):
+            for size in (COMMON_FLOW * onward, torch.full_like(onward, COMMON_PLACE)):
+                pixels = truth.pixels.clone()
+                pixels[..., axis] += 0.5 * size * part  # half a pixel is one deviation
+                solved = DenseBundle(grid).solve(
+                    replace(truth, pixels=pixels), BundleOptions(iterations=12, huber=50.0)
+                )
+                move = of_common_length(solved.T_cw, truth).reshape(-1)
+                expected += move[:, None] * move
+    got, wanted = (m.diagonal().reshape(-1, 6)[1:] for m in (found, expected))
+    assert float((got.sum(0) / wanted.sum(0)).log().abs().max()) < 0.1
+    assert float(found[:6].abs().max()) == 0
+
+
+def test_cells_do_not_average_what_matches_have_in_common(monkeypatch):
+    monkeypatch.setattr(room, "PLACES", (2, 1))
+    double = Camera(
+        2 * CAMERA.fx, 2 * CAMERA.fy, 2 * CAMERA.cx, 2 * CAMERA.cy,
+        2 * CAMERA.width, 2 * CAMERA.height,
+    )  # fmt: skip
+    variances = []
+    for camera in (CAMERA, double):
+        grid, problem = turning(0.05, camera=camera)
+        known = marginals(grid, problem, EXACT)
+        common = common_covariance(grid, problem, EXACT, known)
+        variances.append([m.diagonal().sum() for m in (known.covariance, common)])
+    (own, common), (finer_own, finer_common) = variances
+    # Half a pixel is half the angle; there are four times as many cells.
+    assert float(own / finer_own) == pytest.approx(16, rel=0.35)
+    assert 2.5 < float(common / finer_common) < 7
+
+
+def test_where_nothing_is_known_errors_in_common_add_nothing():
+    grid, problem = turning(0.05)
+    known = marginals(grid, problem, EXACT)
+    unknown = replace(known, covariance=torch.full_like(known.covariance, torch.inf))
+    assert not common_covariance(grid, problem, EXACT, unknown).any()
 
 
 def test_what_nothing_measures_is_open():

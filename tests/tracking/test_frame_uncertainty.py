@@ -6,10 +6,15 @@ import torch
 
 from geogs.bundle.marginals import ALIKE
 from geogs.geometry.lie import retract, se3_inverse
-from geogs.tracking.frame_uncertainty import EXPECTED_RESIDUAL, frame_uncertainty, own_deviations
+from geogs.tracking.frame_uncertainty import (
+    CAUTION,
+    EXPECTED_RESIDUAL,
+    frame_uncertainty,
+    own_deviations,
+)
 from geogs.tracking.frames.frame_recorder import FrameRecorder, pose_of, sparse_cells
 from geogs.tracking.frames.pose_filling import solve_trajectory
-from geogs.tracking.keyframe_uncertainty import COMMON_ERRORS, keyframe_uncertainty
+from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 from geogs.tracking.tracker import Tracker
 from geogs.types import FlowMatch, Frame
 from geogs.world.edges import unpacked_positions
@@ -76,7 +81,7 @@ def test_it_is_the_inverse_of_what_the_matches_say_one_by_one():
                 ahead, behind = (where(grid, ray, d, retract(s * xi, last)) for s in (1, -1))
                 J[:, k] = (ahead - behind) / (2 * step)
             H += min(1.0, 3.0 / norms[-1]) * J.T @ (J * w[:, None])
-    factor = COMMON_ERRORS * float(np.median(norms)) / EXPECTED_RESIDUAL
+    factor = CAUTION * float(np.median(norms)) / EXPECTED_RESIDUAL
     C = ALIKE * factor**2 * torch.linalg.inv(H)
     deviation = own_deviations(log, keyframes)[25]
     assert deviation.position == pytest.approx(float(C.diagonal()[:3].sum().sqrt()), rel=0.02)
@@ -95,7 +100,7 @@ def test_what_is_said_is_what_errors_are_whatever_the_matches_say_of_themselves(
         errors = (centres - se3_inverse(T[2])[:3, 3]).norm(dim=1).numpy()
         deviations = [d.position for d in own_deviations(log, tracker.keyframes).values()]
         # Errors that are independent are foretold too large, by what errors of neighbours share.
-        caution = COMMON_ERRORS * ALIKE**0.5
+        caution = CAUTION * ALIKE**0.5
         ratio = caution * np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(deviations)))
         assert ratio == pytest.approx(1.0, abs=0.25)
 

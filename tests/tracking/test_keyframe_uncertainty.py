@@ -2,16 +2,22 @@
 
 import numpy as np
 import pytest
+import torch
 
+from geogs.bundle import marginals
+from geogs.bundle.protocols import BundleOptions
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.geometry.umeyama import umeyama
 from geogs.tracking import keyframe_uncertainty as room
 from geogs.tracking.keyframe_uncertainty import (
-    COMMON_ERRORS,
-    RESIDUAL_POWER,
     USUAL_RESIDUAL,
     KeyframeUncertainty,
     keyframe_uncertainty,
 )
 from planted_walk import drift, planted_tracker
+
+EXACT = BundleOptions(iterations=10, huber=50.0)
 
 
 def measured(count: int):
@@ -39,6 +45,33 @@ def test_a_bent_walk_strains_its_matches():
     assert float(np.median(after.residual)) > float(np.median(before.residual)) + 0.5
 
 
+def test_errors_that_all_matches_have_in_common_are_foretold(monkeypatch):
+    """Errors of either half of the image in all keyframes, several times as large as usual."""
+    flow_size, place_size = 0.5, 1.0
+    monkeypatch.setattr(marginals, "PLACES", (2, 1))
+    monkeypatch.setattr(marginals, "COMMON_FLOW", flow_size)
+    monkeypatch.setattr(marginals, "COMMON_PLACE", place_size)
+    camera = Camera(fx=150.0, fy=150.0, cx=79.5, cy=55.5, width=160, height=112)
+    squares = []
+    for seed in range(4):
+        tracker, T = planted_tracker(14, camera, sigma=0.05)
+        near = [(a, b) for a in range(14) for b in range(a + 1, min(a + 4, 14))]
+        tracker.map.graph.measure(near)
+        g = torch.Generator().manual_seed(seed)
+        flow, place = (s * torch.randn(2, 2, generator=g) for s in (flow_size, place_size))
+        at = (tracker.keyframes.grid.pixels[:, 0] / camera.width * 2).long()
+        for (i, j), edge in tracker.map.graph.edges.items():
+            edge.pixels += 0.05 * (np.sign(j - i) * flow[at] + place[at])
+        ids = list(range(14))
+        tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, EXACT)
+        found, truth = (se3_inverse(poses)[:, :3, 3] for poses in (tracker.keyframes.poses(ids), T))
+        scale, R, t = umeyama(found, truth)
+        error = (found - (truth - t) @ R / scale).norm(dim=1)
+        said = torch.from_numpy(keyframe_uncertainty(tracker).position)
+        squares.append((error.square().mean() / said.square().mean()).item())
+    assert 0.5 < np.sqrt(np.mean(squares)) < 1.2
+
+
 def test_parts_of_a_long_walk_follow_each_other(monkeypatch):
     tracker = measured(14)
     whole = keyframe_uncertainty(tracker)
@@ -56,9 +89,9 @@ def test_strain_makes_deviations_larger():
     one = np.ones(6)
     calm = KeyframeUncertainty(tuple(range(6)), one, one, one, 0.5 * USUAL_RESIDUAL * one)
     strained = KeyframeUncertainty(tuple(range(6)), one, one, one, 2 * USUAL_RESIDUAL * one)
-    assert calm.calibrated(tracker).position == pytest.approx(COMMON_ERRORS * one)
+    assert calm.calibrated(tracker).position == pytest.approx(one)
     found = strained.calibrated(tracker)
-    assert found.position == pytest.approx(COMMON_ERRORS * 2.0**RESIDUAL_POWER * one)
+    assert found.position == pytest.approx(2 * one)
     assert found.depth == pytest.approx(2 * one)
     assert found.timestamps == pytest.approx([k.timestamp for k in tracker.keyframes])
 

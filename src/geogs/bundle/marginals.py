@@ -9,13 +9,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.flow_term import PinholeFlow, SourceFlow, linearised_sources, residual_norms
+from geogs.bundle.flow_term import (
+    PinholeFlow,
+    SourceFlow,
+    linearised_sources,
+    residual_norms,
+    weighed_residuals,
+)
 from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
-from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.projection import linearise, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState, DepthTerm
 from geogs.geometry.lie import se3_inverse
@@ -28,6 +34,14 @@ ALIKE = 2.25
 much their sum says less than its weights do. Measured on rendered rooms at the start of a map,
 where the errors are 0.4 to 0.9 of what the weights foretell in the median, and up to 1.3 times that
 at their upper tenth."""
+PLACES = 8, 5
+"""Parts of the image, across and down; what matches of one part have in common is taken for
+independent of what those of another have."""
+COMMON_FLOW = 0.1
+"""What matches of a part have in common all along a video, in their own deviations, of the way by
+which the scene moves in the image: the other way round from a later to an earlier frame."""
+COMMON_PLACE = 0.25
+"""The same of the place in the image, whichever frame is the earlier."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +101,36 @@ def marginals(
     return Marginals(covariance, relative, _normalised_residual(problem, part, options))
 
 
+def common_covariance(
+    grid: SampleGrid,
+    problem: AnyProblem,
+    options: BundleOptions,
+    found: Marginals,
+    cells: int = 1024,
+) -> Float[Tensor, "m m"]:
+    """Covariance of all poses by what matches have wrong in common, beside that of ``found``.
+
+    A glossy floor, a slanted wall, a texture that is smoothed alike in all images: such errors are
+    small beside those of a single match, but neither cells nor keyframes average them. No residual
+    tells of them, as the poses follow them. Each is a number of its own, for a part of the image
+    and an axis, that is not solved for; by how much it moves the solution follows from the
+    equations that ``found`` is the inverse of. Source: consider analysis (Schmidt 1966; Bierman
+    1977). Zero where ``found`` knows nothing.
+
+    Args:
+        grid, problem, options, cells: as of :func:`marginals`, which gave ``found``.
+    """
+    if not bool(found.covariance.isfinite().all()):
+        return torch.zeros_like(found.covariance)
+    part = _Thinned(grid, problem, cells)
+    n = len(problem.T_cw)
+    pull = torch.zeros(6 * n, 4 * PLACES[0] * PLACES[1], dtype=torch.float64)
+    for rows, gradient in part.common_gradients(options):
+        pull[rows] += gradient / part.fraction
+    moves = found.covariance / ALIKE @ pull
+    return moves @ moves.mT
+
+
 class _Thinned:
     """A problem with some of the cells, which stand for all of them; on the CPU."""
 
@@ -94,6 +138,7 @@ class _Thinned:
         step = -(-grid.size // cells)
         self._problem, self._cells = problem, slice(None, None, step)
         self._flow = PinholeFlow(grid.camera, grid.rays[self._cells].cpu())
+        self._pixels = grid.pixels[self._cells].cpu()
         self.count = len(self._flow.rays)
         self.fraction = self.count / grid.size
         self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
@@ -113,6 +158,40 @@ class _Thinned:
             used = at.valid & (part.weight[..., 0] > 0)
             for frame, edges in sources_within(i):
                 yield frame, norm[edges][used[edges]]
+
+    def common_gradients(
+        self, options: BundleOptions
+    ) -> Iterator[tuple[Int[Tensor, "c"], Float[Tensor, "c k"]]]:
+        """Each source in order: which unknowns of the poses it joins, and by how much each error
+        that matches have in common, at its deviation, pulls at them once depths have followed."""
+        camera, rays, place = self._flow.camera, self._flow.rays, self._places()
+        for part in self._parts(options):
+            i, j = part.source, part.target
+            p = linearise(camera, rays, relative_motion(part.T_cw, i, j), self.inverse_depth[i])
+            _, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
+            unit = w * part.weight.clamp(min=1e-12).rsqrt()  # weight times one deviation
+            onward = (j - i).sign() * COMMON_FLOW
+            sources = linearised_sources(self._flow, part, part.start, options)
+            for source, (frame, e) in zip(sources, sources_within(i), strict=True):
+                depth, chain = source.edges.depth, source.edges.chain
+                assert depth is not None
+                follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
+                pulls = []
+                for axis in (0, 1):
+                    pose = p.pose_jacobian[e, :, axis] * unit[e, None, :, axis]
+                    own = p.depth_jacobian[e, :, axis] * unit[e, :, axis]
+                    for size in (onward[e], torch.full_like(onward[e], COMMON_PLACE)):
+                        along = (pose * size[:, None, None]).flatten(0, 1)
+                        pulls.append((along - follow * (size[:, None] * own).sum(0)) @ place)
+                yield source.edges.rows(len(part.T_cw)), chain.mT @ torch.cat(pulls, 1).double()
+
+    def _places(self) -> Float[Tensor, "c q"]:
+        """One where a cell lies in a part of the image."""
+        across, down = PLACES
+        camera = self._flow.camera
+        x, y = (self._pixels / self._pixels.new_tensor([camera.width, camera.height])).mT
+        at = (y * down).long() * across + (x * across).long()
+        return torch.nn.functional.one_hot(at, across * down).to(self._pixels)
 
     def _parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
         """Some edges at a time, with the terms of depths."""

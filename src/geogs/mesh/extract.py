@@ -11,6 +11,7 @@ from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
+from geogs.mesh.block_count import fitting_voxel
 from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
 from geogs.mesh.decimate import merged
@@ -28,9 +29,11 @@ _SAMPLED_VIEWS = 40
 _SAMPLED_POINTS = 400_000
 _MOST_OUT_OF_REACH = 0.05
 """Part of the surface that may lie beyond the volume, as stray points do."""
+_CROWDED = 0.1
+"""Part of the memory limit from which on, by a sample of the pixels, all of them are asked how many
+blocks they have: of what is scattered, as outdoors, there are several times as many."""
 OVERRUN = 1.5
-"""Times the memory limit that a volume may take: the plan knows a sample of the pixels, and of what
-is scattered, such as the far end of an outdoor view, each further pixel has blocks of its own."""
+"""Times the memory limit that a volume may take, where the plan is a sample's."""
 COARSER = 1.5
 """Times larger are the voxels that are tried next."""
 _FACES_PER_SQUARE = 2.4
@@ -108,9 +111,10 @@ def extract_mesh(
 ) -> Mesh:
     """Fuse depth maps; their surface, cleaned, coloured from the views' images and decimated.
 
-    ``views`` is gone through up to three times (plan, fuse, colour) in order, so a lazy sequence
-    may render on demand. A volume that outgrows its plan by half, where the surface scatters, is
-    fused anew with larger voxels. The work is done on the device of the first depth map.
+    ``views`` is gone through up to four times (plan, count, fuse, colour) in order, so a lazy
+    sequence may render on demand. Where a sample of the pixels says that the volume may come near
+    its limit, all are counted, and voxels are as large as it takes; should it outgrow the limit by
+    half it is fused anew with larger ones. The work is done on the device of the first depth map.
     ``progress`` is called with the stage ("fuse", "colour", "merge"), what is done of it and all
     there is to do.
 
@@ -120,6 +124,8 @@ def extract_mesh(
     if not len(views):
         raise InputError("There are no depth maps to make a mesh from.")
     plan = plan_volume(views, config)
+    if config.voxel is None and plan.bytes > _CROWDED * config.memory_limit * 2**30:
+        plan = _counted(plan, views, config)
     _log.info("voxel %.4g, about %.0f MiB", plan.voxel, plan.bytes / 2**20)
     most = OVERRUN * config.memory_limit * 2**30
     while (tsdf := fuse(views, plan, progress, most)) is None:
@@ -142,6 +148,14 @@ def extract_mesh(
     if progress:
         progress("merge", 1, 1)
     return mesh
+
+
+def _counted(plan: VolumePlan, views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
+    """The plan with all pixels of all views counted."""
+    most = int(config.memory_limit * 2**30 / BYTES_PER_BLOCK)
+    voxel, blocks = fitting_voxel(views, plan.voxel, plan.truncation, plan.max_depth, most)
+    triangles = round(plan.triangles * (plan.voxel / voxel) ** 2)
+    return replace(plan, voxel=voxel, blocks=blocks, triangles=triangles)
 
 
 @dataclass(frozen=True)

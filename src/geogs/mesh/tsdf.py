@@ -23,7 +23,8 @@ BLOCK = 8
 LIMIT = 2**19
 """Voxels have coordinates in [-LIMIT, LIMIT) along each axis; what lies farther is left out."""
 BYTES_PER_BLOCK = BLOCK**3 * 2 * 4
-_HALF = BLOCK // 2
+HALF = BLOCK // 2
+"""Voxels along a side of half a block."""
 _BITS = 20
 _CHUNK = 256
 """Blocks that a thread takes at a time."""
@@ -61,9 +62,9 @@ def band_blocks(
     the band around all of their points. ``truncation`` is in voxels. Points at :data:`LIMIT`
     voxels from the origin or farther are left out.
     """
-    cell = torch.floor(points / (voxel * _HALF)).long()
-    reach = math.ceil(truncation / _HALF)
-    cell = cell[(cell.abs() < LIMIT // _HALF - reach - 2).all(-1)]
+    cell = torch.floor(points / (voxel * HALF)).long()
+    reach = math.ceil(truncation / HALF)
+    cell = cell[(cell.abs() < LIMIT // HALF - reach - 2).all(-1)]
     cell = unpack(torch.unique(pack(cell)))
     low, high = (cell - reach) >> 1, (cell + reach) >> 1
     steps = torch.arange(reach + 1, device=points.device)
@@ -81,7 +82,7 @@ def blocks_seen(
     Footprints are followed from one half block to the next, so that a floor that is seen at a
     slant has no gaps between the rows of the image.
     """
-    points = planes.footprints(voxel * _HALF).double()
+    points = planes.footprints(voxel * HALF).double()
     return band_blocks((points - T_cw[:3, 3]) @ T_cw[:3, :3], voxel, truncation)
 
 

@@ -11,7 +11,7 @@ from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import HUBER, ITERATIONS, observed, tracked_on
-from geogs.tracking.keyframe_uncertainty import COMMON_ERRORS, keyframe_uncertainty
+from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 from geogs.tracking.locate.pose_deviation import PoseDeviation, left_open
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
@@ -20,6 +20,9 @@ from geogs.world.keyframes import KeyframeSet
 
 EXPECTED_RESIDUAL = math.sqrt(2 * math.log(2))
 """Median length of an error in two dimensions, in its deviations."""
+CAUTION = 4 / 3
+"""Times as large as foretold are errors of frames between keyframes: matches of a frame have some
+in common. Read off rendered videos (docs/tracking.md has the table)."""
 
 
 def frame_uncertainty(tracker: Tracker) -> Uncertainty:
@@ -50,7 +53,7 @@ def own_deviations(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, PoseDe
 
     What the matches of a frame leave open at its solution (:func:`left_open`), a match being as
     unsure as their residuals are long: deviations times the frame's median residual over the one
-    to be expected, and times ``COMMON_ERRORS``. Frames that no match tells of are left out.
+    to be expected, and times ``CAUTION``. Frames that no match tells of are left out.
     Source: the variance factor a posteriori of least squares, by a median for robustness.
     """
     grid, found = keyframes.grid, dict[int, PoseDeviation]()
@@ -69,7 +72,7 @@ def own_deviations(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, PoseDe
         for n, record in enumerate(part):
             edges = problem.frame == n
             if bool(used[edges].any()):
-                factor = COMMON_ERRORS * float(norm[edges][used[edges]].median())
+                factor = CAUTION * float(norm[edges][used[edges]].median())
                 factor /= EXPECTED_RESIDUAL
                 open_ = left_open(total[n])
                 found[record.index] = PoseDeviation(

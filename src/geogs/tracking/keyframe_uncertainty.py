@@ -7,22 +7,19 @@ import torch
 from jaxtyping import Float64
 
 from geogs.bundle.gauge import deviations_after_alignment
-from geogs.bundle.marginals import Marginals, marginals
+from geogs.bundle.marginals import Marginals, common_covariance, marginals
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
 
+CELLS = 512
+"""Most cells of a keyframe whose matches stand for all."""
 TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23
-"""Median residual, in deviations of a match, where the scene is as modelled."""
-RESIDUAL_POWER = 2
-"""Errors of poses grow with this power of the residual."""
-COMMON_ERRORS = 4 / 3
-"""Times as large as foretold are errors of poses where the residual is usual: matches of a whole
-video have some in common. All three were read off rendered videos with and without rolling shutter,
-blur and noise (docs/tracking.md has the table)."""
+"""Median residual, in deviations of a match, where the scene is as modelled: read off rendered
+videos (docs/tracking.md has the table)."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +39,11 @@ class KeyframeUncertainty:
     """Median residual of its matches, in their deviations."""
 
     def calibrated(self, tracker: Tracker) -> Uncertainty:
-        """Deviations that hold where the scene is not as modelled, too: see ``RESIDUAL_POWER``."""
+        """Deviations that hold where the scene is not as modelled, too: matches are as many times
+        as unsure as they say as their residuals are longer than usual."""
         residual = np.where(np.isfinite(self.residual), self.residual / USUAL_RESIDUAL, 1.0)
         residual = np.maximum(residual, 1.0)
-        factor = COMMON_ERRORS * float(np.mean(residual**RESIDUAL_POWER)) if len(residual) else 1.0
+        factor = float(np.sqrt(np.mean(np.square(residual)))) if len(residual) else 1.0
         times = [tracker.keyframes[k].timestamp for k in self.keyframes]
         return Uncertainty(
             np.array(times, np.float64), factor * self.position, factor * self.rotation,
@@ -97,8 +95,10 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
         return None
     problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
     grid = tracker.keyframes.grid
-    found = marginals(grid, problem, BundleOptions(huber=HUBER), cells=512)
+    options = BundleOptions(huber=HUBER)
+    found = marginals(grid, problem, options, CELLS)
+    common = common_covariance(grid, problem, options, found, CELLS)
     own = torch.tensor([frames.index(k) for k in ids])
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
-    covariance = found.covariance[rows[:, None], rows]
+    covariance = (found.covariance + common)[rows[:, None], rows]
     return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])

@@ -1,0 +1,59 @@
+"""How many blocks a volume takes, by every pixel of every view, and the voxel with which they fit.
+
+A sample of the pixels tells it of a surface that many of them see. What scatters, such as trees and
+the far end of an outdoor view, has blocks of its own for each further pixel.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.mesh.pixel_planes import PixelPlanes
+from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.mesh.tsdf import HALF, LIMIT, band_blocks, pack, unpack
+
+COARSER = 1.1
+"""Times larger are the voxels that are tried next."""
+_CELLS_PER_BLOCK = 3
+"""Half blocks with surface for each block that fits, from which on larger voxels are certain."""
+
+
+def fitting_voxel(
+    views: Sequence[DepthMapView], voxel: float, truncation: float, max_depth: float, most: int
+) -> tuple[float, int]:
+    """The voxel, or the least one larger by steps of ``COARSER``, of which ``most`` blocks hold
+    the surface of all views with its band, and how many do.
+
+    ``truncation`` is in voxels; pixels beyond ``max_depth`` are left out.
+    """
+    cells = torch.empty(0, dtype=torch.long, device=views[0].depth.device)
+    for view in views:
+        cells = torch.unique(torch.cat([cells, _cells(_surface(view, voxel, max_depth), voxel)]))
+        while len(cells) > _CELLS_PER_BLOCK * most:
+            points = _centres(cells, voxel)
+            voxel *= COARSER
+            cells = torch.unique(_cells(points, voxel))
+    points = _centres(cells, voxel)
+    while (blocks := len(band_blocks(points, voxel, truncation))) > most:
+        voxel *= COARSER
+    return voxel, blocks
+
+
+def _surface(view: DepthMapView, voxel: float, max_depth: float) -> Float[Tensor, "n 3"]:
+    """World points along the footprints of the pixels, half a block apart or less."""
+    valid = view.valid() & (view.depth <= max_depth)
+    planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
+    T_cw = view.T_cw.to(view.depth.device, torch.float64)
+    return (planes.footprints(voxel * HALF).double() - T_cw[:3, 3]) @ T_cw[:3, :3]
+
+
+def _cells(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:
+    """Keys of the half blocks that points lie in, but for those out of the volume's reach."""
+    cells = torch.floor(points / (voxel * HALF)).long()
+    return pack(cells[(cells.abs() < LIMIT // HALF).all(-1)])
+
+
+def _centres(cells: Int[Tensor, "n"], voxel: float) -> Float[Tensor, "n 3"]:
+    return (unpack(cells).double() + 0.5) * (voxel * HALF)
