@@ -21,8 +21,8 @@ from geogs.geometry.camera import Camera
 
 RIM = 0.0125
 """Long edges of the image around a segment that say where it lies."""
-SURE = 0.7
-"""Confidence from which a pixel says so, and below which it takes the plane's depth."""
+SURE, UNSURE = 0.7, 0.5
+"""Confidence from which a pixel says so, and up to which it takes the plane's depth."""
 TOLERANCE = 0.02
 """Relative distance in inverse depth from a plane within which a pixel lies on it."""
 MOST_PLANES, LEAST_SHARE = 3, 0.35
@@ -139,7 +139,7 @@ def on_planes(
     shape = found.depth.shape
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
     which = _resized(which, shape).ravel()
-    pixels = np.flatnonzero((which > 0) & (found.confidence.ravel() <= SURE))
+    pixels = np.flatnonzero((which > 0) & (found.confidence.ravel() <= UNSURE))
     coefficients = np.array([p.coefficients for p in planes]).reshape(-1, 3)[which[pixels] - 1]
     value = (coefficients * _places(shape, pixels)).sum(-1)
     own = 1 / found.depth.ravel()[pixels]
@@ -158,18 +158,18 @@ def _planes_of_segments(
     shape = labels.shape
     depth, confidence = (_resized(m, shape) for m in (found.depth, found.confidence))
     sky = None if sky is None else _resized(sky.astype(np.uint8), shape)
-    sure, reach = confidence > SURE, max(1, round(RIM * max(shape)))
+    reach = max(1, round(RIM * max(shape)))
     rim = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     planes, which = list[SegmentPlane](), np.zeros(shape, np.int32)
     for label in range(1, int(labels.max(initial=0)) + 1):
         around = _box(labels == label, reach)
-        segment, is_sure = labels[around] == label, sure[around]
+        segment, sure = labels[around] == label, confidence[around]
         is_sky = sky is not None and sky[around][segment].mean() > SKY
-        if is_sky or np.count_nonzero(segment & ~is_sure) < _LEAST:
+        if is_sky or np.count_nonzero(segment & (sure <= UNSURE)) < _LEAST:
             continue
-        known = np.flatnonzero((cv2.dilate(segment.astype(np.uint8), rim) > 0) & is_sure)
+        known = np.flatnonzero((cv2.dilate(segment.astype(np.uint8), rim) > 0) & (sure > SURE))
         known = known[:: -(-len(known) // _MOST) or 1]
-        weight = confidence[around].ravel()[known].astype(np.float64)
+        weight = sure.ravel()[known].astype(np.float64)
         value = 1 / depth[around].ravel()[known].astype(np.float64)
         own = list(segment_planes(_places(shape, known, around), value, weight, rng))
         for plane, mine in zip(own, _nearest(own, known, segment), strict=True):
