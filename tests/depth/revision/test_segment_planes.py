@@ -126,6 +126,18 @@ def test_a_plane_is_not_gone_on_with_far_from_where_it_is_known():
     assert not taken[:, 90:].any()
 
 
+def test_what_lies_beyond_a_faint_edge_is_on_none_of_the_planes():
+    """A bare part goes on from a wall to a slope above it, of which only the far rim is known."""
+    wall_below, slope = wall(), wall(0.0, -0.004, 0.55)
+    above = V < 60
+    inverse = np.where(above, slope, wall_below)
+    found = bowed(inverse, box(36, 124, 26, 60))
+    _, taken = planes_of(found, image_with(box(30, 130)))
+    assert not taken[box(36, 124, 26, 60)].any()
+    _, taken = planes_of(bowed(wall_below, box(36, 124, 26, 60)), image_with(box(30, 130)))
+    assert taken[box(36, 124, 26, 60)].mean() > 0.9
+
+
 def test_the_sky_is_no_plane():
     inverse, bare = wall(), box(30, 130)
     found = bowed(inverse, box(36, 124, 26, 94))

@@ -28,6 +28,8 @@ TOLERANCE = 0.02
 MOST_PLANES, LEAST_SHARE = 3, 0.35
 """Planes of a segment, as of a wall around a corner, and the part of what is known (by confidence)
 that each explains at least."""
+MOSTLY = 0.6
+"""Part of what is sure at the rim of an unsure part that lies on a plane."""
 STABLE = 0.01
 """Largest relative deviation with which a plane is gone on with."""
 ALIKE = 25
@@ -105,6 +107,12 @@ class SegmentPlane:
         """Inverse depth at some places."""
         return (places * self.coefficients).sum(-1)
 
+    def holds(
+        self, places: Float64[np.ndarray, "n 3"], value: Float64[np.ndarray, "n"]
+    ) -> Bool[np.ndarray, "n"]:
+        """Where an inverse depth lies on it."""
+        return np.abs(self.at(places) - value) < TOLERANCE * value
+
     def deviation(self, places: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         """Relative deviation of that: as the fit carries on half the tolerance of its pixels."""
         inverse = np.linalg.inv(self.information + 1e-9 * np.eye(3))
@@ -168,17 +176,46 @@ def _planes_of_segments(
         if is_sky or np.count_nonzero(segment & (sure <= UNSURE)) < _LEAST:
             continue
         known = np.flatnonzero((cv2.dilate(segment.astype(np.uint8), rim) > 0) & (sure > SURE))
-        known = known[:: -(-len(known) // _MOST) or 1]
-        weight = sure.ravel()[known].astype(np.float64)
+        places = _places(shape, known, around)
         value = 1 / depth[around].ravel()[known].astype(np.float64)
-        own = list(segment_planes(_places(shape, known, around), value, weight, rng))
-        for plane, mine in zip(own, _nearest(own, known, segment), strict=True):
+        some = slice(None, None, -(-len(known) // _MOST) or 1)
+        weight = sure.ravel()[known[some]].astype(np.float64)
+        own = list(segment_planes(places[some], value[some], weight, rng))
+        if not own:
+            continue
+        is_on = np.zeros(segment.shape, bool)
+        is_on.ravel()[known] = np.any([plane.holds(places, value) for plane in own], 0)
+        unsure = _told_by_rim(segment & (sure <= UNSURE), sure > SURE, is_on, rim)
+        for plane, mine in zip(own, _nearest(own, known[some], unsure), strict=True):
             planes.append(plane)
             pixels = np.flatnonzero(mine)
             stable = plane.deviation(_places(shape, pixels, around)) < STABLE
             v, u = np.divmod(pixels[stable], segment.shape[1])
             which[v + around[0].start, u + around[1].start] = len(planes)
     return planes, which
+
+
+def _told_by_rim(
+    unsure: Bool[np.ndarray, "h w"],
+    sure: Bool[np.ndarray, "h w"],
+    is_on: Bool[np.ndarray, "h w"],
+    rim: UInt8[np.ndarray, "k k"],
+) -> Bool[np.ndarray, "h w"]:
+    """The connected unsure parts at whose own rim most of what is sure lies on a plane.
+
+    A segment may go on beyond an edge that is too faint to be seen, and what is unsure there is on
+    none of its planes.
+    """
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(unsure.astype(np.uint8))
+    told = np.zeros(unsure.shape, bool)
+    for number in range(1, count):
+        if stats[number, cv2.CC_STAT_AREA] < _LEAST:
+            continue
+        part = parts == number
+        around = (cv2.dilate(part.astype(np.uint8), rim) > 0) & sure
+        if np.count_nonzero(around & is_on) >= MOSTLY * max(1, int(np.count_nonzero(around))):
+            told |= part
+    return told
 
 
 def _box(segment: Bool[np.ndarray, "h w"], reach: int) -> tuple[slice, slice]:
@@ -264,15 +301,15 @@ def _plane(
 
 
 def _nearest(
-    planes: Sequence[SegmentPlane], known: Int[np.ndarray, "n"], segment: Bool[np.ndarray, "h w"]
+    planes: Sequence[SegmentPlane], known: Int[np.ndarray, "n"], unsure: Bool[np.ndarray, "h w"]
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Which of a segment's pixels are nearest to those of the known ones that lie on each plane."""
+    """Which of the unsure pixels are nearest to those of the known ones that lie on each plane."""
     if len(planes) < 2:
-        return [segment] * len(planes)
+        return [unsure] * len(planes)
     distances = []
     for plane in planes:
-        empty = np.ones(segment.shape, np.uint8)
+        empty = np.ones(unsure.shape, np.uint8)
         empty.ravel()[known[plane.on]] = 0
         distances.append(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
     nearest = np.argmin(distances, 0)
-    return [segment & (nearest == number) for number in range(len(planes))]
+    return [unsure & (nearest == number) for number in range(len(planes))]
