@@ -35,7 +35,13 @@ def fitting_voxel(
             points = _centres(cells, voxel)
             voxel *= COARSER
             cells = torch.unique(_cells(points, voxel))
-    points = _centres(cells, voxel)
+    return fitting(_centres(cells, voxel), voxel, truncation, most)
+
+
+def fitting(
+    points: Float[Tensor, "n 3"], voxel: float, truncation: float, most: int
+) -> tuple[float, int]:
+    """As :func:`fitting_voxel`, of a surface that some world points tell of."""
     while (blocks := len(band_blocks(points, voxel, truncation))) > most:
         voxel *= COARSER
     return voxel, blocks

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.block_count import fitting_voxel
+from geogs.mesh.block_count import fitting, fitting_voxel
 from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
 from geogs.mesh.decimate import merged
@@ -98,9 +98,8 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     voxel = float(footprints.median())
     faces = _FACES_PER_SQUARE * _area(points, voxel)
     voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
-    while (n := len(band_blocks(points, voxel, config.truncation))) * BYTES_PER_BLOCK > limit:
-        voxel *= 1.1
-    return VolumePlan(voxel, config.truncation, max_depth, n, round(faces / voxel**2))
+    voxel, blocks = fitting(points, voxel, config.truncation, int(limit / BYTES_PER_BLOCK))
+    return VolumePlan(voxel, config.truncation, max_depth, blocks, round(faces / voxel**2))
 
 
 @on_one_torch_thread

@@ -1,5 +1,6 @@
 """Keyframe depths by the network, on the CPU or a GPU."""
 
+import contextlib
 import math
 import threading
 from collections.abc import Sequence
@@ -68,8 +69,9 @@ class NetworkDepthEngine(AlternativeSearch):
     @torch.no_grad()
     def _warm_up(self) -> None:
         """Run it on nothing once: cuDNN is loaded and chooses its kernels for a second, which the
-        first keyframe need not wait for."""
-        with torch.cuda.stream(torch.cuda.Stream(self.device)):
+        first keyframe need not wait for. Who uses it says what fails."""
+        stream = torch.cuda.Stream(self.device)
+        with contextlib.suppress(RuntimeError), torch.cuda.stream(stream):
             black = torch.zeros(1, 3, self.seen.height, self.seen.width, device=self.device)
             one, many = torch.ones(1, device=self.device), (1, MOST_NEIGHBOURS)
             others = black[None].expand(*many, -1, -1, -1)

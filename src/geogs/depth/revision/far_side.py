@@ -40,8 +40,7 @@ class FarSideSearch(RevisedSearch):
         depth, confidence = searched.depth, searched.confidence
         for _ in range(PASSES):
             beyond = self.classical.farther_surface(depth, round(REACH * max(depth.shape)), APART)
-            there = beyond > 0
-            depths = torch.stack([depth, torch.where(there, beyond, depth)])
+            there, depths = beyond > 0, torch.stack([depth, beyond])
             here, other = self.classical.photo_costs(view, others, depths, ~there, there)
             depth = torch.where(other < here, beyond, depth)
             confidence = torch.where(other < here, MOVED_CONFIDENCE, confidence)
