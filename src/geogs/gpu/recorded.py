@@ -16,14 +16,17 @@ Maps = tuple[Tensor, ...]
 class Recorded:
     """Does ``work``, which no value of the tensors that it is given may change the course of.
 
-    On a GPU it is recorded as a CUDA graph at the first tensors of each set of shapes, and played
-    back from then on. Elsewhere, and where a driver cannot record it, it is called as it is.
+    On a GPU it is recorded as a CUDA graph at the second tensors of each set of shapes, and played
+    back from then on; before it was done once, libraries have not chosen their kernels, and shapes
+    that come but once are not worth it. Elsewhere, and where a driver cannot record it, it is
+    called as it is.
     Threads and streams may share one: each waits until what another has begun is done.
     """
 
     def __init__(self, work: Callable[..., Maps], name: str) -> None:
         """``name`` is what is said to be slow where it cannot be recorded."""
         self._work, self._name = work, name
+        self._done_once = set[tuple[torch.Size, ...]]()
         self._recordings: dict[tuple[torch.Size, ...], Callable[..., Maps]] = {}
         self._lock = threading.Lock()
         self._done: torch.cuda.Event | None = None
@@ -37,9 +40,10 @@ class Recorded:
             stream = torch.cuda.current_stream(given[0].device)
             if self._done is not None:
                 stream.wait_event(self._done)
-            if shapes not in self._recordings:
+            if shapes in self._done_once and shapes not in self._recordings:
                 self._recordings[shapes] = self._recording(given)
-            found = self._recordings[shapes](*given)
+            self._done_once.add(shapes)
+            found = self._recordings.get(shapes, self._work)(*given)
             self._done = stream.record_event(self._done)
         return found
 
@@ -57,11 +61,6 @@ class _Recording:
     def __init__(self, work: Callable[..., Maps], given: Maps) -> None:
         self._given = tuple(tensor.clone() for tensor in given)
         with torch.cuda.device(given[0].device):
-            aside = torch.cuda.Stream()
-            aside.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(aside):
-                work(*self._given)  # libraries choose their kernels
-            torch.cuda.current_stream().wait_stream(aside)
             self._graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
                 self._found = work(*self._given)

@@ -17,7 +17,7 @@ from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
 from geogs.on_demand import OnDemand
 from geogs.priors.depth_sensor import sensor_depth
-from geogs.threads import thread_map
+from geogs.threads import ordered_map, worker_count
 from geogs.world.arrays import ArrayTable
 from geogs.world.keyframes import Keyframe
 
@@ -25,6 +25,8 @@ CHECKING_VIEWS = 8
 """Keyframes whose depth checks a new keyframe's depth and whose free space carves around it."""
 SEARCHED_TOGETHER = 32
 """Keyframes whose images and depths are in memory at once where all are searched anew."""
+PLANAR_TOGETHER = 4
+"""Threads that lay depths on planes: more wait for each other, as much of it is Python's own."""
 
 
 class KeyframeDepths:
@@ -110,9 +112,10 @@ class KeyframeDepths:
 
         def one(pair: tuple[MapView, DenseDepth]) -> DenseDepth:
             view, depth = pair
-            return planar_depth(view.keyframe.image, depth, camera, view.id)
+            return planar_depth(view.bare_segments, depth, camera, view.id)
 
-        return thread_map(one, list(zip(views, depths, strict=True)))
+        pairs = zip(views, depths, strict=True)
+        return list(ordered_map(one, pairs, min(PLANAR_TOGETHER, worker_count())))
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
         """The searched depth, joined with what a sensor measured where it did."""

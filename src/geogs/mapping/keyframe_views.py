@@ -4,10 +4,11 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, ViewPose, depth_images
+from geogs.depth.revision.bare_segments import bare_segments
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.light import same_light
 from geogs.losses.multi_view import PhotoView
@@ -66,6 +67,12 @@ class MapView:
         return DepthView(
             self.id, self.T_cw.numpy(), *loaded.matched, loaded.image, inverse_depth, information
         )
+
+    @property
+    def bare_segments(self) -> Int32[np.ndarray, "sh sw"]:
+        """Numbers of the bare parts of its image."""
+        arrays = self.arrays.table.arrays
+        return arrays.made("bare segments", self.id, lambda: bare_segments(self.keyframe.image))
 
     @property
     def photo(self) -> PhotoView:

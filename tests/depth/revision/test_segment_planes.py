@@ -151,7 +151,7 @@ def test_normals_are_those_of_the_plane(slopes):
     found = bowed(inverse, box(36, 124, 26, 94))
     depth, confidence = (torch.from_numpy(x) for x in (found.depth, found.confidence))
     dense = DenseDepth(depth, confidence, depth.median(), normal=torch.zeros(120, 160, 3))
-    planar = planar_depth(image_with(bare), dense, CAMERA, 0)
+    planar = planar_depth(bare_segments(image_with(bare)), dense, CAMERA, 0)
     taken = planar.depth != depth
     assert (planar.confidence[taken] == CONFIDENCE).all()
     assert (planar.confidence[~taken] == confidence[~taken]).all()

@@ -27,6 +27,7 @@ from geogs.evaluation.pages.lengths import lengths
 from geogs.geometry.camera import Camera
 from geogs.mesh.decimate import with_at_most
 from geogs.mesh.triangle_mesh import Mesh
+from geogs.threads import ordered_map, worker_count
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 MOST_FACES, MOST_DISKS, MOST_IMAGES = 240_000, 50_000, 240
@@ -153,10 +154,12 @@ def _rendered_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
     def image(number: int) -> UInt8[np.ndarray, "h w 3"] | None:
         return renders[number].image
 
-    return [
-        ShownView(r.timestamp, np.linalg.inv(r.T_cw.cpu().numpy()), partial(image, i))
-        for i, r in enumerate(renders)
-    ]
+    def view(number: int) -> ShownView:
+        render = renders[number]
+        T_wc = np.linalg.inv(render.T_cw.cpu().numpy())
+        return ShownView(render.timestamp, T_wc, partial(image, number))
+
+    return list(ordered_map(view, range(len(renders)), worker_count()))
 
 
 def shown_model(
@@ -260,12 +263,14 @@ def _keyframes(views: Sequence[ShownView], camera: Camera) -> list[KeyframeModel
     )
     edge = min(max(edge, _SHORTEST_EDGE), _LONGEST_EDGE)
     start = views[0].timestamp if views else 0.0
-    result = []
-    for number, view in enumerate(views):
+
+    def shown(number: int) -> KeyframeModel:
+        view = views[number]
         image = view.image() if number in with_image else None
         name = f"keyframe {number + 1} of {len(views)}, {view.timestamp - start:.1f} s"
-        result.append(KeyframeModel(name, view.T_wc, None if image is None else _jpeg(image, edge)))
-    return result
+        return KeyframeModel(name, view.T_wc, None if image is None else _jpeg(image, edge))
+
+    return list(ordered_map(shown, range(len(views)), worker_count()))
 
 
 def _jpeg(image: UInt8[np.ndarray, "h w 3"], edge: int) -> bytes:

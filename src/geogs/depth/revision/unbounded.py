@@ -66,7 +66,7 @@ def unbounded(
 
     At infinity only the rotations between the views count. What is asked is a mean over single
     pixels of like colour (``photo_costs``), so that a roof says nothing of the sky beside it.
-    None where hardly a pixel is far, or there is nothing to compare with.
+    None where there are none, hardly a pixel is far, or there is nothing to compare with.
     """
     sure = found.confidence > _SURE
     if not others or not bool(sure.any()):
@@ -77,4 +77,5 @@ def unbounded(
         return None
     depths = torch.stack([found.depth, (_INFINITY * typical).expand_as(found.depth)])
     here, beyond = engine.photo_costs(view, others, depths, sure)
-    return is_far & (beyond < AGREES) & (beyond < here + WORSE)
+    is_sky = is_far & (beyond < AGREES) & (beyond < here + WORSE)
+    return is_sky if bool(is_sky.any()) else None
