@@ -95,6 +95,8 @@ class Frame(ShortRepr):
     """By another tracker, where there is one and it is to be used as a prior."""
     rows: SeenRows | None = None
     """How its rows were rectified; none of a global shutter."""
+    left: int | None = None
+    """Images of its recording that are still to come; none where that is not known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,11 +75,15 @@ class LocalMapping:
         return keyframe
 
     def update(
-        self, keyframe: Keyframe, anchor: int, rotations: Sequence[RelativeRotation]
+        self,
+        keyframe: Keyframe,
+        anchor: int,
+        rotations: Sequence[RelativeRotation],
+        culls: bool = True,
     ) -> tuple[int, ...]:
         """Link a new keyframe to its neighbours and adjust them; returns the ids of those culled.
 
-        ``anchor`` is the keyframe at which it was located.
+        ``anchor`` is the keyframe at which it was located; without ``culls`` none goes.
         """
         self.map.complete(keyframe, rotations)
         self._connect(keyframe.id, anchor)
@@ -90,7 +94,7 @@ class LocalMapping:
         keyframe.moving = propagated(self.keyframes.grid, moving, pixels, weight)
         self._adjust()
         self.map.odometry.update_scale()
-        return self._cull()
+        return self._cull() if culls else ()
 
     def _connect(self, id: int, anchor: int) -> None:
         """Measure a new keyframe against the one it was located at, and its neighbours."""

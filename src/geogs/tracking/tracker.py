@@ -17,7 +17,7 @@ from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.follower import Follower
 from geogs.tracking.frames.pose_filling import solve_trajectory
-from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
+from geogs.tracking.keyframes.keyframe_choice import LATEST, KeyframeChoice, is_near_end
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.locate.frame_locator import FrameMotion, Recognition
@@ -58,6 +58,8 @@ class _Unfinished:
     keyframe: Keyframe
     motion: FrameMotion
     rotations: Sequence[RelativeRotation]
+    is_last: bool
+    """Whether hardly any frame comes after it."""
 
 
 class Tracker:
@@ -223,7 +225,9 @@ class Tracker:
         """Do what the new keyframe takes beyond its pose: neighbours, depth, local adjustment."""
         new, self._unfinished = self._unfinished, None
         assert new is not None, "no keyframe waits to be completed"
-        removed = self.local.update(new.keyframe, new.motion.keyframe, new.rotations)
+        removed = self.local.update(
+            new.keyframe, new.motion.keyframe, new.rotations, culls=not new.is_last
+        )
         fresh = self.map.finalise(self.keyframes.ids[:-1])
         state, active = self.segment.status.state, self.local.active
         return TrackResult(state, fresh, active, removed)
@@ -290,12 +294,14 @@ class Tracker:
             frame.depth is not None and self.segment.is_metric and anchor.measured is None
         )
         seen = motion.flow, motion.overlap, motion.parallax
-        if not (is_first_measured or self._choice.calls_for(*seen)):
+        latest = [self.keyframes[k].frame_index for k in self.keyframes.ids[-LATEST:]]
+        ends = is_near_end(frame.left, latest)
+        if not (is_first_measured or self._choice.calls_for(*seen, ends)):
             self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)
             return TrackResult(status.state, active=self.local.active)
         keyframe = self.local.insert(frame, encoded, motion)
         status.last = LastFrame.at(keyframe, last.velocity, last.interval)
-        self._unfinished = _Unfinished(keyframe, motion, rotations)
+        self._unfinished = _Unfinished(keyframe, motion, rotations, ends)
         return TrackResult(status.state) if self._defers else self.complete()
 
     def _located(self, frame: Frame, motion: FrameMotion) -> LastFrame:

@@ -249,7 +249,10 @@ class Source:
             self.place = ReadingPlace(index + 1, end, (*former, here))
             pose = images.poses.of(raw.timestamp, raw.pose)
             pose = None if pose is None else replace(pose, world=number)
-            yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows)
+            left = None
+            if images.length is not None:
+                left = max(0, images.length - here.frames - here.skipped)
+            yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows, left)
             index += 1
         if short := images.why_short(here.frames + here.skipped, end - here.shift):
             _log.warning("%s", short)

@@ -1,6 +1,8 @@
 """Which frames become keyframes."""
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -18,6 +20,10 @@ part of it is the rotation's."""
 FARTHEST = 0.15
 """Motion that makes a keyframe without any parallax, of the long edge: over larger ones flow finds
 fewer matches, and worse ones."""
+LATEST, CLOSER = 5, 1 / 3
+"""Where no more frames come than lie between two of so many latest keyframes, so much of the usual
+parallax makes one: what comes into view there is seen by no later keyframe, and by one alone it has
+no depth."""
 BLUR_RATIO = 0.7
 """A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
 BLUR_WAIT = 0.4
@@ -35,6 +41,7 @@ def calls_for_keyframe(
     overlap: float,
     parallax: float | None = None,
     patience: float = 0.0,
+    part: float = 1.0,
 ) -> bool:
     """Whether a frame is far enough from the last keyframe to become one.
 
@@ -51,6 +58,7 @@ def calls_for_keyframe(
             stays small while the overlap goes.
         parallax: median of the motion without the rotation's, where it is known, pixels.
         patience: it may come so much further.
+        part: of the usual parallax that is enough.
     """
     more = 1 + patience
     enough = config.keyframe_parallax * more * long_edge
@@ -58,7 +66,16 @@ def calls_for_keyframe(
         return True
     if parallax is None:
         return flow >= WITH_ROTATION * enough
-    return parallax >= enough or flow >= FARTHEST * more * long_edge
+    return parallax >= part * enough or flow >= FARTHEST * more * long_edge
+
+
+def is_near_end(left: int | None, latest: Sequence[int]) -> bool:
+    """Whether too few frames are ``left``, as far as that is known, for another keyframe.
+
+    ``latest`` are the numbers of the frames that became the latest keyframes.
+    """
+    apart = max((b - a for a, b in itertools.pairwise(latest)), default=0)
+    return left is not None and left < apart
 
 
 def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
@@ -103,14 +120,19 @@ class KeyframeChoice:
         """Wait until the latest frame has been noted."""
         self._concurrent.wait()
 
-    def calls_for(self, flow: float, overlap: float, parallax: float | None = None) -> bool:
+    def calls_for(
+        self, flow: float, overlap: float, parallax: float | None = None, ends: bool = False
+    ) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
 
         A frame that is blurred compared with the latest ones waits for a sharper one, though not
-        for long: nothing else sees what comes into view meanwhile.
+        for long: nothing else sees what comes into view meanwhile. ``ends`` says that
+        :func:`is_near_end`.
         """
-        patience = BLUR_WAIT if self._is_blurred() else 0.0
-        return calls_for_keyframe(self.config, self.long_edge, flow, overlap, parallax, patience)
+        patience, part = BLUR_WAIT if self._is_blurred() else 0.0, CLOSER if ends else 1.0
+        return calls_for_keyframe(
+            self.config, self.long_edge, flow, overlap, parallax, patience, part
+        )
 
     def _note(self, value: float) -> None:
         self._recent.append(value)
