@@ -71,6 +71,16 @@ def test_results_tell_what_happened(tracked):
     assert results[0].state is TrackState.INITIALIZING
 
 
+def test_keyframes_are_closer_where_the_video_ends(tracked):
+    before = [tracked[0].keyframes[k].frame_index for k in tracked[0].segment.ids]
+    stream = [replace(f, left=len(PATH) - 1 - f.index) for f in frames(PATH)]
+    tracker, _ = run(stream)
+    after = [tracker.keyframes[k].frame_index for k in tracker.segment.ids]
+    ends = len(PATH) - max(np.diff(before[-6:]))
+    assert [k for k in after if k < ends] == [k for k in before if k < ends]
+    assert len([k for k in after if k >= ends]) > len([k for k in before if k >= ends])
+
+
 def test_median_depth_is_about_one_unit(tracked):
     tracker, _ = tracked
     depth = torch.cat(

@@ -47,6 +47,7 @@ def test_frames_are_numbered_and_timed_through(tmp_path):
         read = list(source)
         assert [f.index for f in read] == list(range(7))
         assert [f.follows_cut for f in read] == [False] * 3 + [True] + [False] * 3
+        assert [f.left for f in read] == [2, 1, 0, 3, 2, 1, 0]
         times = [f.timestamp for f in read]
         assert times == sorted(times)
         assert times[3] == pytest.approx(times[2] + PAUSE)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from geogs.config import TrackingConfig
-from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice, sharpness
+from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice, is_near_end, sharpness
 
 CONFIG = TrackingConfig(keyframe_parallax=0.025, keyframe_overlap=0.7)
 
@@ -31,6 +31,22 @@ def test_before_depths_are_known_the_rotation_counts_and_more_is_asked_for() -> 
     choice = KeyframeChoice(CONFIG, 512)
     assert not choice.calls_for(17.9, 1.0)
     assert choice.calls_for(18.0, 1.0)
+
+
+def test_near_the_end_a_third_of_the_parallax_is_enough() -> None:
+    choice = KeyframeChoice(CONFIG, 512)
+    assert not choice.calls_for(4.2, 1.0, 4.2, near=True)
+    assert choice.calls_for(4.3, 1.0, 4.3, near=True)
+    assert choice.calls_for(6.0, 1.0, near=True)
+    assert not choice.calls_for(5.9, 1.0, near=True)
+
+
+def test_the_end_is_near_where_no_usual_keyframe_comes_any_more() -> None:
+    assert is_near_end(8, [10, 15, 24])
+    assert not is_near_end(9, [10, 15, 24])
+    assert is_near_end(8, [15, 24, 27, 30])  # the latest are closer because it is
+    assert not is_near_end(0, [10])
+    assert not is_near_end(None, [10, 15, 24])
 
 
 def test_lost_overlap_makes_a_keyframe_before_the_median_motion_does() -> None:

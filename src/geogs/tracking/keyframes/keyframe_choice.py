@@ -65,7 +65,7 @@ def calls_for_keyframe(
     if overlap < config.keyframe_overlap / more and flow >= LEAST_FLOW * enough:
         return True
     if parallax is None:
-        return flow >= WITH_ROTATION * enough
+        return flow >= WITH_ROTATION * part * enough
     return parallax >= part * enough or flow >= FARTHEST * more * long_edge
 
 
@@ -121,15 +121,15 @@ class KeyframeChoice:
         self._concurrent.wait()
 
     def calls_for(
-        self, flow: float, overlap: float, parallax: float | None = None, ends: bool = False
+        self, flow: float, overlap: float, parallax: float | None = None, near: bool = False
     ) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
 
         A frame that is blurred compared with the latest ones waits for a sharper one, though not
-        for long: nothing else sees what comes into view meanwhile. ``ends`` says that
+        for long: nothing else sees what comes into view meanwhile. ``near`` says that
         :func:`is_near_end`.
         """
-        patience, part = BLUR_WAIT if self._is_blurred() else 0.0, CLOSER if ends else 1.0
+        patience, part = BLUR_WAIT if self._is_blurred() else 0.0, CLOSER if near else 1.0
         return calls_for_keyframe(
             self.config, self.long_edge, flow, overlap, parallax, patience, part
         )
