@@ -91,13 +91,11 @@ def support(
     """
     poses = np.stack([other.T_cw for other in others]) @ np.linalg.inv(T_cw)
     T = torch.from_numpy(poses).to(points)
-    x, y, z = (points @ T[:, :3, :3].mT + T[:, None, :3, 3]).unbind(-1)
-    right, down = camera.width - 1, camera.height - 1
-    u = camera.fx * x / z.clamp(min=1e-9) + camera.cx
-    v = camera.fy * y / z.clamp(min=1e-9) + camera.cy
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u <= right) & (v <= down)
+    pixel, z = camera.project(points @ T[:, :3, :3].mT + T[:, None, :3, 3])
+    last = pixel.new_tensor([camera.width - 1, camera.height - 1])
+    inside = (z > 0) & ((pixel >= 0) & (pixel <= last)).all(-1)
     maps = torch.stack([torch.stack([o.depth.depth, o.depth.confidence]) for o in others])
-    place = torch.stack([2 * u / right - 1, 2 * v / down - 1], -1)[:, None]
+    place = (2 * pixel / last - 1)[:, None]
     found = F.grid_sample(maps, place, align_corners=True, padding_mode="border")
     there, confidence = found[:, :, 0].unbind(1)
     ratio = z / there
