@@ -28,9 +28,6 @@ PHOTO, SUPPORT = 9.0, 0.4
 """Logit of the chance that the farther side is right: times how much less it costs by
 ``photo_costs``, and how much more support it has. A logistic regression on every third keyframe of
 two dining rooms and a room; the constant came out as 0."""
-AGAINST = -0.03
-"""Least difference of the costs: where the images speak against the farther side no depths of
-others speak for it, as a search loses thin things from every view alike."""
 MOVED_CONFIDENCE = 0.6
 """Confidence of a depth that was moved: what both say is right more often than not."""
 
@@ -63,12 +60,12 @@ def on_their_sides(
         there = beyond > 0 if found.sky is None else (beyond > 0) & ~found.sky
         both = torch.stack([depth, torch.where(there, beyond, depth)])
         here, other = engine.photo_costs(view, views, both, ~there, there)
-        photo, gain = here - other, torch.zeros_like(depth)
+        gain = torch.zeros_like(depth)
         near, far = (
             support(camera.back_project(z)[there], view.T_cw, depths, camera) for z in both
         )
         gain[there] = far - near
-        moves = there & (photo > AGAINST) & (PHOTO * photo + SUPPORT * gain > 0)
+        moves = there & (PHOTO * (here - other) + SUPPORT * gain > 0)
         depth = torch.where(moves, beyond, depth)
         moved |= moves
     confidence = torch.where(moved, MOVED_CONFIDENCE, found.confidence)
