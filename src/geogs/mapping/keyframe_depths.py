@@ -1,6 +1,6 @@
 """The dense depths of the map's keyframes: searched, measured, and checked by those around."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 
 from jaxtyping import Bool, Float
@@ -9,7 +9,6 @@ from torch import Tensor
 from geogs.config import DepthSensorConfig
 from geogs.depth.depth_engine import DepthEngine, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView
-from geogs.depth.revision.edge_sides import on_their_sides
 from geogs.depth.revision.segment_planes import planar_depth
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
@@ -61,43 +60,20 @@ class KeyframeDepths:
                 view.set_depth(self._with_sensor(view, depth))
 
     def check(self, views: Sequence[MapView]) -> None:
-        """Let the neighbours' depths revise those of the views: as they were estimated, and then,
-        at edges, as they are by then."""
-        self._revise(views, self._checked)
-        self._revise(views, self._on_their_sides)
-
-    def _checked(self, batch: Sequence[MapView]) -> list[DenseDepth]:
-        others = [[o.posed for o in self.near(view)] for view in batch]
-        return self._planar(batch, self.engine.check([view.posed for view in batch], others))
-
-    def _on_their_sides(self, batch: Sequence[MapView]) -> list[DenseDepth]:
-        """The depths of views with what is beyond an edge on its own side; what a sensor measured
-        stays."""
-        camera = self.views.arrays.cameras.render
-
-        def one(view: MapView) -> DenseDepth:
-            if view.keyframe.measured is not None:
-                return view.dense
-            others = [(other.depth_view, other.posed) for other in self.near(view)]
-            return on_their_sides(self.engine, view.depth_view, view.dense, others, camera)
-
-        return [one(view) for view in batch]
-
-    def _revise(
-        self, views: Sequence[MapView], revised: Callable[[Sequence[MapView]], list[DenseDepth]]
-    ) -> None:
-        """Replace the depths of views, none of which sees another's new one."""
-        device, arrays, new = self.views.arrays.device, ArrayTable(), []
+        """Let the neighbours' depths, as they were estimated, revise those of the views."""
+        device, arrays, checked = self.views.arrays.device, ArrayTable(), []
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
-            depths = revised(batch)
+            others = [[o.posed for o in self.near(view)] for view in batch]
+            depths = self.engine.check([view.posed for view in batch], others)
+            depths = self._planar(batch, depths)
             if len(views) == len(batch):
                 for view, depth in zip(views, depths, strict=True):
                     view.set_depth(depth)
                 return
             pairs = zip(batch, depths, strict=True)
-            new += [(v.id, put_depth(arrays, v.id, depth, 1.0)) for v, depth in pairs]
-        for id, stored in new:
+            checked += [(v.id, put_depth(arrays, v.id, depth, 1.0)) for v, depth in pairs]
+        for id, stored in checked:
             self.views[id].set_depth(get_depth(arrays, id, stored, 1.0, device))
 
     def near(self, view: MapView) -> list[MapView]:
