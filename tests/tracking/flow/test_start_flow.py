@@ -8,7 +8,7 @@ import torch
 
 from geogs.bundle.projection import project
 from geogs.tracking.flow.classical_flow import ClassicalFlow
-from geogs.tracking.flow.start_flow import StartFlow
+from geogs.tracking.flow.start_flow import Lattice, StartFlow
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA
 
@@ -62,10 +62,11 @@ def test_points_are_those_of_the_formula(flow):
 
 
 def test_a_lattice_is_the_points_it_is_made_of(flow):
-    v, u = np.mgrid[: 8 * ROWS, : 8 * COLUMNS].astype(np.float32)
-    u, v = (u - 4) / 8, (v - 4) / 8
-    expected = StartFlow(flow).at(np.stack([u, v], -1).reshape(-1, 2)).reshape(*u.shape, 2)
-    np.testing.assert_allclose(StartFlow(flow).on_lattice(u, v), expected, atol=1e-4)
+    u, v = ((np.arange(8 * n, dtype=np.float32) - 4) / 8 for n in (COLUMNS, ROWS))
+    points = np.stack(np.meshgrid(u, v), -1)
+    expected = StartFlow(flow).at(points.reshape(-1, 2)).reshape(points.shape)
+    found = StartFlow(flow).on(Lattice(u, v, ROWS, COLUMNS))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_a_quadratic_is_exact():

@@ -20,7 +20,7 @@ from torch import Tensor
 from geogs.threads import opencv_on_one_thread, worker_count
 from geogs.tracking.flow.cell_texture import cell_structure
 from geogs.tracking.flow.flow_operator import Memories
-from geogs.tracking.flow.start_flow import StartFlow
+from geogs.tracking.flow.start_flow import Lattice, StartFlow
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
@@ -56,7 +56,8 @@ class _Level:
         v, u = np.mgrid[:height, :width].astype(np.float32)
         self.u, self.v = u, v
         # The same pixels in cells of the grid.
-        self.cell_u, self.cell_v = ((self.to_image(x) - OFFSET) / STRIDE for x in (u, v))
+        across, down = ((self.to_image(x) - OFFSET) / STRIDE for x in (u[0], v[:, 0]))
+        self.lattice = Lattice(across, down, grid.height, grid.width)
 
     def to_image(self, x: np.ndarray) -> np.ndarray:
         """Coordinates of this level in the full image."""
@@ -186,7 +187,7 @@ class ClassicalFlow:
         if start is not None:
             shape = (self.grid.height, self.grid.width, 2)
             warp = StartFlow(np.clip(start - self._pixels, -1e4, 1e4).reshape(shape))
-            dense = warp.on_lattice(level.cell_u, level.cell_v) / level.step
+            dense = warp.on(level.lattice) / level.step
             u, v = level.u + dense[..., 0], level.v + dense[..., 1]
             height, width = target.shape
             target = cv2.remap(target, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -31,16 +31,14 @@ class StartFlow:
         self._flow = np.ascontiguousarray(flow, np.float32)
         self._along_u, self._along_v = _bends(self._flow, 1), _bends(self._flow, 0)
 
-    def on_lattice(
-        self, u: Float32[np.ndarray, "h w"], v: Float32[np.ndarray, "h w"]
-    ) -> Float32[np.ndarray, "h w 2"]:
-        """At all of some columns u and rows v, in cells; multiples of 1/32, to which OpenCV
-        rounds."""
-        rows, columns = self._flow.shape[:2]
-        (i, p), (j, q) = _intervals(u, columns), _intervals(v, rows)
-        found = _remap(self._flow, u, v)
-        found += p[..., None] * _remap(self._along_u, i, v)
-        found += q[..., None] * _remap(self._along_v, u, j)
+    def on(self, lattice: "Lattice") -> Float32[np.ndarray, "h w 2"]:
+        """At all places of a lattice that is made for such a grid."""
+        x, height = lattice, len(lattice.u)
+        found = _remap(self._flow, x.u, x.v)
+        # Both numbers of a row behind each other: NumPy is slow on axes of two.
+        flat = found.reshape(height, -1)
+        flat += x.factor_u * _remap(self._along_u, x.interval_u, x.v).reshape(height, -1)
+        flat += x.factor_v * _remap(self._along_v, x.u, x.interval_v).reshape(height, -1)
         return found
 
     def at(self, points: Float[np.ndarray, "p 2"]) -> Float32[np.ndarray, "p 2"]:
@@ -55,6 +53,24 @@ class StartFlow:
         along_u = (1 - b) * self._along_u[r, i] + b * self._along_u[r + 1, i]
         along_v = (1 - a) * self._along_v[j, c] + a * self._along_v[j, c + 1]
         return (linear + p * along_u + q * along_v).astype(np.float32)
+
+
+class Lattice:
+    """Columns u and rows v, in cells of a grid, with what interpolants at all of them need."""
+
+    def __init__(
+        self,
+        u: Float32[np.ndarray, "w"],
+        v: Float32[np.ndarray, "h"],
+        rows: int,
+        columns: int,
+    ) -> None:
+        """Places are multiples of 1/32, to which OpenCV rounds; the grid has so many cells."""
+        self.u, self.v = np.meshgrid(u, v)
+        interval, factor = _intervals(u, columns)
+        self.interval_u, self.factor_u = np.meshgrid(interval, v)[0], factor.repeat(2)
+        interval, factor = _intervals(v, rows)
+        self.interval_v, self.factor_v = np.meshgrid(u, interval)[1], factor[:, None]
 
 
 def _cells(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
