@@ -113,16 +113,13 @@ extern "C" __global__ void flow_structure(float* image, int* textured, int width
 extern "C" __global__ void flow_warp(const long long* images, const float2* forward, const float2* backward, float* warped, int pairs, int stride, int width, int height, int grid_width, int grid_height, int levels) {
   __shared__ float tile[TILE][TILE + 1];
   int d = blockIdx.z;
-  const float *source = source_image(images, d), *target = target_image(images, d, pairs);
+  const float* target = target_image(images, d, pairs);
   const float2* start = start_of(forward, backward, d, pairs, grid_width * grid_height);
   int x = min((int)(blockIdx.x * TILE + threadIdx.x), width - 1);
   for (int j = threadIdx.y; j < TILE; j += 8) {
     int y = min((int)(blockIdx.y * TILE) + j, height - 1);
     float2 f = start_flow(start, grid_width, grid_height, x, y);
-    float u = x + f.x, v = y + f.y;
-    // What the target does not show says that the start is right.
-    bool unseen = u < -0.5f || v < -0.5f || u > width - 0.5f || v > height - 0.5f;
-    tile[j][threadIdx.x] = unseen ? source[y * width + x] : start ? sample_cubic(target, width, height, u, v) : target[y * width + x];
+    tile[j][threadIdx.x] = start ? sample_cubic(target, width, height, x + f.x, y + f.y) : target[y * width + x];
   }
   write_levels(tile, warped + (long long)d * stride, width, height, levels);
 }

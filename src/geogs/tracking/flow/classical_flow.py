@@ -189,12 +189,7 @@ class ClassicalFlow:
             warp = StartFlow(np.clip(start - self._pixels, -1e4, 1e4).reshape(shape))
             dense = warp.on(level.lattice) / level.step
             u, v = level.u + dense[..., 0], level.v + dense[..., 1]
-            height, width = target.shape
             target = cv2.remap(target, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            # What the target does not show says that the start is right. A border that is repeated
-            # pulls at the flow beside it, wherever the camera goes forward.
-            unseen = (u < -0.5) | (v < -0.5) | (u > width - 0.5) | (v > height - 0.5)
-            np.copyto(target, source, where=unseen)
         target = _match_brightness(target, source)
         # OpenCV makes the output where None is given, which its stubs do not say.
         flow = self._dis(start is None).calc(source, target, None)  # type: ignore[call-overload]

@@ -12,24 +12,20 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-FARTHEST = 2.0
-"""Cells beyond the border after which flow changes no further."""
-
 
 class StartFlow:
-    """An interpolant of flow on a grid of at least three by three cells.
+    """An interpolant of flow on a grid of at least two by two cells.
 
-    ``f(u, v) = linear + p(u) X + q(v) Y``. Between two cells, a being the share of the way from one
-    to the next, p is -a (1 - a) / 2 and X a second difference along u, the smaller one of those at
-    both ends, none if their signs differ (minmod): what is quadratic along either axis is exact,
-    and a step never overshoots. Beyond the border, p is how far, and X the first difference
-    there or one cell further in, whichever is smaller. Likewise Y along v. Source: the limited
-    reconstructions of Harten et al. 1987 (ENO).
+    ``f(u, v) = linear - a (1 - a) / 2 X - b (1 - b) / 2 Y``, a and b being the shares of the way
+    from one cell to the next along u and v. X and Y are second differences along the two, each the
+    smaller one of the cells at both ends, none if their signs differ (minmod): what is quadratic
+    along either axis is exact, and a step never overshoots. Source: the limited reconstructions of
+    Harten et al. 1987 (ENO).
     """
 
     def __init__(self, flow: Float[np.ndarray, "r c 2"]) -> None:
         self._flow = np.ascontiguousarray(flow, np.float32)
-        self._along_u, self._along_v = _bends(self._flow, 1), _bends(self._flow, 0)
+        self._bend_u, self._bend_v = _limited_bend(self._flow, 1), _limited_bend(self._flow, 0)
 
     def on(self, lattice: "Lattice") -> Float32[np.ndarray, "h w 2"]:
         """At all places of a lattice that is made for such a grid."""
@@ -37,22 +33,25 @@ class StartFlow:
         found = _remap(self._flow, x.u, x.v)
         # Both numbers of a row behind each other: NumPy is slow on axes of two.
         flat = found.reshape(height, -1)
-        flat += x.factor_u * _remap(self._along_u, x.interval_u, x.v).reshape(height, -1)
-        flat += x.factor_v * _remap(self._along_v, x.u, x.interval_v).reshape(height, -1)
+        flat -= x.factor_u * _remap(self._bend_u, x.cell_u, x.v).reshape(height, -1)
+        flat -= x.factor_v * _remap(self._bend_v, x.u, x.cell_v).reshape(height, -1)
         return found
 
     def at(self, points: Float[np.ndarray, "p 2"]) -> Float32[np.ndarray, "p 2"]:
-        """At some points, in cells."""
+        """At some points, in cells. The border is repeated."""
         rows, columns = self._flow.shape[:2]
-        u, v = points.T.astype(np.float32)
-        (i, p), (j, q) = _intervals(u, columns), _intervals(v, rows)
-        i, j, p, q = i.astype(int), j.astype(int), p[:, None], q[:, None]
-        (c, a), (r, b) = _cells(u, columns), _cells(v, rows)
-        linear = (1 - b) * ((1 - a) * self._flow[r, c] + a * self._flow[r, c + 1])
-        linear += b * ((1 - a) * self._flow[r + 1, c] + a * self._flow[r + 1, c + 1])
-        along_u = (1 - b) * self._along_u[r, i] + b * self._along_u[r + 1, i]
-        along_v = (1 - a) * self._along_v[j, c] + a * self._along_v[j, c + 1]
-        return (linear + p * along_u + q * along_v).astype(np.float32)
+        i, a = _cells(points[:, 0].astype(np.float32), columns)
+        j, b = _cells(points[:, 1].astype(np.float32), rows)
+        i, j, a, b = i.astype(int), j.astype(int), a[:, None], b[:, None]
+
+        def along_u(field: np.ndarray, row: np.ndarray) -> np.ndarray:
+            return (1 - a) * field[row, i] + a * field[row, i + 1]
+
+        linear = (1 - b) * along_u(self._flow, j) + b * along_u(self._flow, j + 1)
+        bend_u = (1 - b) * self._bend_u[j, i] + b * self._bend_u[j + 1, i]
+        bend_v = along_u(self._bend_v, j)
+        found: np.ndarray = linear - 0.5 * (a * (1 - a) * bend_u + b * (1 - b) * bend_v)
+        return found
 
 
 class Lattice:
@@ -67,47 +66,34 @@ class Lattice:
     ) -> None:
         """Places are multiples of 1/32, to which OpenCV rounds; the grid has so many cells."""
         self.u, self.v = np.meshgrid(u, v)
-        interval, factor = _intervals(u, columns)
-        self.interval_u, self.factor_u = np.meshgrid(interval, v)[0], factor.repeat(2)
-        interval, factor = _intervals(v, rows)
-        self.interval_v, self.factor_v = np.meshgrid(u, interval)[1], factor[:, None]
+        cell, share = _cells(u, columns)
+        self.cell_u = np.meshgrid(cell, v)[0]
+        self.factor_u = (0.5 * share * (1 - share)).repeat(2)
+        cell, share = _cells(v, rows)
+        self.cell_v = np.meshgrid(u, cell)[1]
+        self.factor_v = (0.5 * share * (1 - share))[:, None]
 
 
 def _cells(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The cell before each place, and the share (p, 1) of the way to the next."""
+    """The cell before each place, and the share of the way to the next."""
     x = np.clip(x, 0, count - 1)
-    cell = np.minimum(np.floor(x), count - 2).astype(int)
-    return cell, (x - cell).astype(np.float32)[:, None]
+    cell = np.minimum(np.floor(x), count - 2)
+    return cell, x - cell
 
 
-def _intervals(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """In which interval between cells each place lies, and by what its bend is multiplied.
-
-    That before the first cell is 0, that beyond the last one ``count``.
-    """
-    inside = np.clip(x, 0, count - 1)
-    cell = np.minimum(np.floor(inside), count - 2)
-    share, beyond = inside - cell, np.clip(x - inside, -FARTHEST, FARTHEST)
-    interval = np.where(beyond < 0, 0, np.where(beyond > 0, count, cell + 1))
-    factor = np.where(beyond != 0, beyond, -0.5 * share * (1 - share))
-    return interval.astype(np.float32), factor.astype(np.float32)
-
-
-def _bends(flow: Float32[np.ndarray, "r c 2"], axis: int) -> np.ndarray:
-    """Of each interval along an axis: slope, second differences between cells, slope."""
-    flow = np.moveaxis(flow, axis, 0)
-    slope, second = np.diff(flow, 1, 0), np.diff(flow, 2, 0)
+def _limited_bend(flow: Float32[np.ndarray, "r c 2"], axis: int) -> Float32[np.ndarray, "r c 2"]:
+    """Second difference between each cell and the next along an axis; of the last one, none."""
+    bend = np.zeros_like(flow)
+    if flow.shape[axis] < 3:
+        return bend
+    second = np.diff(flow, 2, axis)
     # At the border the only one there is counts.
-    ends = np.concatenate([second[:1], second, second[-1:]])
-    between = _minmod(ends[:-1], ends[1:])
-    left, right = _minmod(slope[:1], slope[1:2]), _minmod(slope[-1:], slope[-2:-1])
-    found = np.concatenate([left, between, right])
-    return np.ascontiguousarray(np.moveaxis(found, 0, axis))
-
-
-def _minmod(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smaller one of two numbers of the same sign, else nothing."""
-    return np.where(a * b > 0, np.where(np.abs(a) < np.abs(b), a, b), np.float32(0))
+    both = np.concatenate([second.take([0], axis), second, second.take([-1], axis)], axis)
+    first, last = (both.take(range(k, k + flow.shape[axis] - 1), axis) for k in (0, 1))
+    smaller = np.where(np.abs(first) < np.abs(last), first, last)
+    inner = bend[:, :-1] if axis == 1 else bend[:-1]
+    inner[...] = np.where(first * last > 0, smaller, 0)
+    return bend
 
 
 def _remap(field: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
