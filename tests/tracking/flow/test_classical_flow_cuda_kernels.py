@@ -12,6 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.tracking.flow import classical_flow_cuda
 from geogs.tracking.flow.classical_flow import ClassicalFlow, _DenseFlow
 from geogs.tracking.flow.classical_flow_cuda import DEVIATION, SOURCES, CudaClassicalFlow
+from geogs.tracking.flow.start_flow import StartFlow
 from geogs.world.grid import SampleGrid
 
 ALPHA, GAMMA, DELTA, ZETA2, EPS2, RELAXATION = 30.0, 10.0, 2.0, 0.01, 1e-4, 1.5
@@ -187,7 +188,7 @@ def test_matches_are_those_of_the_cpu(device: torch.device, level: int) -> None:
     back = -there + np.stack([smooth(rng, h, w, 5, 0.3) for _ in "xy"], -1)
     warp = np.stack([smooth(rng, grid.height, grid.width, 3, 2.0) for _ in "xy"], -1)
     start = np.stack([grid.pixels.numpy() + s * warp.reshape(-1, 2) for s in (1, -1)])
-    flows = [_DenseFlow(half, s * warp, f) for s, f in ((1, there), (-1, back))]
+    flows = [_DenseFlow(half, StartFlow(s * warp), f) for s, f in ((1, there), (-1, back))]
 
     encoded = operator.encode(rgb)
     table = torch.tensor([encoded.data.data_ptr()] * 2, device=device)

@@ -91,16 +91,44 @@ __device__ __forceinline__ float2 cell_flow(const float2* start, int grid_width,
                      clampf(q.y - (GRID_OFFSET + GRID_STRIDE * r), -FARTHEST, FARTHEST));
 }
 
-// Start flow at any pixel, interpolated linearly between the cells; zero on a cold start.
+// The smaller one of two numbers of the same sign, else nothing.
+__device__ __forceinline__ float minmod(float a, float b) {
+  return a * b > 0.f ? (fabsf(a) < fabsf(b) ? a : b) : 0.f;
+}
+
+// Second difference between the two inner ones of four cells in a row, the smaller one of either
+// end; `first` and `last` say whether the outer ones exist.
+__device__ __forceinline__ float2 limited_bend(float2 before, float2 a, float2 b, float2 after, bool first, bool last) {
+  float2 at_a = make_float2(before.x - 2.f * a.x + b.x, before.y - 2.f * a.y + b.y);
+  float2 at_b = make_float2(a.x - 2.f * b.x + after.x, a.y - 2.f * b.y + after.y);
+  if (!first) at_a = at_b;
+  if (!last) at_b = at_a;
+  return make_float2(minmod(at_a.x, at_b.x), minmod(at_a.y, at_b.y));
+}
+
+// Start flow at any pixel, zero on a cold start: linear between the cells, less what a quadratic
+// with the second differences around bends, see start_flow.py. The grid has four cells or more
+// across and down.
 __device__ __forceinline__ float2 start_flow(const float2* start, int grid_width, int grid_height, float x, float y) {
   if (!start) return make_float2(0.f, 0.f);
   Linear u = linear_at((x - GRID_OFFSET) / GRID_STRIDE, grid_width);
   Linear v = linear_at((y - GRID_OFFSET) / GRID_STRIDE, grid_height);
+  int left = max(u.i - 1, 0), right = min(u.next + 1, grid_width - 1);
+  int above = max(v.i - 1, 0), below = min(v.next + 1, grid_height - 1);
+  bool has_left = u.i > 0, has_right = u.next + 1 < grid_width;
+  bool has_above = v.i > 0, has_below = v.next + 1 < grid_height;
   float2 a = cell_flow(start, grid_width, u.i, v.i), b = cell_flow(start, grid_width, u.next, v.i);
   float2 c = cell_flow(start, grid_width, u.i, v.next), d = cell_flow(start, grid_width, u.next, v.next);
+  float2 top = limited_bend(cell_flow(start, grid_width, left, v.i), a, b, cell_flow(start, grid_width, right, v.i), has_left, has_right);
+  float2 bottom = limited_bend(cell_flow(start, grid_width, left, v.next), c, d, cell_flow(start, grid_width, right, v.next), has_left, has_right);
+  float2 left_side = limited_bend(cell_flow(start, grid_width, u.i, above), a, c, cell_flow(start, grid_width, u.i, below), has_above, has_below);
+  float2 right_side = limited_bend(cell_flow(start, grid_width, u.next, above), b, d, cell_flow(start, grid_width, u.next, below), has_above, has_below);
+  float bend_u = 0.5f * u.share * (1.f - u.share), bend_v = 0.5f * v.share * (1.f - v.share);
   float top_x = a.x + u.share * (b.x - a.x), below_x = c.x + u.share * (d.x - c.x);
   float top_y = a.y + u.share * (b.y - a.y), below_y = c.y + u.share * (d.y - c.y);
-  return make_float2(top_x + v.share * (below_x - top_x), top_y + v.share * (below_y - top_y));
+  return make_float2(
+      top_x + v.share * (below_x - top_x) - bend_u * (top.x + v.share * (bottom.x - top.x)) - bend_v * (left_side.x + u.share * (right_side.x - left_side.x)),
+      top_y + v.share * (below_y - top_y) - bend_u * (top.y + v.share * (bottom.y - top.y)) - bend_v * (left_side.y + u.share * (right_side.y - left_side.y)));
 }
 
 // Directed pair d < pairs goes from image d to image d + pairs, d >= pairs the other way.

@@ -20,6 +20,7 @@ from torch import Tensor
 from geogs.threads import opencv_on_one_thread, worker_count
 from geogs.tracking.flow.cell_texture import cell_structure
 from geogs.tracking.flow.flow_operator import Memories
+from geogs.tracking.flow.start_flow import Lattice, StartFlow
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
@@ -55,7 +56,8 @@ class _Level:
         v, u = np.mgrid[:height, :width].astype(np.float32)
         self.u, self.v = u, v
         # The same pixels in cells of the grid.
-        self.cell_u, self.cell_v = ((self.to_image(x) - OFFSET) / STRIDE for x in (u, v))
+        across, down = ((self.to_image(x) - OFFSET) / STRIDE for x in (u[0], v[:, 0]))
+        self.lattice = Lattice(across, down, grid.height, grid.width)
 
     def to_image(self, x: np.ndarray) -> np.ndarray:
         """Coordinates of this level in the full image."""
@@ -71,8 +73,8 @@ class _DenseFlow:
     """A known warp, the dense flow that was left over, and how rough that is."""
 
     level: _Level
-    warp: np.ndarray | None
-    """(gh, gw, 2) on the grid, image pixels."""
+    warp: StartFlow | None
+    """Image pixels, over cells of the grid."""
     rest: np.ndarray
     """On the level's pixels, level pixels."""
 
@@ -81,8 +83,7 @@ class _DenseFlow:
         moved = self.level.step * _sample(self.rest, self.level.from_image(points), outside)
         if self.warp is None:
             return moved
-        cells = (points + moved - OFFSET) / STRIDE
-        return moved + _sample(self.warp, cells, None)
+        return moved + self.warp.at((points + moved - OFFSET) / STRIDE)
 
     def roughness(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p"]:
         """Norm of the gradient of the rest around image points."""
@@ -185,8 +186,8 @@ class ClassicalFlow:
         warp = None
         if start is not None:
             shape = (self.grid.height, self.grid.width, 2)
-            warp = np.clip(start - self._pixels, -1e4, 1e4).reshape(shape).astype(np.float32)
-            dense = _bilinear(warp, level.cell_u, level.cell_v) / level.step
+            warp = StartFlow(np.clip(start - self._pixels, -1e4, 1e4).reshape(shape))
+            dense = warp.on(level.lattice) / level.step
             u, v = level.u + dense[..., 0], level.v + dense[..., 1]
             target = cv2.remap(target, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         target = _match_brightness(target, source)
