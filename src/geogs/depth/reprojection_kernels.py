@@ -66,8 +66,9 @@ def splat_depth(points, confidence, rotation, translation, lens, least, depth, w
 def agree_on_depth(depths, weights, asked, reach, clearance, penalty, best, score):
     """The best of several depths of each pixel that is ``asked`` about, 0 being none, as elsewhere.
 
-    depths, weights (n, h, w); asked (h, w). A depth's score is the sum of weights of those near it (Gaussian,
-    relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of it.
+    depths, weights (n, h, w); asked (h, w). A depth's score is the sum of weights of those near it
+    (Gaussian, relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of
+    it.
     """
     n, h, w = depths.shape
     one = np.float32(1.0)
