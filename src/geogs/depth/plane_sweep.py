@@ -111,7 +111,8 @@ def plane_sweep(
     guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
     small, large = np.float32(SMALL_JUMP), np.float32(LARGE_JUMP)
     contrast = np.float32(JUMP_CONTRAST)
-    totals = np.zeros(volume.shape, np.float32), np.zeros(volume.shape, np.float32)
+    raw.fill(0.0)  # is needed no more, and volumes are what takes most memory here
+    totals = raw, np.zeros_like(raw)
     run_chunks(
         lambda k: kernels.aggregate_paths(
             volume, guide, small, large, contrast, k == 0, totals[k]
