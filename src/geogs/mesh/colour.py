@@ -93,13 +93,16 @@ def add_compiled(
     f, camera, n = np.float32, seen.camera, len(vertices)
     T = np.ascontiguousarray(seen.T_cw.numpy()[:3], np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-    arrays = [np.ascontiguousarray(x.numpy(), np.float32) for x in (vertices, normals)]
-    known = np.ascontiguousarray(seen.depth.numpy(), np.float32), np.ascontiguousarray(seen.image)
-    settings, sums = (f(seen.tolerance), f(SLACK), f(LEAST_COSINE)), (total.numpy(), weight.numpy())
+    places, facing, depth = (
+        np.ascontiguousarray(x.numpy(), np.float32) for x in (vertices, normals, seen.depth)
+    )
+    image, sums, weights = np.ascontiguousarray(seen.image), total.numpy(), weight.numpy()
 
     def some(start: int) -> None:
-        end = min(start + _SPAN, n)
-        add_colours(start, end, *arrays, T, lens, *known, *settings, *sums)
+        add_colours(
+            start, min(start + _SPAN, n), places, facing, T, lens, depth, image,
+            f(seen.tolerance), f(SLACK), f(LEAST_COSINE), sums, weights,
+        )  # fmt: skip
 
     thread_map(some, range(0, n, _SPAN))
 
