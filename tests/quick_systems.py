@@ -18,6 +18,6 @@ def quick_config(**mapping: int) -> Config:
     c = Config()
     small = replace(
         c.mapping, render_long_edge=64, iterations=2,
-        depth=replace(c.mapping.depth, planes=32), **mapping,
+        depth=replace(c.mapping.depth, planes=48), **mapping,
     )  # fmt: skip
     return replace(c, mapping=small, tracking=replace(c.tracking, init_keyframes=6))

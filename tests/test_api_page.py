@@ -16,7 +16,7 @@ FRAMES = 26
 def quick(name: str) -> Config:
     """In place of a preset: few frames, little training."""
     c = Config()
-    depth = replace(c.mapping.depth, planes=32)
+    depth = replace(c.mapping.depth, planes=48)
     mapping = replace(
         c.mapping, render_long_edge=64, iterations=1, final_iterations=5, depth=depth,
         final_depth=False,

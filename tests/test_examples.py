@@ -25,7 +25,7 @@ def script(name: str) -> ModuleType:
 def quick(name: str) -> Config:
     """In place of a preset: few frames, little training."""
     c = preset(name)
-    depth = replace(c.mapping.depth, planes=32)
+    depth = replace(c.mapping.depth, planes=48)
     mapping = replace(c.mapping, render_long_edge=64, iterations=1, final_iterations=0, depth=depth)
     tracking = replace(c.tracking, init_keyframes=5)
     return replace(c, mapping=mapping, tracking=tracking, input=replace(c.input, stop=20))

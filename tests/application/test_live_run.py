@@ -49,7 +49,7 @@ class Onlooker(RunObserver):
 
 def settings(source: str, output: Path) -> RunSettings:
     c = Config()
-    depth = replace(c.mapping.depth, planes=32)
+    depth = replace(c.mapping.depth, planes=48)
     mapping = replace(
         c.mapping, render_long_edge=64, iterations=1, final_iterations=5, depth=depth,
         final_depth=False,

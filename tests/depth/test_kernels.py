@@ -223,12 +223,16 @@ def test_splatting_keeps_the_nearest_and_fills_two_by_two():
 def test_the_best_depth_has_most_votes_and_nothing_in_front():
     depths = np.array([2.0, 2.01, 1.0, 3.0, 0.0], F).reshape(5, 1, 1)
     weights = np.array([0.8, 0.7, 0.9, 0.9, 0.0], F).reshape(5, 1, 1)
-    best, score = np.empty((1, 1), F), np.empty((1, 1), F)
-    reprojection.agree_on_depth(depths, weights, F(0.015), F(0.05), F(0.5), best, score)
+    best, score, settings = np.empty((1, 1), F), np.empty((1, 1), F), (F(0.015), F(0.05), F(0.5))
+    asked = np.ones((1, 1), bool)
+    reprojection.agree_on_depth(depths, weights, asked, *settings, best, score)
     alike = np.exp(-0.5 * (0.01 / 2.01 / 0.015) ** 2)
     assert best[0, 0] in (F(2.0), F(2.01))
     assert abs(score[0, 0] - (0.8 + 0.7 * alike - 0.5 * 0.9)) < 0.01
     nothing = np.zeros_like(depths)
-    reprojection.agree_on_depth(nothing, nothing, F(0.015), F(0.05), F(0.5), best, score)
+    reprojection.agree_on_depth(nothing, nothing, asked, *settings, best, score)
+    assert best[0, 0] == 0
+    assert score[0, 0] == 0
+    reprojection.agree_on_depth(depths, weights, ~asked, *settings, best, score)
     assert best[0, 0] == 0
     assert score[0, 0] == 0

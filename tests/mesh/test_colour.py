@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.mesh.colour import colour_mesh
+from geogs.mesh.colour import _SeenImage, add_compiled, add_reference, colour_mesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 CAMERA = Camera(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -65,3 +65,27 @@ def test_image_of_another_size_lands_on_its_pixels():
     assert (colours[right] == (0, 0, 255)).all()
     middle = colours[np.abs(vertices[:, 0]) < 1e-6]
     assert np.abs(middle.astype(int) - [128, 0, 128]).max() <= 1
+
+
+def test_compiled_colours_are_those_of_the_definition():
+    random = np.random.default_rng(0)
+    n = 20000
+    vertices = torch.from_numpy(random.uniform(-1.5, 1.5, (n, 3)).astype(np.float32))
+    vertices[:, 2] = torch.from_numpy(random.uniform(-0.5, 2.0, n).astype(np.float32))
+    normals = torch.nn.functional.normalize(torch.from_numpy(random.normal(size=(n, 3))).float())
+    depth = torch.from_numpy(random.uniform(0.8, 1.6, (48, 64)).astype(np.float32))
+    image = random.integers(0, 256, (96, 128, 3), np.uint8)
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
+    seen = _SeenImage.of(
+        DepthMapView(depth, torch.ones_like(depth), CAMERA, T, image), 0.2, normals
+    )
+    found = []
+    for add in (add_reference, add_compiled):
+        total, weight = torch.zeros(n, 3), torch.zeros(n)
+        add(seen, vertices, normals, total, weight)
+        found.append((total, weight))
+    (total, weight), (compiled_total, compiled_weight) = found
+    assert int((weight > 0).sum()) > 100
+    torch.testing.assert_close(compiled_weight, weight, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(compiled_total, total, rtol=1e-3, atol=1e-2)

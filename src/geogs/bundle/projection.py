@@ -55,10 +55,16 @@ def seen_from_targets(
 ) -> tuple[Float[Tensor, "*b e p 3"], Bool[Tensor, "*b e p"], Float[Tensor, "*b e p"]]:
     """y = R ray + d t of every cell, whether it lies before the target, and its z.
 
-    Points with a z below ``MIN_Z`` are flagged, and their z is set to that.
+    Points with a z below ``MIN_Z`` are flagged, and their z is set to that. In memory each
+    coordinate of a target's cells is a row: many products of matrices with three columns take ten
+    times as long as one with as many as there are cells.
     """
-    R, t = T_ji[..., :3, :3].to(inverse_depth), T_ji[..., :3, 3].to(inverse_depth)
-    y = rays @ R.mT + inverse_depth[..., None] * t[..., None, :]
+    R, t = T_ji[..., :3, :3].to(inverse_depth), T_ji[..., :3, 3:].to(inverse_depth)
+    if rays.dim() == 2:
+        turned = (R.reshape(-1, 3) @ rays.mT).reshape(*R.shape[:-1], len(rays))
+    else:
+        turned = R @ rays.mT
+    y = torch.addcmul(turned, t, inverse_depth[..., None, :]).mT
     return y, y[..., 2] > MIN_Z, y[..., 2].clamp(min=MIN_Z)
 
 

@@ -88,7 +88,7 @@ class DepthConfig(Settings, group="mapping.depth"):
     weights: Annotated[str, NamesFile()] = ""
     """Weights file of the network; "" takes the one that is found."""
     planes: Annotated[int, Range(2, 256)] = 144
-    """Most planes of inverse depth that are searched, and half of them at least."""
+    """Most planes of inverse depth that are searched, and a third of them at least."""
     bare_planes: bool = True
     """Bare parts of an image, as walls, lie on the planes of what is known around them where the
     search is unsure."""

@@ -61,7 +61,7 @@ def preset(name: Preset, on_gpu: bool = False) -> Config:
             pose_iterations=0,
             final_iterations=400,
             final_depth=False,
-            depth=replace(base.mapping.depth, engine="classical", planes=64),
+            depth=replace(base.mapping.depth, engine="classical", planes=96),
         )
         return replace(
             base,

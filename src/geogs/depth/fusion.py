@@ -97,8 +97,8 @@ def _repair(
         )  # fmt: skip
     best, score = np.empty_like(depth.depth), np.empty_like(depth.depth)
     reach, clearance = np.float32(AGREEMENT_REACH), np.float32(VIOLATION_DISTANCE)
-    agree_on_depth(seen, weight, reach, clearance, np.float32(OCCLUSION_PENALTY), best, score)
-    uncertain = depth.confidence < REPAIR_BELOW
+    uncertain, penalty = depth.confidence < REPAIR_BELOW, np.float32(OCCLUSION_PENALTY)
+    agree_on_depth(seen, weight, uncertain, reach, clearance, penalty, best, score)
     taken = uncertain & (score > REPAIR_VOTES)
     confidence = np.where(taken, np.float32(REPAIR_CONFIDENCE), depth.confidence)
     return KeyframeDepth(np.where(taken, best, depth.depth), confidence)

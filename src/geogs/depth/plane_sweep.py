@@ -13,8 +13,11 @@ from geogs.depth.sampling_kernels import pixel_pairs
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
 
-PLANE_STEP = 0.8
-"""Pixels that the median neighbour moves from plane to plane: no window steps over its match."""
+PLANE_STEP = 1.2
+"""Pixels that the median neighbour moves from plane to plane: no window steps over its match, which
+a parabola and the refinement then find between planes."""
+LEAST_PART = 1 / 3
+"""Part of the most planes that are swept at least, however little the neighbours move."""
 WINDOW = 3
 """Side of the matching window in pixels: small, as like colours are averaged after it."""
 VARIANCE_FLOOR = 1e-5
@@ -58,7 +61,7 @@ def sweep_planes(
     far: float,
     most: int,
 ) -> Float32[np.ndarray, "p"]:
-    """At most so many inverse depths, and at least half of them, equally spaced.
+    """At most so many inverse depths, and at least ``LEAST_PART`` of them, equally spaced.
 
     The median neighbour moves ``PLANE_STEP`` from one to the next.
     """
@@ -75,7 +78,7 @@ def sweep_planes(
         moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
         shifts += [float(np.median(m[s])) for m, s in zip(moved, seen, strict=True) if s.any()]
     steps = np.median(shifts[1:] or shifts) / PLANE_STEP
-    count = int(np.clip(np.ceil(steps), most // 2, most))
+    count = int(np.clip(np.ceil(steps), max(2, int(LEAST_PART * most)), most))
     return np.linspace(1.0 / far, 1.0 / near, count, dtype=np.float32)
 
 
@@ -111,7 +114,8 @@ def plane_sweep(
     guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
     small, large = np.float32(SMALL_JUMP), np.float32(LARGE_JUMP)
     contrast = np.float32(JUMP_CONTRAST)
-    totals = np.zeros(volume.shape, np.float32), np.zeros(volume.shape, np.float32)
+    raw.fill(0.0)  # is needed no more, and volumes are what takes most memory here
+    totals = raw, np.zeros_like(raw)
     run_chunks(
         lambda k: kernels.aggregate_paths(
             volume, guide, small, large, contrast, k == 0, totals[k]

@@ -63,18 +63,19 @@ def splat_depth(points, confidence, rotation, translation, lens, least, depth, w
 
 
 @njit(**_FAST)
-def agree_on_depth(depths, weights, reach, clearance, penalty, best, score):
-    """The best of several depths per pixel, 0 being none.
+def agree_on_depth(depths, weights, asked, reach, clearance, penalty, best, score):
+    """The best of several depths of each pixel that is ``asked`` about, 0 being none, as elsewhere.
 
-    depths, weights (n, h, w). A depth's score is the sum of weights of those near it (Gaussian,
-    relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of it.
+    depths, weights (n, h, w); asked (h, w). A depth's score is the sum of weights of those near it
+    (Gaussian, relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of
+    it.
     """
     n, h, w = depths.shape
     one = np.float32(1.0)
     for y in range(h):
         for x in range(w):
             top, winner = np.float32(0.0), np.float32(0.0)
-            for j in range(n):
+            for j in range(n if asked[y, x] else 0):
                 d = depths[j, y, x]
                 if d <= np.float32(0.0):
                     continue

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -14,6 +15,10 @@ from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread, thread_map
 
 _GREY = 128
+SLACK = 0.02
+"""Part of the depth by which a vertex may be off what a view shows, beside the tolerance."""
+LEAST_COSINE = 0.05
+"""Cosine of the viewing angle from which on a view sees a face's front."""
 _SPAN = 32768
 """Vertices that a thread of the CPU takes at a time."""
 
@@ -52,21 +57,54 @@ def seen_colours(
     """
     total = torch.zeros_like(vertices)
     weight = torch.zeros(len(vertices), device=vertices.device)
-    span = _SPAN if vertices.device.type == "cpu" else max(len(vertices), 1)
+    compiled = vertices.device.type == "cpu" and vertices.dtype == torch.float32
+    add = add_compiled if compiled else add_reference
     for number, view in enumerate(views):
         if view.image is not None:
-            seen = _SeenImage.of(view, tolerance, vertices)
-
-            def add(chunk: int, seen: _SeenImage = seen) -> None:
-                part = slice(chunk * span, (chunk + 1) * span)
-                index, w, colour = seen.observe(vertices[part], normals[part])
-                total[part].index_add_(0, index, w[:, None] * colour)
-                weight[part].index_add_(0, index, w)
-
-            thread_map(add, range(-(-len(vertices) // span)))
+            add(_SeenImage.of(view, tolerance, vertices), vertices, normals, total, weight)
         if progress:
             progress(number + 1, len(views))
     return total / torch.where(weight > 0, weight, 1.0)[:, None], weight > 0
+
+
+def add_reference(
+    seen: "_SeenImage",
+    vertices: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    total: Float[Tensor, "n 3"],
+    weight: Float[Tensor, "n"],
+) -> None:
+    """Add the weighted colours that a view gives, and their weights, in place: on any device."""
+    index, w, colour = seen.observe(vertices, normals)
+    total.index_add_(0, index, w[:, None] * colour)
+    weight.index_add_(0, index, w)
+
+
+def add_compiled(
+    seen: "_SeenImage",
+    vertices: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    total: Float[Tensor, "n 3"],
+    weight: Float[Tensor, "n"],
+) -> None:
+    """As :func:`add_reference`, by compiled loops, for float32 tensors on the CPU."""
+    from geogs.mesh.colour_kernels import add_colours
+
+    f, camera, n = np.float32, seen.camera, len(vertices)
+    T = np.ascontiguousarray(seen.T_cw.numpy()[:3], np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    places, facing, depth = (
+        np.ascontiguousarray(x.numpy(), np.float32) for x in (vertices, normals, seen.depth)
+    )
+    image, sums, weights = np.ascontiguousarray(seen.image), total.numpy(), weight.numpy()
+
+    def some(start: int) -> None:
+        add_colours(
+            start, min(start + _SPAN, n), places, facing, T, lens, depth, image,
+            f(seen.tolerance), f(SLACK), f(LEAST_COSINE), sums, weights,
+        )  # fmt: skip
+
+    thread_map(some, range(0, n, _SPAN))
 
 
 @dataclass(frozen=True)
@@ -77,14 +115,13 @@ class _SeenImage:
     T_cw: Float[Tensor, "4 4"]
     depth: Float[Tensor, "h w"]
     """Infinite where nothing is known."""
-    image: Float[Tensor, "3 ih iw"]
+    image: UInt8[np.ndarray, "ih iw 3"]
     tolerance: float
 
     @staticmethod
     def of(view: DepthMapView, tolerance: float, vertices: Tensor) -> "_SeenImage":
         depth = torch.where(view.valid(), view.depth, torch.inf).to(vertices.device)
-        image = torch.from_numpy(view.rgb()).to(vertices.device).permute(2, 0, 1).float()
-        return _SeenImage(view.camera, view.T_cw.to(vertices), depth, image, tolerance)
+        return _SeenImage(view.camera, view.T_cw.to(vertices), depth, view.rgb(), tolerance)
 
     def observe(
         self, vertices: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
@@ -97,13 +134,14 @@ class _SeenImage:
         inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         index = inside.nonzero()[:, 0]
         depth, z = self.depth[row[index], column[index]], z[index]
-        on_surface = (depth - z).abs() < self.tolerance + 0.02 * z
+        on_surface = (depth - z).abs() < self.tolerance + SLACK * z
         index, z = index[on_surface], z[on_surface]
         ray = torch.nn.functional.normalize(points[index], dim=-1)
         cosine = -(ray * (normals[index] @ self.T_cw[:3, :3].mT)).sum(-1)
-        front = cosine > 0.05
+        front = cosine > LEAST_COSINE
         index, weight = index[front], (cosine[front] / z[front]) ** 2
-        return index, weight, _sample(self.image, self.camera, pixels[index])
+        image = torch.from_numpy(self.image).to(vertices.device).permute(2, 0, 1).float()
+        return index, weight, _sample(image, self.camera, pixels[index])
 
 
 def _sample(

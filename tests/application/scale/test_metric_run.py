@@ -26,7 +26,7 @@ def quick(depth: str) -> Config:
     c = Config()
     mapping = replace(
         c.mapping, render_long_edge=64, iterations=2, pose_iterations=1, final_iterations=10,
-        final_depth=False, depth=replace(c.mapping.depth, planes=32),
+        final_depth=False, depth=replace(c.mapping.depth, planes=48),
     )  # fmt: skip
     return replace(
         c,

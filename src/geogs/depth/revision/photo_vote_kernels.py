@@ -82,8 +82,9 @@ def better_half(costs, count):
 
 
 @njit(**_FAST)
-def pixel_costs(differences, light, most, cost):
-    """How badly the images agree at each pixel, of the grey differences (n, h, w).
+def pixel_costs(differences, light, most, asked, cost):
+    """How badly the images agree at each pixel that is ``asked`` about, of the grey differences
+    (n, h, w); 1 elsewhere.
 
     ``light`` (n) is taken off, and ``most`` (n) counts as 1.
     """
@@ -91,7 +92,7 @@ def pixel_costs(differences, light, most, cost):
     for y in range(cost.shape[0]):
         for x in range(cost.shape[1]):
             count = 0
-            for n in range(differences.shape[0]):
+            for n in range(differences.shape[0] if asked[y, x] else 0):
                 difference = differences[n, y, x]
                 if not np.isnan(difference):
                     costs[count] = min(abs(difference - light[n]) / most[n], ONE)

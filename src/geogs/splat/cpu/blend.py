@@ -18,6 +18,7 @@ from geogs.splat.cpu.layout import (
     ONE,
     OPACITY,
     PER_PIXEL,
+    PLANE,
     SAVED_LAST,
     SAVED_LIGHT,
     SAVED_MOMENT,
@@ -43,7 +44,7 @@ _INLINE = {**PER_PIXEL, "cache": False}
 (
     _X, _Y, _LIGHT, _MOMENT, _NORMAL_X, _NORMAL_Y, _NORMAL_Z, _DISTORTION, _MEDIAN, _LAST,
     _ALPHA, _DEPTH,
-) = (np.uint64(k * TILE_PIXELS) for k in range(12))  # fmt: skip
+) = (np.uint64(k * PLANE) for k in range(12))  # fmt: skip
 BLEND_PLANES = 12
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES

@@ -33,6 +33,7 @@ from geogs.splat.cpu.layout import (
     ONE,
     OPACITY,
     PER_PIXEL,
+    PLANE,
     SAVED_LAST,
     SAVED_LIGHT,
     SAVED_MOMENT,
@@ -58,7 +59,7 @@ _INLINE = {**PER_PIXEL, "cache": False}
     _X, _Y, _LIGHT, _MOMENT, _LAST, _BEHIND, _SIGNS, _SIGNED_Z,
     _D_CONSTANT, _D_Z, _D_NORMAL_X, _D_NORMAL_Y, _D_NORMAL_Z, _D_DISTORTION,
     _ALPHA, _DEPTH, _FREE_DEPTH, _U, _V, _BEND, _BLUR,
-) = (np.uint64(k * TILE_PIXELS) for k in range(21))  # fmt: skip
+) = (np.uint64(k * PLANE) for k in range(21))  # fmt: skip
 UNBLEND_PLANES = 21
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES

@@ -22,6 +22,9 @@ TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 LANES = 16
 """Pixels per run."""
 ROWS_PER_RUN = LANES // TILE_WIDTH
+PLANE = TILE_PIXELS + LANES
+"""Floats from one plane of a tile's state to the next. Were that a power of two, the same pixel of
+all planes would lie in one or two sets of the first cache, and push each other out of it."""
 
 OUTLINE = 10
 """Numbers (float64) that bound the pixels of a disk: an ellipse about MIDDLE and a circle of radius

@@ -11,6 +11,7 @@ from geogs.splat.cpu.blend_backward import UNBLEND_PLANES, unblend_tiles
 from geogs.splat.cpu.layout import (
     GRADIENT,
     OUTLINE,
+    PLANE,
     RECORD,
     SAVED,
     TILE_HEIGHT,
@@ -23,7 +24,7 @@ from geogs.splat.cpu.project_backward import project_disks_backward, sum_pairs
 from geogs.threads import run_chunks
 
 # More chunks than threads, so that threads finish together; neighbouring tiles share a chunk, and
-# with it the disks in the cache.
+# with it the disks in the cache. One thread has nobody to wait for.
 _TILE_CHUNKS_PER_THREAD = 16
 # The pose gradient is summed per chunk, then over chunks: their number must not depend on threads.
 _DISK_CHUNKS = 8
@@ -121,12 +122,12 @@ def rasterize_forward(
     )
     saved = np.empty((tiles if with_trace else 0, SAVED, TILE_PIXELS), np.float32)
     inverse_near = np.float32(1 / near)
-    chunks = threads * _TILE_CHUNKS_PER_THREAD
+    chunks = _tile_chunks(threads)
     run_chunks(
         lambda c: blend_tiles(
             *_span(tiles, c, chunks), records, lists.offsets, lists.disks, lists.runs, inverse_near,
             maps.depth, maps.normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible,
-            saved, _cache_aligned(BLEND_PLANES * TILE_PIXELS),
+            saved, _cache_aligned(BLEND_PLANES * PLANE),
         ),
         chunks, threads,
     )  # fmt: skip
@@ -145,12 +146,12 @@ def rasterize_backward(
     lists, n, tiles = trace.lists, len(trace.parameters[0]), len(trace.lists.offsets) - 1
     gradients = np.empty((len(lists.disks) + 1, GRADIENT), np.float32)
     gradients[-1] = 0
-    chunks = threads * _TILE_CHUNKS_PER_THREAD
+    chunks = _tile_chunks(threads)
     run_chunks(
         lambda c: unblend_tiles(
             *_span(tiles, c, chunks), trace.records, lists.offsets, lists.disks, lists.runs,
             trace.inverse_near, trace.saved, d_depth, d_normal, d_alpha, d_distortion, gradients,
-            _cache_aligned(UNBLEND_PLANES * TILE_PIXELS),
+            _cache_aligned(UNBLEND_PLANES * PLANE),
         ),
         chunks, threads,
     )  # fmt: skip
@@ -222,6 +223,10 @@ def sort_by_depth(records: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         sort_by_digit(keys, order, np.uint32(shift), starts, other_keys, other_order)
         keys, other_keys, order, other_order = other_keys, keys, other_order, order
     return order
+
+
+def _tile_chunks(threads: int) -> int:
+    return 1 if threads == 1 else threads * _TILE_CHUNKS_PER_THREAD
 
 
 def _span(count: int, chunk: int, chunks: int) -> tuple[int, int]:
