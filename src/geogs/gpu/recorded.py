@@ -19,8 +19,8 @@ class Recorded:
     On a GPU it is recorded as a CUDA graph at the second tensors of each set of shapes, and played
     back from then on; before it was done once, libraries have not chosen their kernels, and shapes
     that come but once are not worth it. Elsewhere, and where a driver cannot record it, it is
-    called as it is.
-    Threads and streams may share one: each waits until what another has begun is done.
+    called as it is. Threads and streams may share one: each waits until what another has begun is
+    done.
     """
 
     def __init__(self, work: Callable[..., Maps], name: str) -> None:

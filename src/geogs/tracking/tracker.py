@@ -294,7 +294,7 @@ class Tracker:
             frame.depth is not None and self.segment.is_metric and anchor.measured is None
         )
         seen = motion.flow, motion.overlap, motion.parallax
-        latest = [self.keyframes[k].frame_index for k in self.keyframes.ids[-LATEST:]]
+        latest = (self.keyframes[k].frame_index for k in self.keyframes.ids[-LATEST:])
         ends = is_near_end(frame.left, latest)
         if not (is_first_measured or self._choice.calls_for(*seen, ends)):
             self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)

@@ -47,6 +47,11 @@ class RecordingPlace:
     damaged: int = 0
     """Images among them of which a part is damaged."""
 
+    @property
+    def read(self) -> int:
+        """Images so far."""
+        return self.frames + self.skipped
+
     def after(self, raw: RawFrame) -> "RecordingPlace":
         """The place after one more image, which is logged if it is the first of its faults."""
         if raw.image is None:
@@ -235,7 +240,7 @@ class Source:
         images, former = self._recordings[number], self.place.recordings[:number]
         here = (*self.place.recordings, RecordingPlace())[number]
         index, end = self.place.frames, self.place.time
-        for raw in images.read(here.frames + here.skipped):
+        for raw in images.read(here.read):
             here = here.after(raw)
             if raw.image is None:
                 self.place = ReadingPlace(index, end, (*former, here))
@@ -249,12 +254,10 @@ class Source:
             self.place = ReadingPlace(index + 1, end, (*former, here))
             pose = images.poses.of(raw.timestamp, raw.pose)
             pose = None if pose is None else replace(pose, world=number)
-            left = None
-            if images.length is not None:
-                left = max(0, images.length - here.frames - here.skipped)
+            left = None if images.length is None else max(0, images.length - here.read)
             yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows, left)
             index += 1
-        if short := images.why_short(here.frames + here.skipped, end - here.shift):
+        if short := images.why_short(here.read, end - here.shift):
             _log.warning("%s", short)
         if not here.frames:
             raise InputError(images.why_empty(here.skipped))

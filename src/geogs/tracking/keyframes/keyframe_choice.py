@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -69,13 +69,14 @@ def calls_for_keyframe(
     return parallax >= part * enough or flow >= FARTHEST * more * long_edge
 
 
-def is_near_end(left: int | None, latest: Sequence[int]) -> bool:
+def is_near_end(left: int | None, latest: Iterable[int]) -> bool:
     """Whether too few frames are ``left``, as far as that is known, for another keyframe.
 
     ``latest`` are the numbers of the frames that became the latest keyframes.
     """
-    apart = max((b - a for a, b in itertools.pairwise(latest)), default=0)
-    return left is not None and left < apart
+    if left is None:
+        return False
+    return left < max((b - a for a, b in itertools.pairwise(latest)), default=0)
 
 
 def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
