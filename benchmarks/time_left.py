@@ -21,7 +21,7 @@ from typing import Any, cast, get_args
 
 BEGUN = time.perf_counter()
 if __name__ == "__main__":
-    from geogs.cli.process import take_over
+    from geogs.cli.terminal.process import take_over
 
     take_over()  # as the command does, before NumPy is imported
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from geogs.application.photos import PlacedVideo
+from geogs.application.structure_from_motion.photos import PlacedVideo
 from geogs.geometry.camera import Camera
 from geogs.types import Frame
 from geogs_photos.photo_features import find_features

@@ -36,7 +36,8 @@ def open_photographs(
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
-    What its arguments are, and what it raises: ``geogs.application.photos.open_photographs``.
+    What its arguments are, and what it raises:
+    ``geogs.application.structure_from_motion.photos.open_photographs``.
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     chosen, selection = find_photographs(folder), config.input

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from geogs.application.chosen_frames import ChosenFrames
-from geogs.application.photos import PlacedVideo
+from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
+from geogs.application.structure_from_motion.photos import PlacedVideo
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
@@ -41,7 +41,7 @@ def place_frames(
     seed: int,
     progress: Progress,
 ) -> PlacedVideo:
-    """As asked of it in ``geogs.application.photos.place_frames``."""
+    """As asked of it in ``geogs.application.structure_from_motion.photos.place_frames``."""
     colmap = load_colmap()
     begin = Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.agreement import turn_alike
+from geogs.application.structure_from_motion.agreement import turn_alike
 from geogs.types import Trajectory
 
 

@@ -6,8 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.application import chosen_frames
-from geogs.application.chosen_frames import choose_frames, motion, sharpness, stretch_length
+from geogs.application.structure_from_motion import chosen_frames
+from geogs.application.structure_from_motion.chosen_frames import (
+    choose_frames,
+    motion,
+    sharpness,
+    stretch_length,
+)
 from geogs.types import Frame
 
 WIDE = cv2.GaussianBlur(

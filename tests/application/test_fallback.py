@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geogs.application import fallback, offline_plan, remedy
-from geogs.application.fallback import impossible, is_better, is_wanted
-from geogs.application.offline import PlacedOffline
+from geogs.application import remedy
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
+from geogs.application.structure_from_motion import fallback, offline_plan
+from geogs.application.structure_from_motion.fallback import impossible, is_better, is_wanted
+from geogs.application.structure_from_motion.offline import PlacedOffline
 from geogs.cli.main import main
 from geogs.config import Config, preset, preset_of
 from geogs.io.pose_files import read_tum_trajectory

@@ -15,7 +15,7 @@ from geogs.application.interrupt import Interruption
 from geogs.application.run import run
 from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli
-from geogs.cli.speech import NOT_JUDGED, closing_message
+from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.pose_estimate import PoseEstimate
 from posed_scene import vertices

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application import chosen_frames, offline_plan
+from geogs.application.structure_from_motion import chosen_frames, offline_plan
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory

@@ -257,7 +257,7 @@ def test_a_process_ends_at_once_where_pytorch_was_loaded(argument, code):
 
 def test_garbage_is_looked_for_again_after_the_imports():
     code = (
-        "import gc; from geogs.cli import process; usual = gc.get_threshold()\n"
+        "import gc; from geogs.cli.terminal import process; usual = gc.get_threshold()\n"
         "process.take_over(); kept = [[] for _ in range(480_000)]\n"
         "print(gc.get_threshold() == usual, gc.get_freeze_count())\n"
         "more = [[] for _ in range(40_000)]\n"

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from geogs.application.run_settings import Verbosity
-from geogs.cli.speech import say_loading
+from geogs.cli.terminal.speech import say_loading
 
 
 class Terminal(io.StringIO):

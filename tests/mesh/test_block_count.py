@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.mesh.block_count import fitting_voxel
 from geogs.mesh.extract import VolumePlan, fuse
 from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.mesh.volume.block_count import fitting_voxel
 
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 PLENTY = 10**6

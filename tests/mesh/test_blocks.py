@@ -13,9 +13,9 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.mesh.blocks import blocks_of, boxes_of, mesh_block, sees_box, stitched_blocks
 from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume
-from geogs.mesh.level_set import CHUNK
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BlockBox
+from geogs.mesh.volume.level_set import CHUNK
+from geogs.mesh.volume.tsdf import BlockBox
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=39.5, cy=29.5, width=80, height=60)
 HALF = torch.tensor([1.3, 0.8, 1.1], dtype=torch.float64)

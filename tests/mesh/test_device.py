@@ -8,17 +8,17 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.mesh import clean, face_kernels
-from geogs.mesh.deviation import deviations
-from geogs.mesh.deviation_kernels import triangle_distance
+from geogs.mesh.decimation.deviation import deviations
+from geogs.mesh.decimation.deviation_kernels import triangle_distance
+from geogs.mesh.decimation.device_deviation import surface_distances, triangle_distances
 from geogs.mesh.device import surface
 from geogs.mesh.device.clean import border_edges, device_cleaned, vertex_components
-from geogs.mesh.device.deviation import surface_distances, triangle_distances
 from geogs.mesh.device.surface import device_surface
 from geogs.mesh.device.tensor_mesh import TensorMesh
-from geogs.mesh.free_space import SeenFree
-from geogs.mesh.level_set import extract_surface
 from geogs.mesh.triangle_mesh import Mesh
-from geogs.mesh.tsdf import SparseTsdf
+from geogs.mesh.volume.free_space import SeenFree
+from geogs.mesh.volume.level_set import extract_surface
+from geogs.mesh.volume.tsdf import SparseTsdf
 from surface_shapes import hills
 
 GPU = pytest.param(

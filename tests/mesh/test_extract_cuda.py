@@ -15,12 +15,12 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.map_file import save_map
 from geogs.io.writers.ply_writer import write_splats
-from geogs.mesh import tsdf
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.pixel_planes import PixelPlanes, widest
 from geogs.mesh.triangle_mesh import DepthMapView
-from geogs.mesh.tsdf import SparseTsdf, blocks_seen
+from geogs.mesh.volume import tsdf
+from geogs.mesh.volume.pixel_planes import PixelPlanes, widest
+from geogs.mesh.volume.tsdf import SparseTsdf, blocks_seen
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()

@@ -10,10 +10,10 @@ from geogs.mesh import clean
 from geogs.mesh.clean import keep_faces
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.face_kernels import border_edges
-from geogs.mesh.free_space import FreeSpace, SeenFree
 from geogs.mesh.holes import border_loops, close_holes
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, SparseTsdf
+from geogs.mesh.volume.free_space import FreeSpace, SeenFree
+from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
 
 N = 21
 

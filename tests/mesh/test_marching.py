@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from skimage.measure import marching_cubes
 
-from geogs.mesh.marching import MOST_TRIANGLES, faces, loops_of, march, triangles_of
+from geogs.mesh.volume.marching import MOST_TRIANGLES, faces, loops_of, march, triangles_of
 
 
 def all_seen(shape: tuple[int, ...]) -> np.ndarray:

@@ -10,7 +10,7 @@ from geogs.geometry.camera import Camera
 from geogs.mesh import extract
 from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.mesh.triangle_mesh import DepthMapView
-from geogs.mesh.tsdf import BYTES_PER_BLOCK
+from geogs.mesh.volume.tsdf import BYTES_PER_BLOCK
 
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 

@@ -10,8 +10,8 @@ from geogs.config import MeshConfig
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.pixel_planes import LEAST_BAND, PixelPlanes, widest
 from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.mesh.volume.pixel_planes import LEAST_BAND, PixelPlanes, widest
 
 CAMERA = Camera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
 EYE = torch.eye(4, dtype=torch.float64)

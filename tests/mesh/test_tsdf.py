@@ -10,12 +10,13 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mesh import clean, level_set
+from geogs.mesh import clean
 from geogs.mesh.clean import keep_components, remove_degenerate_faces
 from geogs.mesh.extract import extract_mesh, plan_volume
-from geogs.mesh.level_set import extract_surface
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, SparseTsdf, band_blocks, pack, unpack
+from geogs.mesh.volume import level_set
+from geogs.mesh.volume.level_set import extract_surface
+from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf, band_blocks, pack, unpack
 
 CAMERA = Camera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
 RADIUS = 0.4

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import mutations
-from geogs.application.photos import open_photographs
+from geogs.application.structure_from_motion.photos import open_photographs
 from geogs.config import ReconstructConfig
 from geogs_photos.photograph import find_photographs
 from geogs_photos.poses import FoundPoses, LeftOut

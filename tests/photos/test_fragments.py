@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from geogs.application.chosen_frames import ChosenFrames
+from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame

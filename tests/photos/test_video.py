@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.chosen_frames import ChosenFrames
-from geogs.application.photos import PlacedVideo
+from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
+from geogs.application.structure_from_motion.photos import PlacedVideo
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
 from geogs_photos.localise import Localiser, matches_to_points

@@ -17,7 +17,6 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_cost import OutputForecast
-from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews
 from geogs.application.progress.posed_plan import PosedPlan
 from geogs.application.progress.run_progress import RunProgress
@@ -25,6 +24,7 @@ from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result, Written
 from geogs.application.results.surfaces import Snapshots
 from geogs.application.run_settings import ReconstructSettings
+from geogs.application.structure_from_motion.photos import open_photographs
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded

@@ -2,11 +2,11 @@
 
 import shlex
 
-from geogs.application.fallback import impossible, is_wanted
-from geogs.application.offline_plan import offline_plan
-from geogs.application.photos import has_pycolmap
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
+from geogs.application.structure_from_motion.fallback import impossible, is_wanted
+from geogs.application.structure_from_motion.offline_plan import offline_plan
+from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.config import InputConfig, preset_of
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source

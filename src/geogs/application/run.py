@@ -11,12 +11,10 @@ from geogs.application.checkpoints.run_state import (
     SavedRun,
 )
 from geogs.application.driver import Driver
-from geogs.application.fallback import TrackedOrPlaced
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
-from geogs.application.offline_plan import offline_plan
 from geogs.application.prior_choice import open_prior
 from geogs.application.progress.plan import Plan
 from geogs.application.progress.run_plan import RunPlan
@@ -28,6 +26,8 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
 from geogs.application.slam_in_python import go_on_in
+from geogs.application.structure_from_motion.fallback import TrackedOrPlaced
+from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.tracked_video import TrackedVideo
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
@@ -82,7 +82,10 @@ def run(
         if (plan := _plan(driver, opened)) is not None:
             progress.plan(plan)
         if settings.offline:
-            from geogs.application.offline import PlacedOffline, beginning_with
+            from geogs.application.structure_from_motion.offline import (
+                PlacedOffline,
+                beginning_with,
+            )
 
             told = self_calibrated(opened, config, device, progress, stop)
             told = with_shutter_found(told, progress, stop)

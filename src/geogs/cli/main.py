@@ -10,9 +10,9 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 
-from geogs.cli import process
 from geogs.cli.candidates import ASKED, matching
 from geogs.cli.command import all_commands, find_command
+from geogs.cli.terminal import process
 from geogs.errors import GeogsError
 from geogs.version import __version__
 

@@ -7,7 +7,7 @@ from typing import cast
 
 from geogs.application.run_settings import ReconstructSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.speech import followed, say_loading
+from geogs.cli.terminal.speech import followed, say_loading
 from geogs.config import Preset, reconstruct_preset
 from geogs.gpu.early_start import is_gpu, start_gpu
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 from geogs.application.result_settings import HERE
 from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
-from geogs.cli.speech import followed, say_loading
+from geogs.cli.terminal.speech import followed, say_loading
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs.gpu.early_start import is_gpu, start_gpu
@@ -67,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _keys(options: RunOptions, stop: "Stop") -> AbstractContextManager[bool]:
     """Hears the key q during a live run."""
-    from geogs.cli.quit_key import quit_key
+    from geogs.cli.terminal.quit_key import quit_key
 
     is_live = any(live_address(source) is not None for source in options.source)
     if not is_live or any(str(source) == "-" for source in options.source):

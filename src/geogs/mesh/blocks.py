@@ -16,11 +16,11 @@ from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mesh.clean import cleaned
 from geogs.mesh.extract import VolumePlan, integrate
-from geogs.mesh.free_space import FreeSpace
-from geogs.mesh.level_set import CHUNK, SurfacePart, stitched, surface_parts
-from geogs.mesh.pixel_planes import PixelPlanes, widest
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, blocks_seen, meets_frustum
+from geogs.mesh.volume.free_space import FreeSpace
+from geogs.mesh.volume.level_set import CHUNK, SurfacePart, stitched, surface_parts
+from geogs.mesh.volume.pixel_planes import PixelPlanes, widest
+from geogs.mesh.volume.tsdf import BLOCK, BlockBox, SparseTsdf, blocks_seen, meets_frustum
 from geogs.threads import on_one_torch_thread
 
 

@@ -11,17 +11,17 @@ from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.block_count import fitting, fitting_voxel
 from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
-from geogs.mesh.decimate import merged
+from geogs.mesh.decimation.decimate import merged
 from geogs.mesh.device.clean import device_cleaned
 from geogs.mesh.device.surface import device_surface
 from geogs.mesh.device.tensor_mesh import TensorMesh
-from geogs.mesh.free_space import SeenFree
-from geogs.mesh.level_set import extract_surface
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
+from geogs.mesh.volume.block_count import fitting, fitting_voxel
+from geogs.mesh.volume.free_space import SeenFree
+from geogs.mesh.volume.level_set import extract_surface
+from geogs.mesh.volume.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
 from geogs.threads import on_one_torch_thread
 
 _log = logging.getLogger(__name__)

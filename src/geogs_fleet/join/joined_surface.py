@@ -18,10 +18,10 @@ from geogs.mesh.blocks import (
     stitched_blocks,
 )
 from geogs.mesh.colour import colour_mesh
-from geogs.mesh.decimate import decimate
+from geogs.mesh.decimation.decimate import decimate
 from geogs.mesh.extract import VolumePlan, plan_volume
 from geogs.mesh.triangle_mesh import Mesh
-from geogs.mesh.tsdf import BYTES_PER_BLOCK, BlockBox
+from geogs.mesh.volume.tsdf import BYTES_PER_BLOCK, BlockBox
 from geogs_fleet.join.stored_views import StoredView, equal_runs, loaded
 from geogs_fleet.workers import Workers
 

@@ -25,7 +25,7 @@ from geogs.evaluation.model_view.shown_model import (
 from geogs.evaluation.model_view.start_view import StartView, start_view
 from geogs.evaluation.pages.lengths import lengths
 from geogs.geometry.camera import Camera
-from geogs.mesh.decimate import with_at_most
+from geogs.mesh.decimation.decimate import with_at_most
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import ordered_map, worker_count
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory

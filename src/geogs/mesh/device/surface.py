@@ -7,9 +7,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from geogs.mesh.device.tensor_mesh import TensorMesh
-from geogs.mesh.level_set import least_weight, off_zero
-from geogs.mesh.marching import CORNERS, EDGES, triangle_counts, triangle_table
-from geogs.mesh.tsdf import BLOCK, SparseTsdf
+from geogs.mesh.volume.level_set import least_weight, off_zero
+from geogs.mesh.volume.marching import CORNERS, EDGES, triangle_counts, triangle_table
+from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
 
 _VOXELS = BLOCK**3
 _BATCH = 16384
@@ -30,8 +30,8 @@ class _Cells:
 def device_surface(tsdf: SparseTsdf, min_weight: float) -> TensorMesh:
     """The zero level of a volume without a box, on its device.
 
-    What :func:`geogs.mesh.level_set.extract_surface` gives, with vertices and faces in the order of
-    the volume's blocks.
+    What :func:`geogs.mesh.volume.level_set.extract_surface` gives, with vertices and faces in the
+    order of the volume's blocks.
     """
     above = _blocks_above(tsdf)
     cells = _passed_cells(tsdf, above, min_weight)

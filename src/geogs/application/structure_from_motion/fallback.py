@@ -6,11 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from geogs.application.agreement import turn_alike
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.offline_plan import offline_plan
-from geogs.application.photos import has_pycolmap
 from geogs.application.progress.plan import Plan
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import (
@@ -19,13 +16,16 @@ from geogs.application.results.verdict import (
     Verdict,
 )
 from geogs.application.run_settings import RunSettings
+from geogs.application.structure_from_motion.agreement import turn_alike
+from geogs.application.structure_from_motion.offline_plan import offline_plan
+from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
 from geogs.errors import InputError, TrackingLost
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
 
 if TYPE_CHECKING:
-    from geogs.application.offline import PlacedOffline
+    from geogs.application.structure_from_motion.offline import PlacedOffline
 
 MAX_UNKNOWN = 0.1
 """Part of the frames without a place from which on structure from motion is tried."""
@@ -94,7 +94,7 @@ class TrackedOrPlaced(Work):
             return None
         if not has_pycolmap():
             return None
-        from geogs.application.offline import PlacedOffline, beginning_with
+        from geogs.application.structure_from_motion.offline import PlacedOffline, beginning_with
 
         video = beginning_with(self._opened, self._tracked.source)
         placed = PlacedOffline(settings.config, video, self._tracked.scene.stopwatch)

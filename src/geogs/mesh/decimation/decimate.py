@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.mesh.clean import remove_degenerate_faces
-from geogs.mesh.collapse import CollapsingMesh
-from geogs.mesh.deviation import deviations
-from geogs.mesh.device.deviation import surface_distances
+from geogs.mesh.decimation.collapse import CollapsingMesh
+from geogs.mesh.decimation.deviation import deviations
+from geogs.mesh.decimation.device_deviation import surface_distances
 from geogs.mesh.triangle_mesh import Mesh, vertex_normals
 from geogs.threads import worker_count
 

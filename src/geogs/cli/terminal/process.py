@@ -13,7 +13,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from geogs.application.interrupt import asking, interrupt
-from geogs.cli.streams import make_unbreakable
+from geogs.cli.terminal.streams import make_unbreakable
 
 _IMPORTED = 500_000
 """Objects, more than the imports of a run make: 330,000, and with SciPy and Numba 450,000."""

@@ -33,7 +33,7 @@ def march(
 
     Triangles are counter-clockwise seen from outside. A voxel edge has one vertex.
     """
-    from geogs.mesh.marching_kernels import count_triangles, find_vertices, write_triangles
+    from geogs.mesh.volume.marching_kernels import count_triangles, find_vertices, write_triangles
 
     cells, counts = np.ascontiguousarray(seen), triangle_counts()
     number = np.full((*distance.shape, 3), -1, np.int32)

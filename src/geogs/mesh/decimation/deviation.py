@@ -22,7 +22,7 @@ def deviations(
     """
     from scipy.spatial import cKDTree
 
-    from geogs.mesh.deviation_kernels import faces_around, nearest_faces
+    from geogs.mesh.decimation.deviation_kernels import faces_around, nearest_faces
 
     is_used = np.zeros(len(vertices), bool)
     is_used[faces] = True

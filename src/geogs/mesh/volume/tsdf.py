@@ -15,7 +15,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
-from geogs.mesh.pixel_planes import PixelPlanes
+from geogs.mesh.volume.pixel_planes import PixelPlanes
 from geogs.threads import run_chunks, worker_count
 
 BLOCK = 8
@@ -269,7 +269,7 @@ class SparseTsdf:
         camera: Camera,
     ) -> None:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
-        from geogs.mesh.tsdf_kernels import average_in
+        from geogs.mesh.volume.tsdf_kernels import average_in
 
         corner = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
         block = (corner + projection[:, 3:]).float().mT.contiguous().numpy()

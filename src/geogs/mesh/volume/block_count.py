@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.mesh.pixel_planes import PixelPlanes
 from geogs.mesh.triangle_mesh import DepthMapView
-from geogs.mesh.tsdf import HALF, LIMIT, band_blocks, pack, unpack
+from geogs.mesh.volume.pixel_planes import PixelPlanes
+from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, pack, unpack
 
 COARSER = 1.1
 """Times larger are the voxels that are tried next."""

@@ -109,7 +109,7 @@ class CollapsingMesh:
         """Leave out faces of which two corners were merged."""
         corners, cost = self._corners, self._cost
         if corners.device.type == "cpu":
-            from geogs.mesh.collapse_kernels import squeeze
+            from geogs.mesh.decimation.collapse_kernels import squeeze
 
             left = torch.empty_like(corners), torch.empty_like(cost)
             count = squeeze(*(x.numpy() for x in (corners, cost, *left)))
@@ -141,7 +141,7 @@ class CollapsingMesh:
         """
         count = len(self.position)
         if self._corners.device.type == "cpu":
-            from geogs.mesh.collapse_kernels import rings
+            from geogs.mesh.decimation.collapse_kernels import rings
 
             first, corners = rings(self._corners.numpy(), count)
             return torch.from_numpy(first), torch.from_numpy(corners)
@@ -155,7 +155,7 @@ class CollapsingMesh:
             kernel = kernels_for(_SOURCE, self._corners.device)[name]
             kernel(-(-count // _THREADS), _THREADS, count, *arrays)
             return
-        from geogs.mesh import collapse_kernels
+        from geogs.mesh.decimation import collapse_kernels
 
         loop, given = getattr(collapse_kernels, name), [array.numpy() for array in arrays]
         run_chunks(

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf, pack
+from geogs.mesh.volume.tsdf import BLOCK, LIMIT, SparseTsdf, pack
 
 FREE = 0.5
 """Fraction of the truncation; nearer to a surface than that may be its noise."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.mesh.marching import march
 from geogs.mesh.triangle_mesh import Mesh
-from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
+from geogs.mesh.volume.marching import march
+from geogs.mesh.volume.tsdf import BLOCK, LIMIT, SparseTsdf
 from geogs.threads import ordered_map, worker_count
 
 CHUNK = 16
@@ -39,7 +39,7 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
     through in chunks of 128 voxels that share one layer; a vertex is identified by the voxel edge
     it lies on, so chunks join without seams or double vertices.
 
-    Method: marching cubes (Lorensen and Cline 1987), see :mod:`geogs.mesh.marching`.
+    Method: marching cubes (Lorensen and Cline 1987), see :mod:`geogs.mesh.volume.marching`.
     """
     return stitched(surface_parts(tsdf, min_weight), tsdf.voxel)
 

@@ -8,11 +8,16 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
-from geogs.application.chosen_frames import ChosenFrames, choose_frames
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.offline_plan import offline_config
-from geogs.application.photos import PlacedVideo, localiser, place_frames, seconds_to_place
 from geogs.application.results.verdict import Verdict, verdict
+from geogs.application.structure_from_motion.chosen_frames import ChosenFrames, choose_frames
+from geogs.application.structure_from_motion.offline_plan import offline_config
+from geogs.application.structure_from_motion.photos import (
+    PlacedVideo,
+    localiser,
+    place_frames,
+    seconds_to_place,
+)
 from geogs.config import Config, ReconstructConfig
 from geogs.evaluation.duration import duration
 from geogs.geometry.camera import Camera

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.geometry.neighbors import nearest_neighbors
-from geogs.mesh.deviation import NEAREST
+from geogs.mesh.decimation.deviation import NEAREST
 
 
 def surface_distances(
@@ -14,7 +14,7 @@ def surface_distances(
     faces: Int[Tensor, "m 3"],
     known: Int[Tensor, "k"] | None = None,
 ) -> Float[Tensor, "k"]:
-    """What :func:`geogs.mesh.deviation.deviations` gives; every vertex has to have a face."""
+    """What :func:`geogs.mesh.decimation.deviation.deviations` gives; each vertex needs a face."""
     _, near = nearest_neighbors(points, vertices, NEAREST)
     if known is not None:
         near = torch.cat([near, known[:, None]], 1)

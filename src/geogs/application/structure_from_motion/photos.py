@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from geogs.application.chosen_frames import ChosenFrames
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
+from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

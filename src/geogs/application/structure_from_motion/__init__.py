@@ -1,0 +1,1 @@
+"""Photographs, and videos that tracking cannot follow: placed by structure from motion."""

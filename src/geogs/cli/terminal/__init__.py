@@ -1,0 +1,1 @@
+"""The terminal that a command is given: signals, keys, streams, words."""

@@ -1,0 +1,1 @@
+"""A volume of truncated signed distances, and the triangles of its zero level."""
