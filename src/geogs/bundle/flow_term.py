@@ -192,7 +192,6 @@ def matched_cost(
     p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
 ) -> float:
     """Huber's cost of all matched cells; one behind its target is ``BEHIND`` hubers off."""
-    norm = residual_norms(p, pixels, weight)
-    norm = torch.where(p.valid, norm, torch.full_like(norm, BEHIND * huber))
-    cost = huber_cost(norm.square(), huber) * (weight[..., 0] > 0)
-    return float(cost.sum(dtype=torch.float64))
+    x, y = (weight * (pixels - p.pixels).square()).unbind(-1)
+    cost = huber_cost(torch.where(p.valid, x + y, (BEHIND * huber) ** 2), huber)
+    return float(torch.where(weight[..., 0] > 0, cost, 0.0).sum(dtype=torch.float64))
