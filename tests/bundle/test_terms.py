@@ -47,6 +47,11 @@ class Positions:
             found.append(HyperEdge(frame[None], H, g))
         return found
 
+    def cost(self, state: BundleState) -> float:
+        """Weighted squares of what the centres are off by."""
+        centre = se3_inverse(state.T_cw[self.source])[:, :3, 3]
+        return self.weight * float((centre - self.centre).square().sum())
+
 
 @dataclass(frozen=True)
 class Scales:
@@ -86,6 +91,12 @@ class ScaledPrior:
         known = torch.full_like(prior, self.weight)
         depth = DepthEquations(coupling, known, -known * error, known)
         return HyperEdge(torch.zeros(0, dtype=torch.long), H, g, shared, depth)
+
+    def cost(self, state: BundleState) -> float:
+        """Weighted squares of d - s d_prior."""
+        assert isinstance(state.block, Scales)
+        error = state.inverse_depth - state.block.values[:, None].float() * self.inverse_depth
+        return self.weight * float(error.square().sum())
 
 
 def streamed(p: BundleProblem) -> StreamedProblem:

@@ -1,6 +1,7 @@
 """The least-squares loop: which steps it takes, and when it ends."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,31 @@ def test_equations_without_a_solution_are_the_end_or_damped(retries):
     assert found.finite == retries
     assert found.steps == int(retries)
     assert asked == pytest.approx([1e-3, 1e-2, 1e-1, 1.0] if retries else [1e-3])
+
+
+def test_equations_that_never_have_a_solution_are_said_to_have_none():
+    policy = Policy(max_steps=1, damping=1e-3, max_damping=1e3, retries_unsolvable=True)
+    start = np.array([-1.2, 1.0])
+    found = minimise(start, linearise, lambda *_: None, policy, cost)
+    assert not found.finite
+    assert found.steps == 0
+    assert found.state is start
+
+
+def test_a_small_step_is_the_last_one_that_lowers_the_cost():
+    start = np.array([-1.2, 1.0])
+    every = minimise(start, linearise, step, LEVENBERG, cost)
+    sizes = []
+
+    def seen(x, linear, damping):
+        sizes.append(step(x, linear, damping))
+        return sizes[-1]
+
+    found = minimise(start, linearise, seen, replace(LEVENBERG, tolerance=0.05), cost)
+    assert 0 < found.steps < every.steps
+    assert sizes[-1].state is found.state
+    assert sizes[-1].size < 0.05
+    assert found.cost == cost(found.state, None) < cost(start, None)
 
 
 def test_steps_that_are_refused_count_where_trials_do():

@@ -1,6 +1,7 @@
 """The adjustment of parts against one of everything."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,11 +90,14 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     assert {(a // 4, b // 4) for a, b in graph.edges} == {
         (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2
     }
-    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, GLOBAL_OPTIONS)
+    # Of all parts together nobody asks what a step is worth.
+    plain = replace(GLOBAL_OPTIONS, least_damping=None)
+    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, plain)
     for n in range(3):
         wanted = segment.poses([ids[n, place] for place in range(4)])
         moved = float((wanted - placements[n].T_cw).abs().max())
-        assert float((found[n].T_cw - wanted).abs().max()) < 1e-3 * moved + 1e-7
+        # Sums are in another order: so little damped, weak directions show their rounding.
+        assert float((found[n].T_cw - wanted).abs().max()) < 5e-3 * moved + 1e-7
     assert torch.allclose(found[0].T_cw[0], placements[0].T_cw[0], rtol=0, atol=1e-12)
 
 

@@ -1,5 +1,7 @@
 """The specification of one step of dense bundle adjustment: slow, dense, float64, by autograd."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -45,6 +47,40 @@ def motion_residuals(problem: BundleProblem, xi: Tensor) -> Float[Tensor, "m 6"]
         se3_log(T[j] @ se3_inverse(T[i]) @ se3_inverse(measured))
         for i, j, measured in zip(m.source.tolist(), m.target.tolist(), m.T_ts, strict=True)
     ])  # fmt: skip
+
+
+def robust_cost(problem: BundleProblem, camera: Camera, rays: Tensor, huber: float) -> float:
+    """Twice what is minimised: rho of every matched cell, number by number.
+
+    rho(s) of a squared residual s in variances is s up to Huber's knee k, then 2 k sqrt(s) - k^2; a
+    cell behind its target is 10 k off. Depths that were measured have a knee of 3 deviations, and
+    motions Cauchy's loss c^2 log(1 + s / c^2), c = 3.
+    """
+
+    def rho(deviations: float, knee: float) -> float:
+        if deviations <= knee:
+            return deviations**2
+        return 2 * knee * deviations - knee**2
+
+    total = 0.0
+    T, d = problem.T_cw, problem.inverse_depth.double()
+    for e in range(len(problem.source)):
+        i, j = int(problem.source[e]), int(problem.target[e])
+        at, seen = reproject(camera, rays.double(), T[j] @ se3_inverse(T[i]), d[i])
+        for p in range(len(at)):
+            if problem.weight[e, p, 0] > 0:
+                r = problem.pixels[e, p].double() - at[p]
+                off = float((problem.weight[e, p].double() * r * r).sum()) ** 0.5
+                total += rho(off if seen[p] else 10 * huber, huber)
+    for term in problem.depth_terms:
+        if isinstance(term, MeasuredDepths):
+            off = term.information.double().sqrt() * (term.inverse_depth.double() - d).abs()
+            total += sum(rho(x, 3.0) for x in off.reshape(-1).tolist())
+    if problem.pose_terms:
+        e = motion_residuals(problem, torch.zeros(len(T), 6, dtype=torch.float64))
+        square = (problem.pose_terms[0].information * e * e).sum(-1)
+        total += sum(9 * math.log(1 + s / 9) for s in square.tolist())
+    return total
 
 
 def gauss_newton_step(

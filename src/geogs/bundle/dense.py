@@ -74,6 +74,15 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
             self.residual = torch.cat([source.residual for source in sources])
         return LinearBundle(state, system, sources)
 
+    def flow_cost(self, state: BundleState) -> float:
+        """Chunks of edges side by side."""
+        problem, options = self.problem, self.options
+
+        def work(chunk: slice) -> float:
+            return self.flow.cost(problem.part(chunk), state, options.huber)
+
+        return sum(thread_map(work, source_chunks(problem.source, options.chunk)))
+
     def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
         """By Cholesky's method; shared unknowns move by no more than they may at once."""
         step, block = linear.system.solve(damping, self.floor), linear.state.block

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
 from geogs.bundle.terms import BundleState
-from geogs.geometry.robust import huber_weight
+from geogs.geometry.robust import huber_cost, huber_weight
 
 MEASURED_HUBER = 3.0
 """Deviations of a measured depth beyond which it counts linearly. Matches have a smaller knee: they
@@ -31,6 +31,10 @@ class DepthDamping:
         """As in the protocol."""
         return of_depths(DepthEquations.alone(self.curvature[frame]))
 
+    def cost(self, state: BundleState) -> float:
+        """None: it resists each step, wherever it begins."""
+        return 0.0
+
 
 @dataclass(frozen=True)
 class MeasuredDepths:
@@ -47,6 +51,11 @@ class MeasuredDepths:
         norm = information.sqrt() * residual.abs()
         curvature = information * huber_weight(norm, MEASURED_HUBER)
         return of_depths(DepthEquations.alone(curvature, curvature * residual, curvature))
+
+    def cost(self, state: BundleState) -> float:
+        """As in the protocol, by Huber's cost."""
+        square = self.information * (self.inverse_depth - state.inverse_depth).square()
+        return float(huber_cost(square, MEASURED_HUBER).sum(dtype=torch.float64))
 
 
 def of_depths(depth: DepthEquations) -> HyperEdge:

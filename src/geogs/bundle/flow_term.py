@@ -15,12 +15,16 @@ from torch import Tensor
 
 from geogs.bundle.hyper_edge import DepthEquations, HyperEdge, RelativeEdges
 from geogs.bundle.problem import BundleProblem, sources_within
-from geogs.bundle.projection import CellProjection, linearise, relative_motion
+from geogs.bundle.projection import CellProjection, linearise, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_adjoint
-from geogs.geometry.robust import huber_weight
+from geogs.geometry.robust import huber_cost, huber_weight
+
+BEHIND = 10.0
+"""By how many of Huber's knees a cell counts as off whose target sees it from behind. No step is
+drawn by that, and none is taken that brings many there."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,10 @@ class FlowTerm(Protocol):
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
         """The sources of all edges, in order."""
+        ...
+
+    def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
+        """Twice what is minimised: :func:`matched_cost` of all edges."""
         ...
 
 
@@ -85,6 +93,13 @@ class PinholeFlow:
             block, g = torch.block_diag(*H[e]), v[e].reshape(-1)
             edges = RelativeEdges(poses, block, g, depth=depth, adjoint=adjoint[e])
             yield SourceFlow(frame, edges, residual[e])
+
+    def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
+        """As in the protocol."""
+        i = problem.source
+        T_ji = relative_motion(state.T_cw, i, problem.target)
+        p = project(self.camera, self.rays, T_ji, state.inverse_depth[i])
+        return matched_cost(p, problem.pixels, problem.weight, huber)
 
     def depths_after(
         self,
@@ -171,3 +186,12 @@ def residual_norms(
 ) -> Float[Tensor, "e p"]:
     """Norm of each residual in its own standard deviations."""
     return (weight * (pixels - p.pixels).square()).sum(-1).sqrt()
+
+
+def matched_cost(
+    p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
+) -> float:
+    """Huber's cost of all matched cells; one behind its target is ``BEHIND`` hubers off."""
+    x, y = (weight * (pixels - p.pixels).square()).unbind(-1)
+    cost = huber_cost(torch.where(p.valid, x + y, (BEHIND * huber) ** 2), huber)
+    return float(torch.where(weight[..., 0] > 0, cost, 0.0).sum(dtype=torch.float64))

@@ -221,6 +221,9 @@ class _ThinnedTerm:
         assert edges.depth is not None
         return replace(edges, depth=edges.depth.on_cells(self.cells))
 
+    def cost(self, state: BundleState) -> float:
+        return self.term.cost(self.state)
+
 
 def _pose_covariance(
     problem: AnyProblem, part: _Thinned, options: BundleOptions

@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.bundle.hyper_edge import HyperEdge, RelativeEdges
 from geogs.bundle.terms import BundleState
 from geogs.geometry.lie import se3_adjoint, se3_inverse, se3_left_jacobian, se3_log
-from geogs.geometry.robust import cauchy_weight
+from geogs.geometry.robust import cauchy_cost, cauchy_weight
 
 KNEE = 3.0
 """Deviations (of all six numbers together) at which a motion counts half as much. What lies far
@@ -49,6 +49,11 @@ class MeasuredMotions:
         J = torch.linalg.inv(se3_left_jacobian(e))
         JW = J.mT * (self.robust_weight(e)[:, None] * self.information)[:, None]
         return se3_adjoint(present), JW @ J, -(JW @ e[..., None])[..., 0]
+
+    def cost(self, state: BundleState) -> float:
+        """As in the protocol, by Cauchy's loss."""
+        square = (self.information * self.residual(state.T_cw).square()).sum(-1)
+        return float(KNEE**2 * cauchy_cost(square / KNEE**2).sum())
 
     def hyper_edges(self, state: BundleState) -> list[HyperEdge]:
         """As in the protocol: one for each motion."""

@@ -1,7 +1,7 @@
 """What the tracker asks of whatever adjusts, on either device."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Float
@@ -9,9 +9,18 @@ from torch import Tensor
 
 from geogs.bundle.problem import MotionProblem, Problem
 from geogs.bundle.terms import SharedBlock
+from geogs.geometry.least_squares import Policy
 from geogs.world.keyframes import Keyframe
 
 P = TypeVar("P", bound=Problem, contravariant=True)
+
+MAX_DAMPING = 1.0
+"""Most that a step of Levenberg and Marquardt's is damped by, relative to the diagonal."""
+TRIALS = 2
+"""Steps that are tried for each that may be taken."""
+COST_ROUNDING = 1e-6
+"""By this part of itself a cost may be off, as pixels are float32: a step that seems to raise it by
+less says that there is nothing left to gain."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +31,11 @@ class BundleOptions:
     huber: float = 3.0
     """Standard deviations beyond which a residual counts linearly."""
     damping: float = 1e-4
-    """Levenberg damping relative to the diagonal of the reduced system."""
+    """Levenberg damping relative to the diagonal of the reduced system, at the start."""
+    least_damping: float | None = None
+    """None: all steps are taken, damped alike (Gauss and Newton). Else Levenberg and Marquardt's
+    method: only steps that lower the cost are taken, and damping falls tenfold with each, but no
+    further than this; with each other, and where the equations have no solution, it rises."""
     depth_damping: float = 1e-3
     """Damping of inverse depth relative to the mean curvature of its frame."""
     chunk: int = 24
@@ -31,7 +44,27 @@ class BundleOptions:
     max_inverse_depth: float = 1e2
     tolerance: float = 0.0
     """A step that moves no pose by this much (units, radians) is the last one; the dense solver of
-    a GPU does not wait for that."""
+    a GPU waits for that only where it waits for the cost."""
+
+    @property
+    def lowers_cost(self) -> bool:
+        """Whether only steps that lower the cost are taken."""
+        return self.least_damping is not None
+
+    @property
+    def policy(self) -> Policy:
+        """The steps as the least-squares loop is told them."""
+        plain = Policy(self.iterations, self.damping, self.tolerance)
+        if self.least_damping is None:
+            return plain
+        return replace(
+            plain,
+            max_trials=TRIALS * self.iterations,
+            max_damping=MAX_DAMPING,
+            least_damping=self.least_damping,
+            retries_unsolvable=True,
+            stall=COST_ROUNDING,
+        )
 
 
 @dataclass(frozen=True)
@@ -55,9 +88,10 @@ class BundleSolver(Protocol[P]):
     """What adjusts one kind of problem."""
 
     def solve(self, problem: P, options: BundleOptions) -> BundleResult:
-        """Take ``options.iterations`` damped Gauss-Newton steps, or fewer (``tolerance``).
+        """Take ``options.iterations`` damped steps, or fewer (``tolerance``, ``least_damping``).
 
-        A step that is not finite is not taken, and ``finite`` is False in the result.
+        A step that is not finite is not taken; where the last one was not, ``finite`` is False in
+        the result.
         """
         ...
 

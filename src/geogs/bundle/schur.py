@@ -14,7 +14,7 @@ from torch import Tensor
 from geogs.bundle.problem import Problem
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
-from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.least_squares import Step, minimise
 from geogs.geometry.lie import move
 
 P = TypeVar("P", bound=Problem)
@@ -44,6 +44,16 @@ class SchurBundle(ABC, Generic[P, L]):
     ) -> Float[Tensor, "n p"]:
         """Steps of the free inverse depths that go with that of all else."""
 
+    @abstractmethod
+    def flow_cost(self, state: BundleState) -> float:
+        """Twice what is minimised of the matches."""
+
+    def cost(self, state: BundleState, linear: L | None = None) -> float:
+        """Twice what is minimised, in variances of the measurements."""
+        terms = sum(term.cost(state) for term in self.problem.depth_terms)
+        terms += sum(term.cost(state) for term in self.problem.pose_terms)
+        return self.flow_cost(state) + terms
+
     def step(self, state: BundleState, linear: L, damping: float) -> Step[BundleState] | None:
         """As the loop asks for it."""
         step = self.solve_cameras(linear, damping)
@@ -59,10 +69,10 @@ class SchurBundle(ABC, Generic[P, L]):
         return Step(BundleState(T, d, block), float(xi.abs().max()))
 
     def adjusted(self) -> BundleResult:
-        """Gauss-Newton steps from where the problem begins."""
+        """Steps from where the problem begins."""
         o = self.options
-        policy = Policy(o.iterations, o.damping, o.tolerance)
-        solution = minimise(self.problem.start, self.linearise, self.step, policy)
+        cost = self.cost if o.lowers_cost else None
+        solution = minimise(self.problem.start, self.linearise, self.step, o.policy, cost)
         s = solution.state
         return BundleResult(
             s.T_cw, s.inverse_depth, self.information, self.residual, solution.finite, s.block

@@ -24,7 +24,7 @@ from geogs.bundle.flow_term import (
     SourceFlow,
     damped_curvature,
     edge_residual,
-    residual_norms,
+    matched_cost,
     weighed_residuals,
 )
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
@@ -34,7 +34,6 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState, ProjectingBlock
 from geogs.geometry.least_squares import Policy, minimise
 from geogs.geometry.lie import se3_adjoint, se3_inverse
-from geogs.geometry.robust import huber_cost
 
 B = TypeVar("B", bound=ProjectingBlock)
 
@@ -122,24 +121,19 @@ class SharedSchur(DenseSchur):
         return linear
 
     def cost(self, state: BundleState, linear: LinearBundle | None = None) -> float:
-        """Mean of Huber's cost over matched cells; one behind its target is 10 hubers off.
-
-        Infinite where nothing is matched.
-        """
-        p, huber, source = self.problem, self.options.huber, self.problem.source
-        block = cast(ProjectingBlock, state.block)
-        at = block.project(state.T_cw, source, p.target, state.inverse_depth[source])
-        norm = residual_norms(at, p.pixels, p.weight)
-        norm = torch.where(at.valid, norm, torch.full_like(norm, 10 * huber))
-        cost = huber_cost(norm.square(), huber)
-        matched = p.weight[..., 0] > 0
-        if not bool(matched.any()):
-            return math.inf
-        return float((cost * matched).sum(dtype=torch.float64) / matched.sum())
+        """Mean over the matched cells; infinite where nothing is matched."""
+        matched = int((self.problem.weight[..., 0] > 0).sum())
+        return super().cost(state) / matched if matched else math.inf
 
 
 class SharedFlow:
     """Dense flow whose projections depend on shared unknowns."""
+
+    def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
+        """As in the protocol."""
+        source, block = problem.source, cast(ProjectingBlock, state.block)
+        p = block.project(state.T_cw, source, problem.target, state.inverse_depth[source])
+        return matched_cost(p, problem.pixels, problem.weight, huber)
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions

@@ -69,6 +69,14 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
             for source in sources:
                 self.information[source.frame] = source.information
 
+    def flow_cost(self, state: BundleState) -> float:
+        """Chunk by chunk, several side by side."""
+
+        def work(chunk: slice) -> float:
+            return self.flow.cost(self.problem.part(chunk), state, self.options.huber)
+
+        return sum(_few_at_a_time(work, self.chunks))
+
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
         """By the Cholesky factor of a band."""
         return linear.solve(damping, FLOOR)

@@ -46,6 +46,10 @@ class DepthTerm(Protocol):
         """The residuals of a frame linearised, with equations of its depths."""
         ...
 
+    def cost(self, state: BundleState) -> float:
+        """Twice what is minimised of all frames: their squared residuals, as far as they count."""
+        ...
+
 
 @runtime_checkable
 class PoseTerm(Protocol):
@@ -63,6 +67,10 @@ class PoseTerm(Protocol):
 
     def hyper_edges(self, state: BundleState) -> Sequence[HyperEdge]:
         """The residuals linearised."""
+        ...
+
+    def cost(self, state: BundleState) -> float:
+        """Twice what is minimised: the squared residuals, as far as they count."""
         ...
 
 

@@ -40,7 +40,7 @@ class Policy:
     damping: float = 0.0
     """At the start."""
     tolerance: float = 0.0
-    """A step of a smaller size is the last one."""
+    """A step of a smaller size that is taken is the last one."""
 
     max_trials: int = sys.maxsize
     """Steps that are taken, or not."""
@@ -77,7 +77,7 @@ class Solution(Generic[S, L]):
     steps: int
     """Taken."""
     finite: bool
-    """Whether all equations had a solution, or were damped until they had."""
+    """Whether the last equations had a solution, or were damped until they had."""
 
 
 def minimise(
@@ -102,6 +102,7 @@ def minimise(
     linear: L | None = None
     before = after = math.nan
     steps = trials = 0
+    finite = True
     while steps < policy.max_steps and trials < policy.max_trials and damping <= policy.max_damping:
         if linear is None:
             linear = linearise(state)
@@ -109,8 +110,9 @@ def minimise(
             before = cost(state, linear)
         trials += 1
         found = step(state, linear, damping)
-        if found is None and not policy.retries_unsolvable:
-            return Solution(state, linear, before, steps, finite=False)
+        finite = found is not None
+        if not finite and not policy.retries_unsolvable:
+            break
         if cost is not None:
             after = math.inf if found is None else cost(found.state, linear)
             if found is not None and not after < before and after - before <= policy.stall * before:
@@ -119,8 +121,9 @@ def minimise(
             damping = max(damping, policy.least_raised) * 10
             continue
         state, linear, steps = found.state, None, steps + 1
+        is_last = found.size < policy.tolerance
         if cost is None:
-            if found.size < policy.tolerance:
+            if is_last:
                 break
             continue
         damping = max(damping / 10, policy.least_damping)
@@ -130,6 +133,6 @@ def minimise(
             after = cost(state, linear)
         reference = after if policy.is_of_new_cost else before
         before = after
-        if gain <= policy.least_decrease * reference or after < policy.enough:
+        if is_last or gain <= policy.least_decrease * reference or after < policy.enough:
             break
-    return Solution(state, linear, before, steps, finite=True)
+    return Solution(state, linear, before, steps, finite)

@@ -29,6 +29,11 @@ def cauchy_weight(square: A) -> A:
     return 1 / (1 + square)
 
 
+def cauchy_cost(square: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Cauchy's cost ``log(1 + square)``."""
+    return torch.log1p(square)
+
+
 def geman_mcclure_weight(square: A) -> A:
     """Geman and McClure's weight ``1 / (1 + square)^2``."""
     return 1 / (1 + square) ** 2

@@ -26,11 +26,13 @@ PRIORS_TOGETHER = 32
 """Keyframes whose depths are adjusted with their priors at a time; bounds memory."""
 CONVERGED = 0.02
 """The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
-GLOBAL_OPTIONS = BundleOptions(iterations=10, huber=HUBER, damping=1e-6, tolerance=1e-5)
+GLOBAL_OPTIONS = BundleOptions(
+    iterations=10, huber=HUBER, damping=1e-6, least_damping=1e-8, depth_damping=1e-5, tolerance=1e-5
+)
 """How each round is solved; it ends with a step that moves no pose by more, in units and radians.
 A drift of scale along many keyframes has a curvature far below 1e-4 of the diagonal, the less the
-more they are: with the usual damping the steps end long before it is gone (docs/tracking.md,
-section 4)."""
+more they are, and carries all depths along: with the usual damping of either the steps end long
+before it is gone (docs/tracking.md, section 4)."""
 
 
 def global_bundle(

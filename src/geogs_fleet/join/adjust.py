@@ -22,7 +22,7 @@ from geogs.bundle.streamed import StreamedSchur
 from geogs.bundle.terms import BundleState
 from geogs.config import Config
 from geogs.geometry.camera import Camera
-from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.least_squares import Step, minimise
 from geogs.geometry.lie import move
 from geogs.loop.global_bundle import CONVERGED, GLOBAL_OPTIONS, ROUNDS
 from geogs.threads import on_one_torch_thread
@@ -151,10 +151,9 @@ class _Adjustment:
 
     def solve(self) -> None:
         """Gauss-Newton steps until they are small, and the depths after the last of them."""
-        options = GLOBAL_OPTIONS
-        policy = Policy(options.iterations, options.damping, options.tolerance)
         poses = _AllPoses(self)
-        found = minimise(_Poses(self.poses()), poses.linearise, poses.step, policy)
+        # What a step is worth nobody asks: that would be one more way through all files.
+        found = minimise(_Poses(self.poses()), poses.linearise, poses.step, GLOBAL_OPTIONS.policy)
         if found.finite:
             self.follow(found.state, is_last=True)
 

@@ -11,11 +11,16 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, joined_edges
+from geogs.bundle.cuda.linear_edges import (
+    EdgeArrays,
+    LinearisedEdges,
+    edge_costs,
+    joined_edges,
+)
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.protocols import BundleOptions, BundleResult
-from geogs.bundle.terms import BundleState
-from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.bundle.terms import BundleState, SharedBlock
+from geogs.geometry.least_squares import Step, minimise
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device, upload_indices
 from geogs.world.grid import SampleGrid
@@ -111,45 +116,75 @@ class _Cameras:
         self.blocks, self.vectors = like.new_empty(144 * pairs), like.new_empty(12 * pairs)
 
 
+@dataclass(frozen=True)
+class _State:
+    """What is adjusted, on the device."""
+
+    memory: Float[Tensor, "m"]
+    """Poses and the sign of failure, which travel back together."""
+    inverse_depth: Float[Tensor, "n p"]
+    block: SharedBlock | None
+
+    @staticmethod
+    def at_start(problem: BundleProblem) -> "_State":
+        """Where the adjustment begins."""
+        d, T = problem.inverse_depth, problem.T_cw
+        memory = torch.zeros(T.numel() + 1, dtype=torch.float64, device=d.device)
+        memory[:-1].copy_(to_device(T.reshape(-1), d.device))
+        return _State(memory, d, problem.block)
+
+    @property
+    def T(self) -> Float[Tensor, "m"]:
+        """Poses."""
+        return self.memory[:-1]
+
+    @property
+    def failed(self) -> Int[Tensor, "2"]:
+        """Not zero once a step was not finite."""
+        return self.memory[-1:].view(torch.int32)
+
+    @property
+    def everything(self) -> BundleState:
+        """As terms see it."""
+        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth, self.block)
+
+    @property
+    def with_poses_here(self) -> BundleState:
+        """As terms of poses see it; waits."""
+        return BundleState(self.T.reshape(-1, 4, 4).cpu(), self.inverse_depth, self.block)
+
+    def copy(self) -> "_State":
+        """For a step to change."""
+        return _State(self.memory.clone(), self.inverse_depth.clone(), self.block)
+
+
 class _Workspace:
-    """What one solve keeps on the device, the state that is adjusted among it."""
+    """What one solve keeps on the device beside the state that is adjusted."""
 
     def __init__(
         self, problem: BundleProblem, structure: _Structure, kernels: Mapping[str, Kernel]
     ) -> None:
-        d, frames = problem.inverse_depth, structure.frames
+        d = problem.inverse_depth
         self.structure = structure
-        # Poses and the sign of failure travel back together.
-        self.memory = torch.zeros(16 * frames + 1, dtype=torch.float64, device=d.device)
-        self.memory[: 16 * frames].copy_(to_device(problem.T_cw.reshape(-1), d.device))
-        self.T = self.memory[: 16 * frames]
-        self.failed = self.memory[16 * frames :].view(torch.int32)
-        self.inverse_depth, self.delta = d.clone(), d.new_empty(d.numel())
+        self.delta = d.new_empty(d.numel())
         self.edges = LinearisedEdges(kernels, structure.edges, d)
-        self.cameras = _Cameras(structure, self.memory)
-        self.depth_terms, self.block = KernelDepthTerms.of(problem.depth_terms), problem.block
-
-    @property
-    def state(self) -> BundleState:
-        """What is adjusted, where it is."""
-        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth, self.block)
+        self.cameras = _Cameras(structure, d.new_empty(0, dtype=torch.float64))
+        self.depth_terms = KernelDepthTerms.of(problem.depth_terms)
 
 
-def _add_pose_terms(w: _Workspace, problem: BundleProblem, damping: float) -> None:
+def _add_pose_terms(c: _Cameras, state: _State, problem: BundleProblem, damping: float) -> None:
     """Add what is said of poses alone to the assembled camera system, which waits for them."""
     if not problem.pose_terms:
         return
     poses = DenseCameraSystem(problem.free_pose.cpu())
-    state = BundleState(w.T.reshape(-1, 4, 4).cpu(), problem.inverse_depth)
     for term in problem.pose_terms:
-        poses.add(term.hyper_edges(state))
+        poses.add(term.hyper_edges(state.with_poses_here))
     hessian = poses.hessian[poses.free[:, None], poses.free]
     # Of the system on the device only the lower blocks are in use.
     diagonal = hessian.diagonal()
     diagonal += damping * diagonal.abs()
     added = torch.cat([hessian, poses.gradient[poses.free][None]])
-    system = w.cameras.system
-    system += to_device(added.reshape(-1), system.device)
+    c.system += to_device(added.reshape(-1), c.system.device)
 
 
 class CudaDenseBundle:
@@ -169,17 +204,22 @@ class CudaDenseBundle:
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         """As in the protocol; poses are returned where they were given.
 
-        Whether a step is small nobody waits for, so that ``tolerance`` plays no part.
+        Where steps need not lower the cost nobody waits for one to end, be it small
+        (``tolerance``) or not finite.
         """
         device = problem.inverse_depth.device
         w = _Workspace(problem, self._structure_of(problem, device), self.kernels)
-        steps = _DenseSteps(self, problem, options)
-        policy = Policy(options.iterations, options.damping)
-        minimise(w, steps.linearise, steps.step, policy)
-        memory = w.memory.cpu()
+        steps = _DenseSteps(self, problem, options, w)
+        cost = steps.cost if options.lowers_cost else None
+        found = minimise(
+            _State.at_start(problem), steps.linearise, steps.step, options.policy, cost
+        )
+        memory = found.state.memory.cpu()
         T = memory[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
-        finite = int(memory[-1:].view(torch.int32)[0]) == 0
-        return BundleResult(T, w.inverse_depth, w.edges.information, w.edges.residual, finite)
+        finite = found.finite and int(memory[-1:].view(torch.int32)[0]) == 0
+        return BundleResult(
+            T, found.state.inverse_depth, w.edges.information, w.edges.residual, finite
+        )
 
     def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
         """That of the last problem, if it is the same: edges are adjusted in rounds."""
@@ -191,30 +231,53 @@ class CudaDenseBundle:
 
 
 class _DenseSteps:
-    """One adjustment as the least-squares loop sees it; the workspace is changed in place."""
+    """One adjustment as the least-squares loop sees it; what is linearised is in the workspace."""
 
     def __init__(
-        self, bundle: CudaDenseBundle, problem: BundleProblem, options: BundleOptions
+        self,
+        bundle: CudaDenseBundle,
+        problem: BundleProblem,
+        options: BundleOptions,
+        workspace: _Workspace,
     ) -> None:
         self.grid, self.problem, self.options = bundle.grid, problem, options
         self.kernels, self.solvers = bundle.kernels, bundle.solvers
         self.matches = problem.pixels.contiguous(), problem.weight.contiguous()
+        self.workspace = workspace
 
-    def linearise(self, state: _Workspace) -> None:
-        """Edges, summed up by source."""
-        w, terms = state, state.depth_terms
+    def linearise(self, state: _State) -> bool:
+        """Edges, summed up by source; that they are."""
+        w = self.workspace
         w.edges.fill(
-            self.grid, w.T, w.inverse_depth, self.matches, self.options, terms,
-            range(w.structure.frames), w.state,
+            self.grid, state.T, state.inverse_depth, self.matches, self.options, w.depth_terms,
+            range(w.structure.frames), state.everything,
         )  # fmt: skip
+        return True
 
-    def step(self, state: _Workspace, linear: None, damping: float) -> Step[_Workspace]:
+    def step(self, state: _State, linear: bool, damping: float) -> Step[_State] | None:
         """All moves on the device, which keeps in mind whether one was not finite."""
         self._solve_cameras(state, damping)
-        self._move(state)
-        return Step(state)
+        moved = self._moved(state)
+        if not self.options.lowers_cost:
+            return Step(moved)
+        if bool(moved.failed.any()):
+            return None
+        return Step(moved, float(self.workspace.cameras.xi.abs().max()))
 
-    def _solve_cameras(self, w: _Workspace, damping: float) -> None:
+    def cost(self, state: _State, linear: bool) -> float:
+        """As of the CPU's solvers; waits."""
+        p, edges = self.problem, self.workspace.structure.edges
+        matched = edge_costs(
+            self.kernels, edges, self.grid, state.T, state.inverse_depth, self.matches,
+            self.options.huber,
+        )  # fmt: skip
+        terms = sum(term.cost(state.everything) for term in p.depth_terms)
+        if p.pose_terms:
+            terms += sum(term.cost(state.with_poses_here) for term in p.pose_terms)
+        return float(matched.sum()) + terms
+
+    def _solve_cameras(self, state: _State, damping: float) -> None:
+        w = self.workspace
         s, c = w.structure, w.cameras
         if not s.poses:
             return
@@ -223,7 +286,7 @@ class _DenseSteps:
             len(s.places), 256, s.places, s.first_part, s.parts, c.blocks, c.vectors, s.poses,
             damping, c.system,
         )  # fmt: skip
-        _add_pose_terms(w, self.problem, damping)
+        _add_pose_terms(c, state, self.problem, damping)
         if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
             self.solvers["solve_few_poses"](1, threads, c.system, s.slot, s.poses, s.frames, c.xi)
@@ -245,11 +308,13 @@ class _DenseSteps:
             1, threads, c.system, size, c.inverses, c.good, s.slot, s.frames, c.xi
         )
 
-    def _move(self, w: _Workspace) -> None:
-        s, options, edges = w.structure, self.options, w.edges
-        edges.find_depth_steps(w.cameras.xi, w.delta, w.failed)
+    def _moved(self, state: _State) -> _State:
+        w, options, moved = self.workspace, self.options, state.copy()
+        s, edges = w.structure, w.edges
+        edges.find_depth_steps(w.cameras.xi, w.delta, moved.failed)
         self.kernels["take_steps"](
             (-(-edges.cells // edges.block), s.frames), edges.block, s.slot, s.edges.free_depth,
             w.cameras.xi, w.delta, edges.cells, options.min_inverse_depth,
-            options.max_inverse_depth, w.failed, w.T, w.inverse_depth,
+            options.max_inverse_depth, moved.failed, moved.T, moved.inverse_depth,
         )  # fmt: skip
+        return moved

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.flow_term import BEHIND
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.gpu.kernels import Kernel
@@ -63,6 +64,25 @@ class EdgeArrays:
     pair_a: Tensor
     """Pairs a <= b of edges of one source that the elimination joins."""
     pair_b: Tensor
+
+
+def edge_costs(
+    kernels: Mapping[str, Kernel],
+    arrays: EdgeArrays,
+    grid: SampleGrid,
+    poses: Float[Tensor, "m"],
+    depth: Float[Tensor, "s p"],
+    matches: tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]],
+    huber: float,
+) -> Float[Tensor, "e"]:
+    """Huber's cost of the matched cells of each edge, float64: ``flow_term.matched_cost``."""
+    a, c, cells = arrays, grid.camera, depth.shape[1]
+    cost = depth.new_empty(len(a.source), dtype=torch.float64)
+    kernels["find_edge_costs"](
+        len(a.source), block_size(cells), poses, depth, a.source, a.target, *matches, grid.rays,
+        cells, c.fx, c.fy, c.cx, c.cy, huber, BEHIND, cost,
+    )  # fmt: skip
+    return cost
 
 
 class LinearisedEdges:

@@ -46,6 +46,35 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
   if (threadIdx.x == 0) residual[e] = sqrtf((float)(sums[27] / fmax(sums[28], 1e-12) * 2));
 }
 
+// Huber's cost of the matched cells of an edge, in variances; one behind its target is `behind`
+// times `huber` off. One block per edge.
+extern "C" __global__ void __launch_bounds__(256) find_edge_costs(
+    const double* T, const float* inverse_depth, const int* source, const int* target,
+    const float2* pixels, const float2* weight, const float* rays, int cells, float fx, float fy,
+    float cx, float cy, float huber, float behind, double* cost) {
+  __shared__ Motion T_ji;
+  size_t e = blockIdx.x;
+  int i = source[e];
+  if (threadIdx.x == 0) {
+    double relative[12];
+    relative_motion(T + 16 * target[e], T + 16 * i, relative);
+    for (int k = 0; k < 12; k++) T_ji.m[k] = (float)relative[k];
+  }
+  __syncthreads();
+  Motion pose = T_ji;
+  Camera camera = {fx, fy, cx, cy};
+  float sum = 0.f;
+  for (int p = threadIdx.x; p < cells; p += blockDim.x) {
+    Projected seen = project_cell(pose, rays, p, inverse_depth[(size_t)i * cells + p]);
+    float2 at = pixel_of(camera, seen), measured = pixels[e * cells + p], w = weight[e * cells + p];
+    float rx = measured.x - at.x, ry = measured.y - at.y;
+    float norm = seen.valid ? sqrtf(w.x * rx * rx + w.y * ry * ry) : behind * huber;
+    if (w.x > 0.f) sum += norm <= huber ? norm * norm : huber * (2.f * norm - huber);
+  }
+  sum = block_sum(sum);
+  if (threadIdx.x == 0) cost[e] = sum;
+}
+
 // Curvature and gradient of the inverse depths of a frame over all of its edges. One block each.
 // added: further damping of every cell, or null. measured: inverse depths measured beside the
 // matches with their information, both or null; robust by Huber's factor, as on the CPU.

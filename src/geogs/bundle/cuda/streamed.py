@@ -16,7 +16,12 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, joined_edges
+from geogs.bundle.cuda.linear_edges import (
+    EdgeArrays,
+    LinearisedEdges,
+    edge_costs,
+    joined_edges,
+)
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.problem import StreamedProblem, source_chunks
 from geogs.bundle.protocols import BundleOptions, BundleResult
@@ -103,6 +108,17 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
             system.add(term.hyper_edges(state))
         return system
 
+    def flow_cost(self, state: BundleState) -> float:
+        """Chunk by chunk."""
+        d, cost = state.inverse_depth, state.inverse_depth.new_zeros(1, dtype=torch.float64)
+        for chunk in self.chunks:
+            depth = d[chunk.sources.to(d.device)]
+            cost += edge_costs(
+                self.kernels, chunk.arrays, self.grid, self._poses(state, chunk), depth,
+                self._matches(chunk), self.options.huber,
+            ).sum()  # fmt: skip
+        return float(cost)
+
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
         """On the CPU."""
         return linear.solve(damping, FLOOR)
@@ -122,16 +138,22 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return delta
 
     def _linearise(self, state: BundleState, chunk: _Chunk) -> LinearisedEdges:
-        d = state.inverse_depth
-        pixels, weight = (m.contiguous() for m in self.problem.matches(chunk.edges))
-        own = chunk.sources.to(d.device)
-        depth, poses = d[own], to_device(state.T_cw[chunk.frames].reshape(-1), d.device)
+        own = chunk.sources.to(state.inverse_depth.device)
+        depth = state.inverse_depth[own]
         edges = LinearisedEdges(self.kernels, chunk.arrays, depth)
         edges.fill(
-            self.grid, poses, depth, (pixels, weight), self.options, self.depth_terms.of_rows(own),
-            chunk.sources.tolist(), state,
+            self.grid, self._poses(state, chunk), depth, self._matches(chunk), self.options,
+            self.depth_terms.of_rows(own), chunk.sources.tolist(), state,
         )  # fmt: skip
         return edges
+
+    def _poses(self, state: BundleState, chunk: _Chunk) -> Float[Tensor, "m"]:
+        """Poses of a chunk's frames on the device."""
+        return to_device(state.T_cw[chunk.frames].reshape(-1), state.inverse_depth.device)
+
+    def _matches(self, chunk: _Chunk) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+        pixels, weight = self.problem.matches(chunk.edges)
+        return pixels.contiguous(), weight.contiguous()
 
 
 def _chunk(

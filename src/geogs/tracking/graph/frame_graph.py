@@ -1,7 +1,6 @@
 """The frame graph: which keyframes see each other, and the flow measured between them."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -32,9 +31,6 @@ from geogs.world.keyframes import Keyframe, KeyframeSet
 HUBER = 0.5
 """Standard deviations of the flow beyond which a match counts linearly: the flow is more certain
 than it says."""
-SURE_DAMPING = 1e-4
-"""Damping at which equations are solved that have no solution with less: what matches leave open
-has no curvature, or the rounding of single precision makes it negative."""
 STACKED_EDGES = 1024, 8192
 """Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
 
@@ -218,9 +214,6 @@ class FrameGraph:
         if not directed:
             return None
         result, ids = self._solve(directed, free_pose, free_depth, options)
-        if not result.finite and options.damping < SURE_DAMPING:
-            surely = replace(options, damping=SURE_DAMPING)
-            result, ids = self._solve(directed, free_pose, free_depth, surely)
         if not result.finite:
             return None
         depths, poses = set(free_depth), set(free_pose)
