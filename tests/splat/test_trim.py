@@ -29,7 +29,7 @@ def trimmed_one_by_one(
             ends = []
             for way in is_free[n, axis].tolist():
                 first = way.index(True) if True in way else None
-                ends.append(end if first is None else end * (first + 0.5) / SAMPLES)
+                ends.append(end if first is None else end * (first + 1) / (SAMPLES + 1))
             position[n] += (ends[0] - ends[1]) / 2 * axes[n, :, axis]
             log_scale[n, axis] = math.log((ends[0] + ends[1]) / 2 / REACH)
     return position, log_scale
@@ -55,7 +55,7 @@ def test_spokes_lie_in_the_plane_of_a_disk_up_to_its_reach() -> None:
     normal = quaternion_to_matrix(disks.quaternion)[..., 2]
     assert float((way * normal[:, None, None, None]).sum(-1).abs().max()) < 1e-6
     length = way.norm(dim=-1) / disks.log_scale.exp()[:, :, None, None]
-    expected = REACH * torch.arange(1, SAMPLES + 1) / SAMPLES
+    expected = REACH * torch.arange(1, SAMPLES + 1) / (SAMPLES + 1)
     torch.testing.assert_close(length, expected.expand_as(length))
     torch.testing.assert_close(way[:, :, 0], -way[:, :, 1])
 
@@ -69,12 +69,12 @@ def test_a_disk_that_overhangs_an_edge_ends_there() -> None:
     disks = DiskParameters(position, unit, scale, torch.zeros(26))
     points = spokes(disks)
     new, log_scale = trimmed(disks, points[..., 0] > 1e-6)
-    step = REACH * 0.1 / SAMPLES
+    step = REACH * 0.1 / (SAMPLES + 1)
     right = new[:, 0] + REACH * log_scale[:, 0].exp()
     left = new[:, 0] - REACH * log_scale[:, 0].exp()
-    assert bool((right < step / 2 + 1e-5).all())
+    assert bool((right < step + 1e-5).all())
     torch.testing.assert_close(left, x - REACH * 0.1)  # on the surface it keeps its end
     assert torch.equal(log_scale[:, 1], scale[:, 1])
-    far = x + REACH * 0.1 <= 0
+    far = x + REACH * 0.1 <= step
     assert bool(far.any())
     assert torch.equal(new[far], position[far])

@@ -8,15 +8,14 @@ from geogs.geometry.lie import quaternion_to_matrix
 from geogs.world.disks import DiskParameters
 
 REACH = 2.4
-"""Standard deviations from its centre up to which a disk counts: it leaves 94 % of the light there
-at least."""
+"""Standard deviations from its centre where a disk ends: it leaves 94 % of the light there."""
 SAMPLES = 3
-"""Points from the centre to that distance, which is left out."""
+"""Points between the centre and an end."""
 
 
 def spokes(disks: DiskParameters) -> Float[Tensor, "n 2 2 s 3"]:
-    """Points of disks along both tangents, forth and back, from near the centre to ``REACH``."""
-    part = torch.arange(1, SAMPLES + 1, device=disks.position.device) / SAMPLES
+    """Points of disks along both tangents, forth and back, from the centre towards the ends."""
+    part = torch.arange(1, SAMPLES + 1, device=disks.position.device) / (SAMPLES + 1)
     way = part[:, None] * torch.stack([_reach(disks), -_reach(disks)], 2)[:, :, :, None]
     return disks.position.detach()[:, None, None, None] + way
 
@@ -24,13 +23,12 @@ def spokes(disks: DiskParameters) -> Float[Tensor, "n 2 2 s 3"]:
 def trimmed(
     disks: DiskParameters, is_free: Bool[Tensor, "n 2 2 s"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 2"]]:
-    """Positions and log-scales of disks that end half way before the first free one of ``spokes``.
+    """Positions and log-scales of disks that end at the first free one of their ``spokes``.
 
-    Along each tangent what is left is the new disk's reach to both sides: its centre moves away
-    from the free space, and its deviation shrinks. Where nothing is free nothing changes.
+    Along each tangent the centre moves away from the free space, and the deviation shrinks, so that
+    the other end stays where it is. Where nothing is free nothing changes.
     """
-    beyond = is_free.int().cumsum(-1) > 0
-    left = ((~beyond).sum(-1) + torch.where(beyond[..., -1], 0.5, 0.0)) / SAMPLES
+    left = ((is_free.int().cumsum(-1) == 0).sum(-1) + 1) / (SAMPLES + 1)
     forth, back = left.unbind(-1)
     moved = ((forth - back) / 2)[..., None] * _reach(disks)
     shrunk = ((forth + back) / 2).log()
