@@ -55,10 +55,11 @@ class DiskGrowth:
     def _trimmed(
         self, disks: DiskParameters, views: Sequence[MapView]
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 2"]]:
-        """Positions and log-scales of disks that end where some views see free space."""
+        """Positions and log-scales of disks that end at the silhouettes that some views see."""
         points = spokes(disks)
-        kept = self.depths.keep(points.reshape(-1, 3), views)
-        return trimmed(disks, ~kept.reshape(points.shape[:-1]))
+        centres, along = disks.position.detach(), points.flatten(1, 3)
+        is_free = self.depths.past_silhouettes(centres, along, views)
+        return trimmed(disks, is_free.reshape(points.shape[:-1]))
 
     def prune(self, views: Sequence[MapView]) -> None:
         """Drop transparent and broken disks, too."""

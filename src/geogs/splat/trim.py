@@ -7,9 +7,9 @@ from torch import Tensor
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.world.disks import DiskParameters
 
-REACH = 2.4
-"""Standard deviations from its centre where a disk ends: it leaves 94 % of the light there."""
-SAMPLES = 3
+REACH = 3.0
+"""Standard deviations from its centre where a disk ends: it leaves 99 % of the light there."""
+SAMPLES = 4
 """Points between the centre and an end."""
 
 
