@@ -7,13 +7,11 @@ import pytest
 import torch
 
 from geogs.config import Config, MappingConfig
-from geogs.geometry.lie import matrix_to_quaternion, retract, se3_exp, se3_inverse
+from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.training.map_trainer import draw_views
-from geogs.splat.trim import REACH, spokes
 from geogs.types import PoseCorrection
-from geogs.world.disks import DiskParameters
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, add, segment_of
@@ -259,33 +257,6 @@ def test_a_floater_is_carved_and_the_surface_stays(sequence):
     left = mapper.table.disks.position.detach()
     assert not ((left - floater[0]).norm(dim=1) < 1e-3).any()
     assert len(mapper.table.disks) > 0.97 * count
-
-
-def test_a_disk_that_reaches_into_free_space_is_cut_back(sequence):
-    """One that stands on the surface, as wide as a third of its depth, along a keyframe's axis."""
-    mapper = build(sequence[0][:6])
-    view, disks = mapper.views[2], mapper.table.disks
-    height, width = view.dense.depth.shape
-    z = float(view.dense.depth[height // 2, width // 2])
-    rays = mapper.cameras.render.rays()
-    T_wc = view.T_wc.float()
-    ray = T_wc[:3, :3] @ rays[height // 2, width // 2]
-    quarter = matrix_to_quaternion(T_wc[:3, :3].flip(1) * torch.tensor([1.0, 1.0, -1.0]))
-    log_scale = torch.tensor([[z / 3 / REACH, 0.01 * z]]).log()
-    standing = DiskParameters(
-        (ray * z + T_wc[:3, 3])[None], quarter[None], log_scale, torch.tensor([3.0])
-    )
-    disks.append(standing, view.id)
-    before = spokes(disks.parameters)[-1, 0, :, -1]
-    mapper.growth.carve(list(mapper.views.values()))
-    after = spokes(disks.parameters)[-1, 0, :, -1]
-
-    def depths(points):
-        return sorted((points @ view.T_cw.float()[:3, :3].T + view.T_cw.float()[:3, 3])[:, 2])
-
-    assert depths(before)[0] < 0.7 * z
-    assert depths(after)[0] > 0.75 * z
-    assert depths(after)[1] > 1.3 * z  # what is behind the surface is not known to be free
 
 
 def test_windows_hold_the_newest_and_draw_older_ones():

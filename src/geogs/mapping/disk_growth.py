@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_depths import KeyframeDepths
@@ -20,8 +18,6 @@ from geogs.splat.density import (
 from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
-from geogs.splat.trim import spokes, trimmed
-from geogs.world.disks import DiskParameters
 from geogs.world.map import MapTable
 
 SPLIT_PIXELS = 1.0
@@ -48,18 +44,6 @@ class DiskGrowth:
         disks = self.table.disks
         if len(disks) and self.config.disk.carve:
             disks.keep(self.depths.keep(disks.position.detach(), views))
-            position, log_scale = self._trimmed(disks.parameters, views)
-            disks.parameters.position.detach().copy_(position)
-            disks.parameters.log_scale.detach().copy_(log_scale)
-
-    def _trimmed(
-        self, disks: DiskParameters, views: Sequence[MapView]
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 2"]]:
-        """Positions and log-scales of disks that end at the silhouettes that some views see."""
-        points = spokes(disks)
-        centres, along = disks.position.detach(), points.flatten(1, 3)
-        is_free = self.depths.past_silhouettes(centres, along, views)
-        return trimmed(disks, is_free.reshape(points.shape[:-1]))
 
     def prune(self, views: Sequence[MapView]) -> None:
         """Drop transparent and broken disks, too."""
@@ -93,9 +77,6 @@ class DiskGrowth:
         new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config)
         if self.config.ablation.initialisation == "random":
             new = turned_at_random(new, self.table.random.of_torch)
-        if config.carve:
-            position, log_scale = self._trimmed(new, [view, *others])
-            new = new._replace(position=position, log_scale=log_scale)
         disks.append(new, view.id)
 
     def split(self, optimizer: MapOptimizer, unit: float) -> None:

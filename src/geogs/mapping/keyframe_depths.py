@@ -11,7 +11,6 @@ from geogs.depth.depth_engine import DepthEngine, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView
 from geogs.depth.revision.segment_planes import planar_depth
 from geogs.depth.sensor import joined
-from geogs.depth.silhouettes import past_silhouettes
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.dense_depths import get_depth, put_depth
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
@@ -91,16 +90,6 @@ class KeyframeDepths:
         known = [v for v in views if v.has_depth]
         # Read one after the other where they are not in memory.
         return self.engine.keep(points, OnDemand(known, attrgetter("posed")))
-
-    def past_silhouettes(
-        self,
-        centres: Float[Tensor, "n 3"],
-        points: Float[Tensor, "n m 3"],
-        views: Sequence[MapView],
-    ) -> Bool[Tensor, "n m"]:
-        """World points in the free space that some views see beside the surface of the centres."""
-        known = (v.posed for v in views if v.has_depth)
-        return past_silhouettes(centres, points, known, self.views.arrays.cameras.render)
 
     def _neighbours(self, view: MapView) -> list[DepthView]:
         """What a view is matched with."""
