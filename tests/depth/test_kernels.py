@@ -104,7 +104,7 @@ def test_cost_outside_every_neighbour_is_the_outside_cost():
     scene = make_scene()
     planes = np.array([0.3, 3.0], F)
     costs = matching_costs(scene.views[0], [scene.views[1]], RENDER, planes)
-    assert costs[36, 0, 1] == sweep.OUTSIDE
+    assert costs[36, 0, 1] == pytest.approx(sweep.OUTSIDE, rel=1e-6)
     assert np.isfinite(costs).all()
 
 
