@@ -141,13 +141,18 @@ def measure(rounds: int) -> Costs:
 
 
 def processor() -> str:
-    """What the costs were measured on."""
+    """What the costs were measured on; names alone, as "AMD EPYC", stand for many generations."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor() or platform.machine()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    first = {}
+    for name, _, value in (line.partition(":") for line in lines):
+        first.setdefault(name.strip(), value.strip())
+    if "model name" not in first:
+        return platform.machine()
+    number = (f"{key.split()[-1]} {first[key]}" for key in ("cpu family", "model") if key in first)
+    return ", ".join([first["model name"], *number])
 
 
 def read(path: Path) -> Costs:
