@@ -146,7 +146,7 @@ def processor() -> str:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor() or platform.machine()
-    first = {}
+    first: dict[str, str] = {}
     for name, _, value in (line.partition(":") for line in lines):
         first.setdefault(name.strip(), value.strip())
     if "model name" not in first:
