@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 
 from geogs.config import Config
+from geogs_bench.machine import first_processor
 from geogs_synth.sequence.replica_files import write_sequence
 from run_profile import measured_run
 
@@ -142,17 +143,11 @@ def measure(rounds: int) -> Costs:
 
 def processor() -> str:
     """What the costs were measured on; names alone, as "AMD EPYC", stand for many generations."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
+    said = first_processor()
+    if "model name" not in said:
         return platform.processor() or platform.machine()
-    first: dict[str, str] = {}
-    for name, _, value in (line.partition(":") for line in lines):
-        first.setdefault(name.strip(), value.strip())
-    if "model name" not in first:
-        return platform.machine()
-    number = (f"{key.split()[-1]} {first[key]}" for key in ("cpu family", "model") if key in first)
-    return ", ".join([first["model name"], *number])
+    number = (f"{key.split()[-1]} {said[key]}" for key in ("cpu family", "model") if key in said)
+    return ", ".join([said["model name"], *number])
 
 
 def read(path: Path) -> Costs:

@@ -18,6 +18,16 @@ def machine_name() -> str:
     return f"{_processor()}, {cores} cores"
 
 
+def first_processor() -> dict[str, str]:
+    """What Linux says of the first processor, by the names in /proc/cpuinfo; elsewhere nothing."""
+    said = dict[str, str]()
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            said.setdefault(name.strip(), value.strip())
+    return said
+
+
 def program_version() -> str:
     """The commit of the checkout that runs, ``+`` if changed since; else the version."""
     package = PACKAGE.resolve()
@@ -47,11 +57,7 @@ def forget_peak_memory() -> None:
 
 
 def _processor() -> str:
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return first_processor().get("model name") or platform.processor() or platform.machine()
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
