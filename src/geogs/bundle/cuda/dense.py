@@ -176,9 +176,9 @@ def _add_pose_terms(c: _Cameras, state: _State, problem: BundleProblem, damping:
     """Add what is said of poses alone to the assembled camera system, which waits for them."""
     if not problem.pose_terms:
         return
-    poses = DenseCameraSystem(problem.free_pose.cpu())
+    poses, here = DenseCameraSystem(problem.free_pose.cpu()), state.with_poses_here
     for term in problem.pose_terms:
-        poses.add(term.hyper_edges(state.with_poses_here))
+        poses.add(term.hyper_edges(here))
     hessian = poses.hessian[poses.free[:, None], poses.free]
     # Of the system on the device only the lower blocks are in use.
     diagonal = hessian.diagonal()
@@ -273,7 +273,8 @@ class _DenseSteps:
         )  # fmt: skip
         terms = sum(term.cost(state.everything) for term in p.depth_terms)
         if p.pose_terms:
-            terms += sum(term.cost(state.with_poses_here) for term in p.pose_terms)
+            here = state.with_poses_here
+            terms += sum(term.cost(here) for term in p.pose_terms)
         return float(matched.sum()) + terms
 
     def _solve_cameras(self, state: _State, damping: float) -> None:
