@@ -66,8 +66,12 @@ def placed(tmp_path, monkeypatch):
     return parts, files, placements, gauge, config
 
 
-def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
+def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path, monkeypatch):
     parts, files, placements, gauge, config = placed
+    # Of all parts together nobody asks what a step is worth. Sums are in another order: with depths
+    # damped as little as usual the rounding would show in weak directions.
+    options = replace(GLOBAL_OPTIONS, least_damping=None, depth_damping=1e-3)
+    monkeypatch.setattr(adjust, "GLOBAL_OPTIONS", options)
     (tmp_path / "kept").mkdir()
     workers = Recording(tmp_path / "kept")
     found = adjusted(
@@ -90,14 +94,11 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     assert {(a // 4, b // 4) for a, b in graph.edges} == {
         (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2
     }
-    # Of all parts together nobody asks what a step is worth.
-    plain = replace(GLOBAL_OPTIONS, least_damping=None)
-    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, plain)
+    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, options)
     for n in range(3):
         wanted = segment.poses([ids[n, place] for place in range(4)])
         moved = float((wanted - placements[n].T_cw).abs().max())
-        # Sums are in another order: so little damped, weak directions show their rounding.
-        assert float((found[n].T_cw - wanted).abs().max()) < 2e-2 * moved + 1e-7
+        assert float((found[n].T_cw - wanted).abs().max()) < 1e-3 * moved + 1e-7
     assert torch.allclose(found[0].T_cw[0], placements[0].T_cw[0], rtol=0, atol=1e-12)
 
 
