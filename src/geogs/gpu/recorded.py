@@ -1,8 +1,10 @@
 """Work on a GPU as a recorded sequence of kernels: its many launches cost the CPU one."""
 
+import gc
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -11,6 +13,26 @@ _log = logging.getLogger(__name__)
 
 Maps = tuple[Tensor, ...]
 """What is made of tensors, on their device."""
+
+
+@contextmanager
+def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
+    """A CUDA graph of what this thread launches on ``device`` within the block.
+
+    Python's garbage collector rests meanwhile: an older graph that it found and destroyed would
+    end the recording with an error.
+    """
+    graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
+    with (
+        torch.cuda.device(device),
+        torch.cuda.graph(graph, capture_error_mode="thread_local"),
+    ):
+        gc.disable()
+        try:
+            yield graph
+        finally:
+            if collects:
+                gc.enable()
 
 
 class Recorded:
@@ -60,10 +82,8 @@ class Recorded:
 class _Recording:
     def __init__(self, work: Callable[..., Maps], given: Maps) -> None:
         self._given = tuple(tensor.clone() for tensor in given)
-        with torch.cuda.device(given[0].device):
-            self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-                self._found = work(*self._given)
+        with recording(given[0].device) as self._graph:
+            self._found = work(*self._given)
 
     def __call__(self, *given: Tensor) -> Maps:
         for mine, tensor in zip(self._given, given, strict=True):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.recorded import recording
 from geogs.gpu.transfer import to_device
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.training.cuda.known_views import KnownViews
@@ -152,11 +153,7 @@ class _TrainingStep:
             return
         self._launch()  # the first step of its kind also loads what it needs
         if self._device.type == "cuda":
-            graph = torch.cuda.CUDAGraph()
-            with (
-                torch.cuda.device(self._device),
-                torch.cuda.graph(graph, capture_error_mode="thread_local"),
-            ):
+            with recording(self._device) as graph:
                 self._launch()
             self._graph = graph
 
