@@ -6,28 +6,20 @@ the poses do. Source: the block inverse; Rosinol et al. 2023 use it for dense bu
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.flow_term import (
-    PinholeFlow,
-    SourceFlow,
-    linearised_sources,
-    residual_norms,
-    weighed_residuals,
-)
+from geogs.bundle.flow_term import linearised_sources, weighed_residuals
 from geogs.bundle.hyper_edge import HyperEdge
-from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
-from geogs.bundle.projection import linearise, project, relative_motion
+from geogs.bundle.problem import sources_within
+from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.terms import BundleState, DepthTerm
+from geogs.bundle.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.lie import se3_inverse
 from geogs.world.grid import SampleGrid
-
-AnyProblem = BundleProblem | StreamedProblem
 
 ALIKE = 2.25
 """Matches of neighbouring cells err alike, and so do those of one cell along several edges: by how
@@ -40,8 +32,9 @@ independent of what those of another have."""
 COMMON_FLOW = 0.1
 """What matches of a part have in common all along a video, in their own deviations, of the way by
 which the scene moves in the image: the other way round from a later to an earlier frame."""
-COMMON_PLACE = 0.25
-"""The same of the place in the image, whichever frame is the earlier."""
+COMMON_PLACE = 0.15
+"""The same of the place in the image, whichever frame is the earlier; beside what an error of the
+lens does (:mod:`geogs.bundle.lens_error`)."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +82,7 @@ def marginals(
 
     Where at most one pose is fixed, lengths are relative to the distances of the cameras from it.
     """
-    part = _Thinned(grid, problem, cells)
+    part = ThinnedProblem(grid, problem, cells)
     covariance = ALIKE * _pose_covariance(problem, part, options)
     relative = torch.zeros(len(problem.T_cw), part.count)
     relative[problem.free_depth.cpu()] = torch.inf
@@ -122,111 +115,53 @@ def common_covariance(
     """
     if not bool(found.covariance.isfinite().all()):
         return torch.zeros_like(found.covariance)
-    part = _Thinned(grid, problem, cells)
+    part = ThinnedProblem(grid, problem, cells)
     n = len(problem.T_cw)
     pull = torch.zeros(6 * n, 4 * PLACES[0] * PLACES[1], dtype=torch.float64)
-    for rows, gradient in part.common_gradients(options):
+    for rows, gradient in _common_gradients(part, options):
         pull[rows] += gradient / part.fraction
     moves = found.covariance / ALIKE @ pull
     return moves @ moves.mT
 
 
-class _Thinned:
-    """A problem with some of the cells, which stand for all of them; on the CPU."""
-
-    def __init__(self, grid: SampleGrid, problem: AnyProblem, cells: int) -> None:
-        step = -(-grid.size // cells)
-        self._problem, self._cells = problem, slice(None, None, step)
-        self._flow = PinholeFlow(grid.camera, grid.rays[self._cells].cpu())
-        self._pixels = grid.pixels[self._cells].cpu()
-        self.count = len(self._flow.rays)
-        self.fraction = self.count / grid.size
-        self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
-
-    def sources(self, options: BundleOptions) -> Iterator[SourceFlow]:
-        """All sources, in order."""
-        for part in self._parts(options):
-            yield from linearised_sources(self._flow, part, part.start, options)
-
-    def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
-        """Each source in order, and norms of its matches' residuals in standard deviations."""
-        for part in self._parts(options):
-            i, j = part.source, part.target
-            T_ji = relative_motion(part.T_cw, i, j)
-            at = project(self._flow.camera, self._flow.rays, T_ji, self.inverse_depth[i])
-            norm = residual_norms(at, part.pixels, part.weight)
-            used = at.valid & (part.weight[..., 0] > 0)
-            for frame, edges in sources_within(i):
-                yield frame, norm[edges][used[edges]]
-
-    def common_gradients(
-        self, options: BundleOptions
-    ) -> Iterator[tuple[Int[Tensor, "c"], Float[Tensor, "c k"]]]:
-        """Each source in order: which unknowns of the poses it joins, and by how much each error
-        that matches have in common, at its deviation, pulls at them once depths have followed."""
-        camera, rays, place = self._flow.camera, self._flow.rays, self._places()
-        for part in self._parts(options):
-            i, j = part.source, part.target
-            p = linearise(camera, rays, relative_motion(part.T_cw, i, j), self.inverse_depth[i])
-            _, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
-            unit = w * part.weight.clamp(min=1e-12).rsqrt()  # weight times one deviation
-            onward = (j - i).sign() * COMMON_FLOW
-            sources = linearised_sources(self._flow, part, part.start, options)
-            for source, (frame, e) in zip(sources, sources_within(i), strict=True):
-                depth, chain = source.edges.depth, source.edges.chain
-                assert depth is not None
-                follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
-                pulls = []
-                for axis in (0, 1):
-                    pose = p.pose_jacobian[e, :, axis] * unit[e, None, :, axis]
-                    own = p.depth_jacobian[e, :, axis] * unit[e, :, axis]
-                    for size in (onward[e], torch.full_like(onward[e], COMMON_PLACE)):
-                        along = (pose * size[:, None, None]).flatten(0, 1)
-                        pulls.append((along - follow * (size[:, None] * own).sum(0)) @ place)
-                yield source.edges.rows(len(part.T_cw)), chain.mT @ torch.cat(pulls, 1).double()
-
-    def _places(self) -> Float[Tensor, "c q"]:
-        """One where a cell lies in a part of the image."""
-        across, down = PLACES
-        camera = self._flow.camera
-        x, y = (self._pixels / self._pixels.new_tensor([camera.width, camera.height])).mT
-        at = (y * down).long() * across + (x * across).long()
-        return torch.nn.functional.one_hot(at, across * down).to(self._pixels)
-
-    def _parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
-        """Some edges at a time, with the terms of depths."""
-        p, cells = self._problem, self._cells
-        terms = tuple(_ThinnedTerm(term, p.start, cells) for term in p.depth_terms)
-        for chunk in source_chunks(p.source.cpu(), options.chunk):
-            part = p.part(chunk)
-            yield BundleProblem(
-                p.T_cw.cpu(), self.inverse_depth, part.source.cpu(), part.target.cpu(),
-                p.free_pose.cpu(), p.free_depth.cpu(), terms,
-                pixels=part.pixels[:, cells].cpu(), weight=part.weight[:, cells].cpu(),
-            )  # fmt: skip
+def _common_gradients(
+    thinned: ThinnedProblem, options: BundleOptions
+) -> Iterator[tuple[Int[Tensor, "c"], Float[Tensor, "c k"]]]:
+    """Each source in order: which unknowns of the poses it joins, and by how much each error
+    that matches have in common, at its deviation, pulls at them once depths have followed."""
+    camera, rays, place = thinned.flow.camera, thinned.flow.rays, _places(thinned)
+    for part in thinned.parts(options):
+        i, j = part.source, part.target
+        p = linearise(camera, rays, relative_motion(part.T_cw, i, j), part.inverse_depth[i])
+        _, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
+        unit = w * part.weight.clamp(min=1e-12).rsqrt()  # weight times one deviation
+        onward = (j - i).sign() * COMMON_FLOW
+        sources = linearised_sources(thinned.flow, part, part.start, options)
+        for source, (frame, e) in zip(sources, sources_within(i), strict=True):
+            depth, chain = source.edges.depth, source.edges.chain
+            assert depth is not None
+            follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
+            pulls = []
+            for axis in (0, 1):
+                pose = p.pose_jacobian[e, :, axis] * unit[e, None, :, axis]
+                own = p.depth_jacobian[e, :, axis] * unit[e, :, axis]
+                for size in (onward[e], torch.full_like(onward[e], COMMON_PLACE)):
+                    along = (pose * size[:, None, None]).flatten(0, 1)
+                    pulls.append((along - follow * (size[:, None] * own).sum(0)) @ place)
+            yield source.edges.rows(len(part.T_cw)), chain.mT @ torch.cat(pulls, 1).double()
 
 
-@dataclass(frozen=True)
-class _ThinnedTerm:
-    """A term of depths on some of the cells."""
-
-    term: DepthTerm
-    state: BundleState
-    """With all cells."""
-    cells: slice
-    information: None = None
-
-    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
-        edges = self.term.of_frame(frame, self.state)
-        assert edges.depth is not None
-        return replace(edges, depth=edges.depth.on_cells(self.cells))
-
-    def cost(self, state: BundleState) -> float:
-        return self.term.cost(self.state)
+def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
+    """One where a cell lies in a part of the image."""
+    across, down = PLACES
+    camera, pixels = thinned.flow.camera, thinned.pixels
+    x, y = (pixels / pixels.new_tensor([camera.width, camera.height])).mT
+    at = (y * down).long() * across + (x * across).long()
+    return torch.nn.functional.one_hot(at, across * down).to(pixels)
 
 
 def _pose_covariance(
-    problem: AnyProblem, part: _Thinned, options: BundleOptions
+    problem: AnyProblem, part: ThinnedProblem, options: BundleOptions
 ) -> Float[Tensor, "m m"]:
     """Inverse of the reduced camera system over all poses, zero for the fixed ones."""
     n, fixed = len(problem.T_cw), ~problem.free_pose.cpu()
@@ -250,7 +185,7 @@ def _pose_covariance(
 
 
 def _normalised_residual(
-    problem: AnyProblem, part: _Thinned, options: BundleOptions
+    problem: AnyProblem, part: ThinnedProblem, options: BundleOptions
 ) -> Float[Tensor, "n"]:
     """Median residual from each frame; infinite without matches."""
     found = torch.full((len(problem.T_cw),), torch.inf)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from geogs.bundle.protocols import BundleOptions
+from geogs.loop.lens_correction import correct_lens
 from geogs.loop.row_correction import correct_rows
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
@@ -79,6 +80,7 @@ def global_bundle(
         odometry.update_scale_by_all()
     free_poses = free if fixed else ids[1:]
     correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
+    correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:

@@ -7,14 +7,20 @@ import torch
 from jaxtyping import Float64
 
 from geogs.bundle.gauge import deviations_after_alignment
-from geogs.bundle.marginals import Marginals, common_covariance, marginals
+from geogs.bundle.lens_error import LensEstimate, LensEvidence, lens_evidence
+from geogs.bundle.marginals import ALIKE, Marginals, common_covariance, marginals
+from geogs.bundle.problem import StreamedProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
+from geogs.world.grid import SampleGrid
 
 CELLS = 512
 """Most cells of a keyframe whose matches stand for all."""
+OPTIONS = BundleOptions(huber=HUBER, depth_damping=1e-5)
+"""How matches are linearised. More damping of the depths would count as evidence against a drift of
+scale, which takes them all along."""
 TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23
@@ -86,8 +92,34 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
     return KeyframeUncertainty(tuple(ids), position, rotation, depth, residual)
 
 
-def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
-    """Marginals of some keyframes, by the edges between them; none where there are none."""
+def lens_estimate(tracker: Tracker, ids: list[int]) -> LensEstimate | None:
+    """What edges between some keyframes, earliest first, say of k1 and k2 beside what is known."""
+    found = None
+    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
+        said = _solution(tracker, ids[first : first + TOGETHER + 1])
+        if said is not None and bool(said.known.covariance.isfinite().all()):
+            part = said.lens()
+            found = part if found is None else found.joined(part)
+    return None if found is None else found.bend
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Some keyframes' poses and depths as they are, and what their edges say of them."""
+
+    grid: SampleGrid
+    problem: StreamedProblem
+    frames: list[int]
+    known: Marginals
+
+    def lens(self) -> LensEvidence:
+        """What matches say of the lens."""
+        covariance = self.known.covariance / ALIKE
+        return lens_evidence(self.grid, self.problem, OPTIONS, covariance, CELLS)
+
+
+def _solution(tracker: Tracker, ids: list[int]) -> _Solution | None:
+    """Of some keyframes, by the edges between them; none where there are none."""
     free = ids if tracker.segment.fixed else ids[1:]
     among = {*ids, *tracker.segment.fixed}
     edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
@@ -95,10 +127,20 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
         return None
     problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
     grid = tracker.keyframes.grid
-    options = BundleOptions(huber=HUBER)
-    found = marginals(grid, problem, options, CELLS)
-    common = common_covariance(grid, problem, options, found, CELLS)
-    own = torch.tensor([frames.index(k) for k in ids])
+    return _Solution(grid, problem, frames, marginals(grid, problem, OPTIONS, CELLS))
+
+
+def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
+    """Marginals of some keyframes, with what all their matches have wrong in common."""
+    solution = _solution(tracker, ids)
+    if solution is None:
+        return None
+    found, covariance = solution.known, solution.known.covariance
+    if bool(covariance.isfinite().all()):
+        common = common_covariance(solution.grid, solution.problem, OPTIONS, found, CELLS)
+        covariance = covariance + common + solution.lens().considered()
+    own = torch.tensor([solution.frames.index(k) for k in ids])
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
-    covariance = (found.covariance + common)[rows[:, None], rows]
-    return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])
+    return Marginals(
+        covariance[rows[:, None], rows], found.relative_depth[own], found.normalised_residual[own]
+    )

@@ -33,7 +33,7 @@ class Observation:
     position: Int16[Tensor, "s 2"]
     half_weight: Annotated[Float16[Tensor, "s 2"], Range(0)]
     shift: Int16[Tensor, "s 2"] | None = None
-    """Steps to be added to the position, for the rows of a rolling shutter."""
+    """Steps to be added to the position, for the rows of a rolling shutter and the lens."""
 
     @property
     def shifted(self) -> Int16[Tensor, "s 2"]:

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.projection import project
+from geogs.bundle.projection import carried_over, project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.shutter.angular_motion import AngularMotion
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.tracking.frames.row_errors import LONGEST_INTERVAL, RowErrors, _propagated, lagrange
+from geogs.tracking.frames.row_errors import LONGEST_INTERVAL, RowErrors, lagrange
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
 
@@ -113,7 +113,7 @@ def test_a_step_is_carried_as_finite_differences_carry_it():
         moved = rays.clone()
         moved[:, axis] += small / (CAMERA.fx, CAMERA.fy)[axis]
         numeric = (project(CAMERA, moved, T_ji, d).pixels - p.pixels) / small
-        carried = _propagated(GRID, T_ji, p.pixels, p.z, step)
+        carried = carried_over(CAMERA, rays, T_ji, d, step)
         torch.testing.assert_close(carried[p.valid], numeric[p.valid], atol=1e-3, rtol=1e-3)
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import motion_solver
+from geogs.bundle.lens_error import LensBend
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
@@ -17,7 +18,7 @@ from geogs.tracking.frames.rotation_averaging import orientations
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.types import Trajectory
 from geogs.world.edges import in_steps, unpacked_positions
-from geogs.world.frames import FrameLog, FrameRecord
+from geogs.world.frames import FrameLog, FrameRecord, Observation
 from geogs.world.keyframes import KeyframeSet
 
 SOLVED_TOGETHER = 64
@@ -70,10 +71,7 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
     """Correct what was found of frames by the errors of their rows and their keyframes'."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
-    seen = [(r, o) for r in frames.records for o in r.observations if o.keyframe in keyframes]
-    for start in range(0, len(seen), SOLVED_TOGETHER):
-        part = seen[start : start + SOLVED_TOGETHER]
-        ids = [o.keyframe for _, o in part]
+    for part, ids in _seen_by(frames, keyframes):
         T = errors.poses([r.index for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
         shifts = errors.of_matches(
             [keyframes[k].frame_index for k in ids], [r.index for r, _ in part], T,
@@ -83,6 +81,30 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
         steps = in_steps(grid.camera, shifts)
         for (_, observation), shift in zip(part, steps, strict=True):
             observation.shift = shift
+
+
+def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None:
+    """Correct what was found of frames by what the lens bends, beside the errors of their rows."""
+    grid = keyframes.grid
+    cells = sparse_cells(grid)
+    for part, ids in _seen_by(frames, keyframes):
+        seen = torch.stack([pose_of(r, keyframes) for r, _ in part])
+        T, depth = seen @ se3_inverse(keyframes.poses(ids)), keyframes.inverse_depths(ids)
+        shifts = bend.of_matches(grid.camera, grid.rays[cells], T, depth[:, cells])
+        steps = in_steps(grid.camera, shifts)
+        for (_, observation), shift in zip(part, steps, strict=True):
+            rows = observation.shift if frames.rows else None
+            observation.shift = shift if rows is None else rows + shift
+
+
+def _seen_by(
+    frames: FrameLog, keyframes: KeyframeSet
+) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int]]]:
+    """What was found of frames in keyframes, and the ids of these; some at a time."""
+    seen = [(r, o) for r in frames.records for o in r.observations if o.keyframe in keyframes]
+    for start in range(0, len(seen), SOLVED_TOGETHER):
+        part = seen[start : start + SOLVED_TOGETHER]
+        yield part, [o.keyframe for _, o in part]
 
 
 def tracked_on(frames: FrameLog, keyframes: KeyframeSet) -> list[FrameRecord]:

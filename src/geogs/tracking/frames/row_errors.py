@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.projection import project, seen_from_targets
+from geogs.bundle.projection import carried_over, project, seen_from_targets
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
 from geogs.types import SeenRows, Trajectory
@@ -122,8 +122,8 @@ class RowErrors:
         own = (own + pixels.new_tensor([camera.cx, camera.cy])).expand_as(pixels)
         p = project(camera, rays, T_ji, inverse_depth)
         there = self.of_pixels(target, pixels, inverse_depth / p.z)
-        moved = _propagated(
-            self._grid, T_ji, p.pixels, p.z, self.of_pixels(source, own, inverse_depth)
+        moved = carried_over(
+            camera, rays, T_ji, inverse_depth, self.of_pixels(source, own, inverse_depth)
         )
         error = there - moved
         believed = p.valid & (error.norm(dim=-1) < LARGEST * camera.long_edge)
@@ -230,22 +230,3 @@ def _seen(
         field, position[:, :, None], padding_mode="border", align_corners=False
     )[..., 0]
     return values[:, :2].mT, values[:, 2]
-
-
-def _propagated(
-    grid: SampleGrid,
-    T_ji: Float[Tensor, "e 4 4"],
-    pixels: Float[Tensor, "e p 2"],
-    z: Float[Tensor, "e p"],
-    step: Float[Tensor, "e p 2"],
-) -> Float[Tensor, "e p 2"]:
-    """Small steps in the source, in pixels of the target, at constant inverse depth.
-
-    ``pixels`` and ``z`` are where the cells fall in the target, and their depth there over that in
-    the source.
-    """
-    camera = grid.camera
-    focal = pixels.new_tensor([camera.fx, camera.fy])
-    plane = (pixels - pixels.new_tensor([camera.cx, camera.cy])) / focal
-    moved = (step / focal) @ T_ji[:, :3, :2].to(step).mT
-    return focal * (moved[..., :2] - plane * moved[..., 2:]) / z[..., None]

@@ -1,0 +1,238 @@
+"""What matches say of a lens that is taken for a pinhole, and what it costs the poses.
+
+A lens that bends by a thousandth lets every keyframe of a walk straight on seem a little shorter
+than the one before it: what lies ahead moves outwards, where it is magnified otherwise. All matches
+of a video say so alike, and neither their residuals nor more of them tell; but the error is of a
+known shape. Its sizes (:data:`SHAPES`) are unknowns that the poses and depths are eliminated from.
+They are estimated, and what is left open of them is considered in what is said of poses.
+Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bierman 1977).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.bundle.flow_term import linearised_sources, weighed_residuals
+from geogs.bundle.problem import BundleProblem, sources_within
+from geogs.bundle.projection import carried_over, linearise, project, relative_motion
+from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.thinned import AnyProblem, ThinnedProblem
+from geogs.geometry.camera import Camera
+from geogs.world.grid import SampleGrid
+
+SHAPES = 3
+"""Of the error of a pixel x off the axis: x, x |x|^2, x |x|^4, for the logarithm of the focal
+length, and OpenCV's k1 and k2."""
+LEAST = 0.0005, 0.0005, 0.001
+"""No size is known better, however many matches agree: half of what they say of lenses that have no
+error (docs/tracking.md)."""
+PRIOR = 0.03, 0.05, 0.1
+"""Deviations of the sizes before any match is asked."""
+
+
+def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "3 *b 2"]:
+    """By how much a pinhole's pixel lies off what is seen, for each size of one, to first order."""
+    centre = pixels.new_tensor([camera.cx, camera.cy])
+    off = pixels - centre
+    square = (off / pixels.new_tensor([camera.fx, camera.fy])).square().sum(-1, keepdim=True)
+    return torch.stack([-off, -off * square, -off * square.square()])
+
+
+def shape_shifts(
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    inverse_depth: Float[Tensor, "e p"],
+) -> Float[Tensor, "3 e p 2"]:
+    """What is to be added to where cells were found, for each size of one.
+
+    What a cell shows lies off it, and so does what is found in the target; the former is carried
+    over at the cell's own depth. The latter is taken where the cell falls: where it was found is
+    off by the residual, and the product of both would count as evidence.
+    """
+    pixels = project(camera, rays, T_ji, inverse_depth).pixels
+    own = pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
+    own = own + pixels.new_tensor([camera.cx, camera.cy])
+    there, here = lens_shapes(camera, pixels), lens_shapes(camera, own)
+    moved = [carried_over(camera, rays, T_ji, inverse_depth, s.expand_as(pixels)) for s in here]
+    return there - torch.stack(moved)
+
+
+@dataclass(frozen=True)
+class LensBend:
+    """A lens' error beside the distortion that it is known for: OpenCV's k1 and k2, small."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+
+    def plus(self, size: Float[Tensor, "2"]) -> "LensBend":
+        """With k1 and k2 added to."""
+        return LensBend(self.k1 + float(size[0]), self.k2 + float(size[1]))
+
+    def of_matches(
+        self,
+        camera: Camera,
+        rays: Float[Tensor, "p 3"],
+        T_ji: Float[Tensor, "e 4 4"],
+        inverse_depth: Float[Tensor, "e p"],
+    ) -> Float[Tensor, "e p 2"]:
+        """What is to be added to where cells were found, as if a pinhole had seen both views."""
+        shift = shape_shifts(camera, rays, T_ji, inverse_depth)
+        return self.k1 * shift[1] + self.k2 * shift[2]
+
+
+@dataclass(frozen=True)
+class LensEvidence:
+    """Normal equations of the sizes of a lens' error, poses and depths eliminated."""
+
+    information: Float[Tensor, "s k k"]
+    """Of each source frame, whose sum is that of all."""
+    gradient: Float[Tensor, "s k"]
+    """The direction of descent; likewise."""
+    moves: Float[Tensor, "m k"]
+    """By how much an error of size one moves all poses, left perturbations; m = 6n."""
+
+    def joined(self, other: "LensEvidence") -> "LensEvidence":
+        """Of both, poses of one after those of the other."""
+        return LensEvidence(
+            torch.cat([self.information, other.information]),
+            torch.cat([self.gradient, other.gradient]),
+            torch.cat([self.moves, other.moves]),
+        )
+
+    @property
+    def bend(self) -> "LensEstimate":
+        """Of k1 and k2, the focal length being right."""
+        return _estimate(self.information[:, 1:, 1:], self.gradient[:, 1:], LEAST[1:])
+
+    def considered(self) -> Float[Tensor, "m m"]:
+        """Second moment of the moves of all poses by the error that the lens has.
+
+        By what matches say of it and ``PRIOR`` together: their estimate moves poses as far as it
+        would if it were taken off, and what it leaves open does too.
+        """
+        said = _estimate(self.information, self.gradient, LEAST)
+        prior = self.moves.new_tensor(PRIOR).square()
+        gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
+        size = gain @ said.size
+        left = torch.diag(prior) - gain @ torch.diag(prior)
+        return self.moves @ (left + size[:, None] * size) @ self.moves.mT
+
+
+class LensEstimate(NamedTuple):
+    """Sizes of a lens' error, and their covariance."""
+
+    size: Float[Tensor, "k"]
+    covariance: Float[Tensor, "k k"]
+
+    @property
+    def evidence(self) -> float:
+        """Square of the sizes in their deviations."""
+        return float(self.size @ torch.linalg.solve(self.covariance, self.size))
+
+
+def _estimate(
+    each: Float[Tensor, "s k k"], gradient: Float[Tensor, "s k"], least: tuple[float, ...]
+) -> LensEstimate:
+    """The sizes that matches want, and their covariance.
+
+    That is what the matches themselves leave open, and a cluster-robust one beside, by source
+    frames (Liang and Zeger's sandwich, as in :func:`~geogs.bundle.shared.solve_shared`): it is
+    the larger by far where there is evidence, and nothing where there is none.
+    """
+    information = each.sum(0)
+    damping = torch.diag(1e-9 * information.diagonal() + 1e-12)
+    inverse = torch.linalg.inv(information + damping)
+    size = inverse @ gradient.sum(0)
+    left = gradient - each @ size
+    floor = torch.diag(information.new_tensor(least).square())
+    return LensEstimate(size, inverse + inverse @ left.mT @ left @ inverse + floor)
+
+
+def lens_evidence(
+    grid: SampleGrid,
+    problem: AnyProblem,
+    options: BundleOptions,
+    covariance: Float[Tensor, "m m"],
+    cells: int = 1024,
+) -> LensEvidence:
+    """What the matches of a problem at its solution say of the error of the lens.
+
+    Args:
+        grid: where the depths are.
+        problem: as of :func:`~geogs.bundle.marginals.marginals`.
+        options: Huber's limit and the damping of depths.
+        covariance: inverse of the reduced equations of all poses, finite.
+        cells: most cells of a frame that are asked; the others are taken to say the same.
+    """
+    thinned = ThinnedProblem(grid, problem, cells)
+    scale = 1 / thinned.fraction
+    pull = torch.zeros(len(covariance), SHAPES, dtype=torch.float64)
+    each = list(_reduced(thinned, options))
+    for s in each:
+        pull[s.rows] += scale * s.pull
+    moves = covariance @ pull
+    information = [s.information - s.pull.mT @ moves[s.rows] for s in each]
+    gradient = [s.gradient + moves[s.rows].mT @ s.descent for s in each]
+    return LensEvidence(scale * torch.stack(information), scale * torch.stack(gradient), moves)
+
+
+class _Reduced(NamedTuple):
+    """Equations of the poses that a source joins, and of the sizes, its depths eliminated."""
+
+    rows: Int[Tensor, "c"]
+    pull: Float[Tensor, "c k"]
+    """Of matches that are off by a size of one on the poses."""
+    descent: Float[Tensor, "c"]
+    """Of the residuals on the poses."""
+    information: Float[Tensor, "k k"]
+    gradient: Float[Tensor, "k"]
+    """Direction of descent of the sizes, poses being held."""
+
+
+def _reduced(thinned: ThinnedProblem, options: BundleOptions) -> Iterator[_Reduced]:
+    """Each source in order."""
+    for part in thinned.parts(options):
+        shift, wJ, residual, weights = _weighed(thinned, part, options)
+        sources = linearised_sources(thinned.flow, part, part.start, options)
+        for source, (frame, e) in zip(sources, sources_within(part.source), strict=True):
+            depth, chain = source.edges.depth, source.edges.chain
+            assert depth is not None
+            free = float(part.free_depth[frame]) / depth.curvature
+            S, r, w = shift[:, e], residual[e], weights.flow[e]
+            along = torch.einsum("eiap,keap->eik", wJ[e], S).flatten(0, 1)
+            on_depth = (weights.depth[e] * S).sum((1, 2))
+            follow = depth.coupling * free
+            information = torch.einsum("keap,leap,eap->kl", S, S, w)
+            gradient = -torch.einsum("keap,eap,eap->k", S, r, w)
+            yield _Reduced(
+                source.edges.rows(len(part.T_cw)),
+                chain.mT @ (along - follow @ on_depth.mT).double(),
+                source.edges.chained()[1],
+                (information - (on_depth * free) @ on_depth.mT).double(),
+                (gradient + (on_depth * free) @ depth.gradient).double(),
+            )
+
+
+class _Weights(NamedTuple):
+    flow: Float[Tensor, "e 2 p"]
+    depth: Float[Tensor, "e 2 p"]
+    """Times the derivative by the inverse depth."""
+
+
+def _weighed(
+    thinned: ThinnedProblem, part: BundleProblem, options: BundleOptions
+) -> tuple[Tensor, Tensor, Tensor, _Weights]:
+    """Shifts (k e 2 p), weighed derivatives by the poses (e 6 2 p), residuals (e 2 p), weights."""
+    camera, rays = thinned.flow.camera, thinned.flow.rays
+    T_ji = relative_motion(part.T_cw, part.source, part.target)
+    d = part.inverse_depth[part.source]
+    p = linearise(camera, rays, T_ji, d)
+    r, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
+    shift = shape_shifts(camera, rays, T_ji, d)
+    weights = _Weights(w.mT, (w * p.depth_jacobian).mT)
+    return shift.mT, p.pose_jacobian * w.mT[:, None], r.mT, weights

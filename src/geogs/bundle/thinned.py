@@ -1,0 +1,85 @@
+"""Some cells of an adjustment, which stand for all where it is asked how well it is known.
+
+Linearised on the CPU, some edges at a time, wherever the matches lie.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.flow_term import (
+    PinholeFlow,
+    SourceFlow,
+    linearised_sources,
+    residual_norms,
+)
+from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
+from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import BundleState, DepthTerm
+from geogs.world.grid import SampleGrid
+
+AnyProblem = BundleProblem | StreamedProblem
+
+
+class ThinnedProblem:
+    """A problem with some of the cells, which stand for all of them; on the CPU."""
+
+    def __init__(self, grid: SampleGrid, problem: AnyProblem, cells: int) -> None:
+        step = -(-grid.size // cells)
+        self._problem, self._cells = problem, slice(None, None, step)
+        self.flow = PinholeFlow(grid.camera, grid.rays[self._cells].cpu())
+        self.pixels = grid.pixels[self._cells].cpu()
+        self.count = len(self.flow.rays)
+        self.fraction = self.count / grid.size
+        self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
+
+    def sources(self, options: BundleOptions) -> Iterator[SourceFlow]:
+        """All sources, in order."""
+        for part in self.parts(options):
+            yield from linearised_sources(self.flow, part, part.start, options)
+
+    def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
+        """Each source in order, and norms of its matches' residuals in standard deviations."""
+        for part in self.parts(options):
+            i, j = part.source, part.target
+            T_ji = relative_motion(part.T_cw, i, j)
+            at = project(self.flow.camera, self.flow.rays, T_ji, self.inverse_depth[i])
+            norm = residual_norms(at, part.pixels, part.weight)
+            used = at.valid & (part.weight[..., 0] > 0)
+            for frame, edges in sources_within(i):
+                yield frame, norm[edges][used[edges]]
+
+    def parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
+        """Some edges at a time, with the terms of depths."""
+        p, cells = self._problem, self._cells
+        terms = tuple(_ThinnedTerm(term, p.start, cells) for term in p.depth_terms)
+        for chunk in source_chunks(p.source.cpu(), options.chunk):
+            part = p.part(chunk)
+            yield BundleProblem(
+                p.T_cw.cpu(), self.inverse_depth, part.source.cpu(), part.target.cpu(),
+                p.free_pose.cpu(), p.free_depth.cpu(), terms,
+                pixels=part.pixels[:, cells].cpu(), weight=part.weight[:, cells].cpu(),
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _ThinnedTerm:
+    """A term of depths on some of the cells."""
+
+    term: DepthTerm
+    state: BundleState
+    """With all cells."""
+    cells: slice
+    information: None = None
+
+    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
+        edges = self.term.of_frame(frame, self.state)
+        assert edges.depth is not None
+        return replace(edges, depth=edges.depth.on_cells(self.cells))
+
+    def cost(self, state: BundleState) -> float:
+        return self.term.cost(self.state)

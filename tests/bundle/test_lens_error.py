@@ -1,0 +1,162 @@
+"""The error of a lens against lenses that bend, and against adjustments of what they show."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bundle_scenes import CAMERA
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.lens_error import (
+    LEAST,
+    PRIOR,
+    LensBend,
+    LensEvidence,
+    lens_evidence,
+    lens_shapes,
+)
+from geogs.bundle.marginals import ALIKE, marginals
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
+from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
+from geogs.world.grid import SampleGrid
+
+EXACT = BundleOptions(huber=50.0, depth_damping=0.0)
+SOLVED = BundleOptions(iterations=20, huber=50.0, damping=1e-9, depth_damping=1e-9)
+
+
+def walk(bend: tuple[float, ...] = (0.0, 0.0, 0.0)) -> tuple[SampleGrid, BundleProblem]:
+    """Six views forward, a little aside, and turning, of a lens that is no pinhole of CAMERA's."""
+    g, n, grid = torch.Generator().manual_seed(3), 6, SampleGrid(CAMERA)
+    k = torch.arange(n, dtype=torch.float64)
+    xi = torch.stack([0.03 * k, 0.02 * k.sin(), -0.08 * k, 0.02 * k, 0.06 * k, 0.03 * k.cos()], 1)
+    T, d = se3_exp(xi), 0.5 + 0.6 * torch.rand(n, grid.size, generator=g)
+    pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
+    source, target = (torch.tensor([p[m] for p in pairs]) for m in (0, 1))
+    true = pinhole(grid.pixels, bend)
+    wanted = project(CAMERA, rays(true), relative_motion(T, source, target), d[source]).pixels
+    seen = wanted
+    for _ in range(5):  # whose pinhole's pixel is the wanted one
+        seen = seen + wanted - pinhole(seen, bend)
+    inside = grid.inside(wanted)[..., None].expand_as(seen)
+    seen, weight = torch.where(inside, seen, grid.centre), 1e4 * inside
+    free = torch.ones(n, dtype=torch.bool)
+    free[0] = False
+    return grid, BundleProblem(
+        T, d, source, target, free, torch.ones_like(free), pixels=seen, weight=weight
+    )
+
+
+def pinhole(pixels: Tensor, bend: tuple[float, ...]) -> Tensor:
+    """Where a pinhole would have seen what a lens shows at pixels."""
+    return pixels + torch.einsum("k,k...->...", torch.tensor(bend), lens_shapes(CAMERA, pixels))
+
+
+def rays(pixels: Tensor) -> Tensor:
+    plane = (pixels - pixels.new_tensor([CAMERA.cx, CAMERA.cy])) / pixels.new_tensor(
+        [CAMERA.fx, CAMERA.fy]
+    )
+    return torch.cat([plane, torch.ones_like(plane[:, :1])], 1)
+
+
+def evidence(grid: SampleGrid, problem: BundleProblem, chunk: int = 24) -> LensEvidence:
+    options = replace(EXACT, chunk=chunk)
+    covariance = marginals(grid, problem, options, grid.size).covariance / ALIKE
+    return lens_evidence(grid, problem, options, covariance, grid.size)
+
+
+@pytest.mark.parametrize("bend", [(0.01, 0.0), (0.0, -0.02), (0.01, -0.03)])
+def test_matches_tell_how_the_lens_bends(bend):
+    found = evidence(*walk((0.0, *bend))).bend
+    torch.testing.assert_close(found.size, torch.tensor(bend).double(), atol=3e-4, rtol=0.04)
+    assert found.evidence > 50
+
+
+def test_matches_tell_what_they_do_wherever_they_lie():
+    grid, problem = walk((0.0, 0.01, -0.02))
+    one, parts = evidence(grid, problem), evidence(grid, problem, chunk=6)
+    torch.testing.assert_close(one.bend.size, parts.bend.size)
+    assert one.joined(parts).bend.size == pytest.approx(one.bend.size)
+
+
+def test_a_focal_length_that_is_off_is_told_beside_the_bend():
+    all_ = evidence(*walk((0.004, 0.01, -0.02)))
+    solved = torch.linalg.solve(all_.information.sum(0), all_.gradient.sum(0))
+    torch.testing.assert_close(
+        solved, torch.tensor([0.004, 0.01, -0.02]).double(), atol=3e-4, rtol=0.04
+    )
+
+
+def test_noise_alone_is_no_evidence():
+    grid, problem = walk()
+    for seed in range(4):
+        g = torch.Generator().manual_seed(seed)
+        noise = 0.01 * torch.randn(problem.pixels.shape, generator=g)
+        found = evidence(grid, replace(problem, pixels=problem.pixels + noise)).bend
+        assert found.evidence < 20
+
+
+def test_poses_move_by_what_the_lens_does_to_them():
+    """Against adjustments of what a lens shows."""
+    size = 0.004
+    grid, straight = walk()
+    found = evidence(grid, straight)
+    for n in range(3):
+        bend = tuple(size * (k == n) for k in range(3))
+        solved = DenseBundle(grid).solve(
+            replace(walk(bend)[1], T_cw=straight.T_cw, inverse_depth=straight.inverse_depth), SOLVED
+        )
+        # An error of the lens that is taken off moves poses back.
+        move = -same_length(solved.T_cw, straight.T_cw).reshape(-1)
+        foretold = size * found.moves[:, n]
+        assert float((move - foretold).norm() / move.norm()) < 0.1
+
+
+def same_length(T: Tensor, truth: Tensor) -> Tensor:
+    """Moves of poses whose lengths are brought to those of the truth, as covariances are."""
+    T, t = T.clone(), T[:, :3, 3]
+    T[:, :3, 3] /= float((t * truth[:, :3, 3]).sum() / truth[:, :3, 3].square().sum())
+    return se3_log(T @ se3_inverse(truth))
+
+
+def test_matches_that_are_corrected_are_those_of_a_pinhole():
+    bend = LensBend(0.01, -0.02)
+    grid, problem = walk((0.0, bend.k1, bend.k2))
+    T_ji = relative_motion(problem.T_cw, problem.source, problem.target)
+    d = problem.inverse_depth[problem.source]
+    wanted = project(CAMERA, grid.rays, T_ji, d).pixels
+    found = problem.pixels + bend.of_matches(CAMERA, grid.rays, T_ji, d)
+    off, before = ((problem.weight * (p - wanted)).norm() for p in (found, problem.pixels))
+    assert off < 0.03 * before
+
+
+def test_what_is_said_of_poses_is_the_mean_square_over_lenses():
+    """Against lenses drawn by ``PRIOR``, each seen with noise, and what they do."""
+    g = torch.Generator().manual_seed(0)
+    moves = torch.randn(12, 3, generator=g, dtype=torch.float64)
+    prior, least = torch.tensor(PRIOR).double(), torch.tensor(LEAST).double()
+    noise = torch.tensor([0.02, 0.02, 0.2]).double()
+    count = 40
+    each = torch.diag(1 / noise.square())[None].expand(count, 3, 3) / count
+    said = torch.zeros(12, dtype=torch.float64)
+    true = torch.zeros_like(said)
+    for _ in range(300):
+        lens = prior * torch.randn(3, generator=g, dtype=torch.float64)
+        seen = torch.randn(count, 3, generator=g, dtype=torch.float64) / noise / count**0.5
+        seen = (
+            seen + least * torch.randn(3, generator=g, dtype=torch.float64) / noise.square() / count
+        )
+        found = LensEvidence(each, each @ lens + seen, moves)
+        said += found.considered().diagonal()
+        true += (moves @ lens).square()
+    assert float((said / true).log().abs().max()) < 0.2
+
+
+def test_without_evidence_the_lens_is_as_unsure_as_before():
+    moves = torch.eye(3).double()
+    found = LensEvidence(torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves)
+    wanted = torch.diag(torch.tensor(PRIOR).double().square())
+    # Nothing is said of it, whatever is estimated.
+    assert float((found.considered() - wanted).abs().max()) < 1e-3 * float(wanted.max())

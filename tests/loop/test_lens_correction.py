@@ -1,0 +1,123 @@
+"""A lens in the adjustment of all keyframes: a walk past a wall, with exact matches of a lens."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from geogs.bundle.lens_error import lens_shapes
+from geogs.bundle.projection import project
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.geometry.umeyama import umeyama
+from geogs.loop import lens_correction
+from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
+from geogs.tracking.tracker import Tracker, lone_tracker
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
+from planted_walk import PlantedFlow, true_inverse_depth
+
+CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
+GRID, COUNT = SampleGrid(CAMERA), 24
+BEND = 0.06, -0.1
+
+
+def forward() -> Tensor:
+    """World to camera: straight on along a corridor, looking a little about."""
+    k = np.arange(COUNT)
+    xi = np.zeros((COUNT, 6))
+    xi[:, 4] = 1.57 + 0.08 * np.sin(0.5 * k)
+    T_wc = se3_exp(torch.from_numpy(xi))
+    T_wc[:, :3, 3] = torch.from_numpy(np.stack([0.2 * k, 0.03 * np.sin(k), 0.0 * k], -1))
+    return se3_inverse(T_wc)
+
+
+class BentFlow(PlantedFlow):
+    """Exact matches between images of a lens."""
+
+    def __init__(self, T: Tensor, bend: tuple[float, float]) -> None:
+        self.bend = torch.tensor([0.0, *bend])
+        shown = self._pinhole(GRID.pixels)
+        centre, focal = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
+        self.rays = torch.cat([(shown - centre) / focal, torch.ones(GRID.size, 1)], 1)
+        own = SampleGrid(CAMERA)
+        object.__setattr__(own, "rays", self.rays)
+        super().__init__(GRID, T, true_inverse_depth(T, own), 0.0)
+
+    def _pinhole(self, pixels: Tensor) -> Tensor:
+        return pixels + torch.einsum("k,k...->...", self.bend, lens_shapes(CAMERA, pixels))
+
+    def _match(self, source, target) -> FlowMatch:
+        i, j = list(source), list(target)
+        p = project(CAMERA, self.rays, self.T[j] @ se3_inverse(self.T[i]), self.d[i])
+        used = p.valid & GRID.inside(p.pixels)
+        wanted = torch.where(used[..., None], p.pixels, GRID.centre)
+        pixels = wanted
+        for _ in range(5):
+            pixels = pixels + wanted - self._pinhole(pixels)
+        g = torch.Generator().manual_seed(100 * i[0] + j[0])
+        pixels = pixels + 0.02 * torch.randn(pixels.shape, generator=g)
+        weight = torch.where(used, 400.0, 0.0)[..., None].expand(-1, -1, 2).contiguous()
+        return FlowMatch(pixels, weight)
+
+
+def tracker_of(bend: tuple[float, float]) -> tuple[Tracker, Tensor]:
+    T = forward()
+    flow = BentFlow(T, bend)
+    tracker = lone_tracker(CAMERA, operator=flow)
+    for n in range(COUNT):
+        image = np.full((4, 4, 3), (n, 0, 0), np.uint8)
+        state = tracker.keyframes.add(n, n / 10, image, n, T[n].clone())
+        state.inverse_depth, state.information = flow.d[n].clone(), torch.full_like(flow.d[n], 1e4)
+        tracker.map.recorder.add_keyframe(state)
+    tracker.segment.status.state = TrackState.TRACKING
+    return tracker, T
+
+
+def error(tracker: Tracker, truth: Tensor) -> float:
+    """Root mean square error of the centres after a similarity."""
+    x, y = (se3_inverse(T)[:, :3, 3] for T in (tracker.keyframes.poses(range(COUNT)), truth))
+    scale, R, t = umeyama(x, y)
+    return float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+
+
+@pytest.fixture(autouse=True)
+def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 3)
+
+
+def test_a_corridor_through_a_lens_that_nobody_told_keeps_its_scale(monkeypatch):
+    tracker, truth = tracker_of(BEND)
+    believed = lens_correction.EVIDENCE
+    monkeypatch.setattr(lens_correction, "EVIDENCE", np.inf)
+    global_bundle(tracker)
+    bent = error(tracker, truth)
+    assert bent > 0.008
+    tracker, truth = tracker_of(BEND)
+    monkeypatch.setattr(lens_correction, "EVIDENCE", believed)
+    global_bundle(tracker)
+    assert error(tracker, truth) < 0.2 * bent
+
+
+def test_the_bend_is_told_as_it_is():
+    tracker, _ = tracker_of(BEND)
+    ids = list(range(COUNT))
+    tracker.map.graph.measure(
+        [(a, b) for a in ids for b in range(a + 1, min(a + 4, COUNT))], packed=True
+    )
+    tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    bend = lens_correction.correct_lens(tracker, ids[1:], ids, GLOBAL_OPTIONS)
+    assert bend is not None
+    assert (bend.k1, bend.k2) == pytest.approx(BEND, rel=0.1)
+
+
+def test_a_lens_that_is_known_is_left_alone():
+    tracker, _ = tracker_of((0.0, 0.0))
+    ids = list(range(COUNT))
+    tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
+    tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    before = {e: v.position.clone() for e, v in tracker.map.graph.edges.items()}
+    assert lens_correction.correct_lens(tracker, ids[1:], ids, GLOBAL_OPTIONS) is None
+    for pair, edge in tracker.map.graph.edges.items():
+        assert torch.equal(edge.position, before[pair])
