@@ -1,5 +1,6 @@
 """What tracking lost is placed by structure from motion, where that is better, and else kept."""
 
+import functools
 import json
 import signal
 from dataclasses import replace
@@ -19,7 +20,7 @@ from geogs.config import Config, preset, preset_of
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.frame_source import Source
 from io_samples import write_image
-from posed_layouts import render_room
+from posed_layouts import Room, render_room
 from posed_scene import SMALL
 
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
@@ -84,11 +85,17 @@ def test_the_map_is_made_by_the_preset_of_the_run():
     assert preset_of(replace(Config(), mapping=own)) == "default"
 
 
+@functools.cache
+def filmed() -> Room:
+    """What all tests here see; rendered once in a process. Nobody may change it."""
+    return render_room(FRAMES, 3, 160, 120)
+
+
 @pytest.fixture
 def video(tmp_path, monkeypatch):
     """A few small frames of a room, of which tracking is taken to have lost too many."""
     pytest.importorskip("pycolmap")
-    room = render_room(FRAMES, 3, 160, 120)
+    room = filmed()
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
     monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
