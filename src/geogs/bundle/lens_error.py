@@ -18,7 +18,13 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import linearised_sources, weighed_residuals
 from geogs.bundle.problem import BundleProblem, sources_within
-from geogs.bundle.projection import carried_over, linearise, project, relative_motion
+from geogs.bundle.projection import (
+    CellProjection,
+    carried_over,
+    linearise,
+    project,
+    relative_motion,
+)
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
@@ -46,20 +52,18 @@ def shape_shifts(
     camera: Camera,
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
+    at: CellProjection,
 ) -> Float[Tensor, "3 e p 2"]:
     """What is to be added to where cells were found, for each size of one.
 
     What a cell shows lies off it, and so does what is found in the target; the former is carried
-    over at the cell's own depth. The latter is taken where the cell falls: where it was found is
-    off by the residual, and the product of both would count as evidence.
+    over at the cell's own depth. The latter is taken where the cell falls (``at``): where it was
+    found is off by the residual, and the product of both would count as evidence.
     """
-    pixels = project(camera, rays, T_ji, inverse_depth).pixels
-    own = pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
-    own = own + pixels.new_tensor([camera.cx, camera.cy])
-    there, here = lens_shapes(camera, pixels), lens_shapes(camera, own)
-    moved = [carried_over(camera, rays, T_ji, inverse_depth, s.expand_as(pixels)) for s in here]
-    return there - torch.stack(moved)
+    own = at.pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
+    own = own + at.pixels.new_tensor([camera.cx, camera.cy])
+    there, here = lens_shapes(camera, at.pixels), lens_shapes(camera, own)
+    return there - carried_over(camera, T_ji, at, here[:, None].expand_as(there))
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class LensBend:
         inverse_depth: Float[Tensor, "e p"],
     ) -> Float[Tensor, "e p 2"]:
         """What is to be added to where cells were found, as if a pinhole had seen both views."""
-        shift = shape_shifts(camera, rays, T_ji, inverse_depth)
+        shift = shape_shifts(camera, rays, T_ji, project(camera, rays, T_ji, inverse_depth))
         return self.k1 * shift[1] + self.k2 * shift[2]
 
 
@@ -197,15 +201,15 @@ class _Reduced(NamedTuple):
 def _reduced(thinned: ThinnedProblem, options: BundleOptions) -> Iterator[_Reduced]:
     """Each source in order."""
     for part in thinned.parts(options):
-        shift, wJ, residual, weights = _weighed(thinned, part, options)
+        matches = _weighed(thinned, part, options)
         sources = linearised_sources(thinned.flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(part.source), strict=True):
             depth, chain = source.edges.depth, source.edges.chain
             assert depth is not None
             free = float(part.free_depth[frame]) / depth.curvature
-            S, r, w = shift[:, e], residual[e], weights.flow[e]
-            along = torch.einsum("eiap,keap->eik", wJ[e], S).flatten(0, 1)
-            on_depth = (weights.depth[e] * S).sum((1, 2))
+            S, r, w = matches.shift[:, e], matches.residual[e], matches.weight[e]
+            along = torch.einsum("eiap,keap->eik", matches.on_pose[e], S).flatten(0, 1)
+            on_depth = (matches.on_depth[e] * S).sum((1, 2))
             follow = depth.coupling * free
             information = torch.einsum("keap,leap,eap->kl", S, S, w)
             gradient = -torch.einsum("keap,eap,eap->k", S, r, w)
@@ -218,21 +222,23 @@ def _reduced(thinned: ThinnedProblem, options: BundleOptions) -> Iterator[_Reduc
             )
 
 
-class _Weights(NamedTuple):
-    flow: Float[Tensor, "e 2 p"]
-    depth: Float[Tensor, "e 2 p"]
-    """Times the derivative by the inverse depth."""
+class _Weighed(NamedTuple):
+    """Matches of some edges."""
+
+    shift: Float[Tensor, "k e 2 p"]
+    residual: Float[Tensor, "e 2 p"]
+    weight: Float[Tensor, "e 2 p"]
+    on_pose: Float[Tensor, "e 6 2 p"]
+    """The weight times the derivative by the poses."""
+    on_depth: Float[Tensor, "e 2 p"]
+    """The weight times the derivative by the inverse depth."""
 
 
-def _weighed(
-    thinned: ThinnedProblem, part: BundleProblem, options: BundleOptions
-) -> tuple[Tensor, Tensor, Tensor, _Weights]:
-    """Shifts (k e 2 p), weighed derivatives by the poses (e 6 2 p), residuals (e 2 p), weights."""
+def _weighed(thinned: ThinnedProblem, part: BundleProblem, options: BundleOptions) -> _Weighed:
     camera, rays = thinned.flow.camera, thinned.flow.rays
     T_ji = relative_motion(part.T_cw, part.source, part.target)
-    d = part.inverse_depth[part.source]
-    p = linearise(camera, rays, T_ji, d)
+    p = linearise(camera, rays, T_ji, part.inverse_depth[part.source])
     r, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
-    shift = shape_shifts(camera, rays, T_ji, d)
-    weights = _Weights(w.mT, (w * p.depth_jacobian).mT)
-    return shift.mT, p.pose_jacobian * w.mT[:, None], r.mT, weights
+    shift = shape_shifts(camera, rays, T_ji, p)
+    on_pose, on_depth = p.pose_jacobian * w.mT[:, None], (w * p.depth_jacobian).mT
+    return _Weighed(shift.mT, r.mT, w.mT, on_pose, on_depth)

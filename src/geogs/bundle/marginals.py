@@ -59,6 +59,11 @@ class Marginals:
         return self.covariance.reshape(n, 6, n, 6).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
 
     @property
+    def is_bounded(self) -> bool:
+        """Whether matches tell of all poses."""
+        return bool(self.covariance.isfinite().all())
+
+    @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
         """Median of ``relative_depth`` over the cells with matches; infinite without any."""
         known = torch.where(self.relative_depth.isfinite(), self.relative_depth, torch.nan)
@@ -113,7 +118,7 @@ def common_covariance(
     Args:
         grid, problem, options, cells: as of :func:`marginals`, which gave ``found``.
     """
-    if not bool(found.covariance.isfinite().all()):
+    if not found.is_bounded:
         return torch.zeros_like(found.covariance)
     part = ThinnedProblem(grid, problem, cells)
     n = len(problem.T_cw)

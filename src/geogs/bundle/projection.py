@@ -116,17 +116,15 @@ def linearise(
 
 def carried_over(
     camera: Camera,
-    rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
-    step: Float[Tensor, "e p 2"],
-) -> Float[Tensor, "e p 2"]:
+    at: CellProjection,
+    step: Float[Tensor, "*b e p 2"],
+) -> Float[Tensor, "*b e p 2"]:
     """Small steps of the cells of source frames, in pixels of the targets, at constant depth.
 
-    To first order.
+    To first order; ``at`` is where the cells fall by T_ji.
     """
-    p = project(camera, rays, T_ji, inverse_depth)
-    focal = p.pixels.new_tensor([camera.fx, camera.fy])
-    plane = (p.pixels - p.pixels.new_tensor([camera.cx, camera.cy])) / focal
+    focal = at.pixels.new_tensor([camera.fx, camera.fy])
+    plane = (at.pixels - at.pixels.new_tensor([camera.cx, camera.cy])) / focal
     moved = (step / focal) @ T_ji[:, :3, :2].to(step).mT
-    return focal * (moved[..., :2] - plane * moved[..., 2:]) / p.z[..., None]
+    return focal * (moved[..., :2] - plane * moved[..., 2:]) / at.z[..., None]

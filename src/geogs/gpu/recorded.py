@@ -23,16 +23,16 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
     end the recording with an error.
     """
     graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
-    with (
-        torch.cuda.device(device),
-        torch.cuda.graph(graph, capture_error_mode="thread_local"),
-    ):
-        gc.disable()
-        try:
+    gc.disable()
+    try:
+        with (
+            torch.cuda.device(device),
+            torch.cuda.graph(graph, capture_error_mode="thread_local"),
+        ):
             yield graph
-        finally:
-            if collects:
-                gc.enable()
+    finally:
+        if collects:
+            gc.enable()
 
 
 class Recorded:

@@ -7,17 +7,15 @@ straight on drifts in scale (docs/tracking.md).
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from geogs.bundle.lens_error import LensBend
 from geogs.bundle.protocols import BundleOptions
-from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.pose_filling import shift_lens
 from geogs.tracking.frames.row_errors import TOGETHER
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import lens_estimate
 from geogs.tracking.tracker import Tracker
-from geogs.world.edges import PackedEdge, Pair, in_steps
+from geogs.world.edges import PackedEdge, Pair
 
 ROUNDS = 3
 """Each is to first order; the second and third take a fifth and a twentieth of what the first
@@ -40,7 +38,7 @@ def correct_lens(
     saved map, whose keyframes stay as its own adjustment left them.
     """
     graph, keyframes = tracker.map.graph, tracker.keyframes
-    measured = {e: edge for e, edge in graph.edges.items() if isinstance(edge, PackedEdge)}
+    measured = graph.packed
     bend = LensBend()
     for n in range(ROUNDS if measured and not tracker.segment.fixed else 0):
         said = lens_estimate(tracker, list(free_depth))
@@ -60,10 +58,7 @@ def _shift(graph: FrameGraph, measured: dict[Pair, PackedEdge], bend: LensBend) 
     grid, keyframes, pairs = graph.keyframes.grid, graph.keyframes, sorted(measured)
     for start in range(0, len(pairs), TOGETHER):
         part = pairs[start : start + TOGETHER]
-        source, target = ([pair[k] for pair in part] for k in (0, 1))
-        T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
-        shifts = bend.of_matches(grid.camera, grid.rays, T_ji, keyframes.inverse_depths(source))
-        steps = in_steps(grid.camera, shifts)
-        for pair, step in zip(part, steps, strict=True):
-            edge = measured[pair]
-            graph.edges[pair] = replace(edge, position=edge.position + step)
+        T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
+        shifts = bend.of_matches(grid.camera, grid.rays, T_ji, depth)
+        for pair, shift in zip(part, shifts, strict=True):
+            graph.edges[pair] = measured[pair].moved(grid.camera, shift)

@@ -16,14 +16,12 @@ from torch import Tensor
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
-from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.tracker import Tracker
-from geogs.world.edges import PackedEdge, Pair, edge_matches, in_steps
-from geogs.world.grid import SampleGrid
+from geogs.world.edges import PackedEdge, Pair, edge_matches
 
 ROUNDS = 2
 """Where the readout is not searched for: the first takes most of it."""
@@ -52,7 +50,7 @@ def correct_rows(
     whether the readout is found once more, where it was found in the video.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
-    measured = {e: edge for e, edge in graph.edges.items() if isinstance(edge, PackedEdge)}
+    measured = graph.packed
     search, grid, last = _Search(), keyframes.grid, ROUNDS - 1
     between = replace(options, iterations=min(options.iterations, BETWEEN))
     for n in range(1 + READOUTS):
@@ -70,7 +68,7 @@ def correct_rows(
         present = errors.with_readout(search.factor)
         for part, shift in _shifts(graph, measured, present):
             graph.edges.update(
-                {pair: _moved(grid, measured[pair], s) for pair, s in zip(part, shift, strict=True)}
+                {e: measured[e].moved(grid.camera, s) for e, s in zip(part, shift, strict=True)}
             )
         graph.adjust(list(graph.edges), free_pose, free_depth, options if n == last else between)
         shift_rows(log, keyframes, present)
@@ -112,7 +110,7 @@ def _readout_gradient(
     grid, keyframes = graph.keyframes.grid, graph.keyframes
     both = zip(_shifts(graph, measured, low), _shifts(graph, measured, high), strict=True)
     for (part, before), (_, after) in both:
-        T, depth = _relative(graph, part), keyframes.inverse_depths([i for i, _ in part])
+        T, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
         weight = static_weight(keyframes, part, pixels, weight)
         p = project(grid.camera, grid.rays, T, depth)
@@ -128,13 +126,3 @@ def _shifts(
 ) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
     keyframes = graph.keyframes
     return edge_shifts(errors, keyframes, measured, lambda id: keyframes[id].frame_index)
-
-
-def _relative(graph: FrameGraph, pairs: Sequence[Pair]) -> Float[Tensor, "e 4 4"]:
-    source, target = (graph.keyframes.poses([pair[k] for pair in pairs]) for k in (0, 1))
-    return target @ se3_inverse(source)
-
-
-def _moved(grid: SampleGrid, edge: PackedEdge, shift: Float[Tensor, "p 2"]) -> PackedEdge:
-    """An edge with its matches elsewhere."""
-    return replace(edge, position=edge.position + in_steps(grid.camera, shift))

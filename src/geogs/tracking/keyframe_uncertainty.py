@@ -97,7 +97,7 @@ def lens_estimate(tracker: Tracker, ids: list[int]) -> LensEstimate | None:
     found = None
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         said = _solution(tracker, ids[first : first + TOGETHER + 1])
-        if said is not None and bool(said.known.covariance.isfinite().all()):
+        if said is not None and said.known.is_bounded:
             part = said.lens()
             found = part if found is None else found.joined(part)
     return None if found is None else found.bend
@@ -136,7 +136,7 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     if solution is None:
         return None
     found, covariance = solution.known, solution.known.covariance
-    if bool(covariance.isfinite().all()):
+    if found.is_bounded:
         common = common_covariance(solution.grid, solution.problem, OPTIONS, found, CELLS)
         covariance = covariance + common + solution.lens().considered()
     own = torch.tensor([solution.frames.index(k) for k in ids])

@@ -4,7 +4,7 @@ A packed edge takes a third of the memory, for graphs over thousands of keyframe
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import torch
@@ -60,6 +60,10 @@ class PackedEdge:
     """Damping of the source's inverse depth, if the operator gives one."""
     memory: Any = field(default=None, metadata={"stored": False})
     """What the operator keeps of this edge, and can do without."""
+
+    def moved(self, camera: Camera, shift: Float[Tensor, "p 2"]) -> "PackedEdge":
+        """With its matches so many pixels elsewhere."""
+        return replace(self, position=self.position + in_steps(camera, shift))
 
 
 Edge = MeasuredEdge | PackedEdge

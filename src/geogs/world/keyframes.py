@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geogs.config.setting import Range
 from geogs.errors import InputError
-from geogs.geometry.lie import scaled, sim3_scale
+from geogs.geometry.lie import scaled, se3_inverse, sim3_scale
 from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
 from geogs.types import MeasuredPose, PoseCorrection
 from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
@@ -330,6 +330,11 @@ class KeyframeSet:
     def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera, float64, on the CPU."""
         return torch.from_numpy(self.table.poses.rows(ids))
+
+    def relative_poses(self, pairs: Sequence[tuple[int, int]]) -> Float[Tensor, "e 4 4"]:
+        """T_ji of each pair (i, j): from the camera of the first to that of the second."""
+        source, target = (self.poses([pair[k] for pair in pairs]) for k in (0, 1))
+        return target @ se3_inverse(source)
 
     def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
         """On the grid."""

@@ -189,9 +189,7 @@ def match(
     for start in range(0, len(stale), MATCHED_TOGETHER[0]):
         graph.measure(stale[start : start + MATCHED_TOGETHER[0]], packed=True)
     node = {id: n for n, id in ids.items()}
-    found = {
-        (node[i], node[j]): e for (i, j), e in graph.edges.items() if isinstance(e, PackedEdge)
-    }
+    found = {(node[i], node[j]): e for (i, j), e in graph.packed.items()}
     errors = _row_errors(grid, members, results, ids)
     shift: dict[Directed, Tensor] = {}
     if errors is not None:

@@ -113,7 +113,7 @@ def test_a_step_is_carried_as_finite_differences_carry_it():
         moved = rays.clone()
         moved[:, axis] += small / (CAMERA.fx, CAMERA.fy)[axis]
         numeric = (project(CAMERA, moved, T_ji, d).pixels - p.pixels) / small
-        carried = carried_over(CAMERA, rays, T_ji, d, step)
+        carried = carried_over(CAMERA, T_ji, p, step)
         torch.testing.assert_close(carried[p.valid], numeric[p.valid], atol=1e-3, rtol=1e-3)
 
 

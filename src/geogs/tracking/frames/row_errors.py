@@ -122,9 +122,7 @@ class RowErrors:
         own = (own + pixels.new_tensor([camera.cx, camera.cy])).expand_as(pixels)
         p = project(camera, rays, T_ji, inverse_depth)
         there = self.of_pixels(target, pixels, inverse_depth / p.z)
-        moved = carried_over(
-            camera, rays, T_ji, inverse_depth, self.of_pixels(source, own, inverse_depth)
-        )
+        moved = carried_over(camera, T_ji, p, self.of_pixels(source, own, inverse_depth))
         error = there - moved
         believed = p.valid & (error.norm(dim=-1) < LARGEST * camera.long_edge)
         return torch.where(believed[..., None], error, 0.0)
@@ -180,7 +178,7 @@ def edge_shifts(
     for start in range(0, len(pairs), TOGETHER):
         part = pairs[start : start + TOGETHER]
         source, target = ([pair[k] for pair in part] for k in (0, 1))
-        T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
+        T_ji = keyframes.relative_poses(part)
         pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
         yield part, errors.of_matches(
             [frame_of(k) for k in source], [frame_of(k) for k in target], T_ji, grid.rays,

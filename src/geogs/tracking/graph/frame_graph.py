@@ -58,6 +58,11 @@ class FrameGraph:
         """Measured pairs."""
         return [(i, j) for i, j in self.edges if i < j]
 
+    @property
+    def packed(self) -> dict[Pair, PackedEdge]:
+        """The edges that are kept packed."""
+        return {pair: e for pair, e in self.edges.items() if isinstance(e, PackedEdge)}
+
     def remove_keyframe(self, id: int) -> None:
         """Forget every edge of a keyframe."""
         for directed in [e for e in self.edges if id in e]:
