@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from geogs.bundle.lens_error import lens_shapes
 from geogs.bundle.projection import project
+from geogs.bundle.uncertainty.lens_error import lens_shapes
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama

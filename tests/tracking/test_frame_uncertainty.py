@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.marginals import ALIKE
+from geogs.bundle.uncertainty.marginals import ALIKE
 from geogs.geometry.lie import retract, se3_inverse
 from geogs.tracking.frame_uncertainty import (
     CAUTION,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle import lens_error, marginals
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty import lens_error, marginals
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama

@@ -8,8 +8,8 @@ straight on drifts in scale (docs/tracking.md).
 
 from collections.abc import Sequence
 
-from geogs.bundle.lens_error import LensBend
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty.lens_error import LensBend
 from geogs.tracking.frames.pose_filling import shift_lens
 from geogs.tracking.frames.row_errors import TOGETHER
 from geogs.tracking.graph.frame_graph import FrameGraph

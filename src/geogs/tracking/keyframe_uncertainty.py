@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from geogs.bundle.gauge import deviations_after_alignment
-from geogs.bundle.lens_error import LensEstimate, LensEvidence, lens_evidence
-from geogs.bundle.marginals import ALIKE, Marginals, common_covariance, marginals
 from geogs.bundle.problem import StreamedProblem
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty.gauge import deviations_after_alignment
+from geogs.bundle.uncertainty.lens_error import LensEstimate, LensEvidence, lens_evidence
+from geogs.bundle.uncertainty.marginals import ALIKE, Marginals, common_covariance, marginals
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
@@ -62,8 +62,8 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
 
     What it says of poses is what is left of their errors when the trajectory is laid over the truth
     by a similarity, for frame and unit of the map are anyone's
-    (:func:`~geogs.bundle.gauge.deviations_after_alignment`). In the world of a saved map: of the
-    keyframes that it did not bring, relative to it.
+    (:func:`~geogs.bundle.uncertainty.gauge.deviations_after_alignment`). In the world of a saved
+    map: of the keyframes that it did not bring, relative to it.
 
     In a video of more than ``TOGETHER`` keyframes each part begins where the one before it ended,
     and deviations are relative to the first keyframe: errors add up along the way whatever loops

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import motion_solver
-from geogs.bundle.lens_error import LensBend
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
+from geogs.bundle.uncertainty.lens_error import LensBend
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.interpolation import bridged

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.marginals import ALIKE
 from geogs.bundle.projection import linearise
+from geogs.bundle.uncertainty.marginals import ALIKE
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.pose_filling import depth_aware_weight
 from geogs.tracking.locate.frame_locator import FrameMotion

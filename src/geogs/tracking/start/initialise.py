@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
-from geogs.bundle.marginals import marginals
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty.marginals import marginals
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph

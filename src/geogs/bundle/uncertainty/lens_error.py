@@ -26,7 +26,7 @@ from geogs.bundle.projection import (
     relative_motion,
 )
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.thinned import AnyProblem, ThinnedProblem
+from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
 
@@ -168,7 +168,7 @@ def lens_evidence(
 
     Args:
         grid: where the depths are.
-        problem: as of :func:`~geogs.bundle.marginals.marginals`.
+        problem: as of :func:`~geogs.bundle.uncertainty.marginals.marginals`.
         options: Huber's limit and the damping of depths.
         covariance: inverse of the reduced equations of all poses, finite.
         cells: most cells of a frame that are asked; the others are taken to say the same.

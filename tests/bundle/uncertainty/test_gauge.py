@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.gauge import deviations_after_alignment
+from geogs.bundle.uncertainty.gauge import deviations_after_alignment
 from geogs.evaluation.rotation_errors import best_rotation, rotation_angle
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama

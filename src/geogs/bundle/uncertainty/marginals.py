@@ -17,7 +17,7 @@ from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.problem import sources_within
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.thinned import AnyProblem, ThinnedProblem
+from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.lie import se3_inverse
 from geogs.world.grid import SampleGrid
 
@@ -34,7 +34,7 @@ COMMON_FLOW = 0.1
 which the scene moves in the image: the other way round from a later to an earlier frame."""
 COMMON_PLACE = 0.15
 """The same of the place in the image, whichever frame is the earlier; beside what an error of the
-lens does (:mod:`geogs.bundle.lens_error`)."""
+lens does (:mod:`geogs.bundle.uncertainty.lens_error`)."""
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,18 @@ import torch
 from torch import Tensor
 
 from bundle_scenes import CAMERA, scene
-from geogs.bundle import marginals as room
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.marginals import (
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty import marginals as room
+from geogs.bundle.uncertainty.marginals import (
     ALIKE,
     COMMON_FLOW,
     COMMON_PLACE,
     common_covariance,
     marginals,
 )
-from geogs.bundle.problem import BundleProblem, StreamedProblem
-from geogs.bundle.projection import project, relative_motion
-from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.world.grid import SampleGrid

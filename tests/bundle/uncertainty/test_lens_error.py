@@ -8,7 +8,10 @@ from torch import Tensor
 
 from bundle_scenes import CAMERA
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.lens_error import (
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty.lens_error import (
     LEAST,
     PRIOR,
     LensBend,
@@ -16,10 +19,7 @@ from geogs.bundle.lens_error import (
     lens_evidence,
     lens_shapes,
 )
-from geogs.bundle.marginals import ALIKE, marginals
-from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import project, relative_motion
-from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty.marginals import ALIKE, marginals
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.world.grid import SampleGrid
 
