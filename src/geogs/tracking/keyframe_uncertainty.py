@@ -40,7 +40,7 @@ class KeyframeUncertainty:
     rotation: Float64[np.ndarray, "n"]
     """Likewise of its orientation, radians."""
     depth: Float64[np.ndarray, "n"]
-    """Median relative deviation of its depths."""
+    """Relative deviation of the best known of its depths (:class:`Marginals`)."""
     residual: Float64[np.ndarray, "n"]
     """Median residual of its matches, in their deviations."""
 

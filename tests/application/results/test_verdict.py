@@ -27,7 +27,7 @@ def test_a_good_run_says_how_good():
     assert found.position == pytest.approx(0.0035 / np.std(np.linspace(0, 1, 5)))
     assert found.sentence == (
         "Trajectory and shape are reliable: the camera's place is known to 1.0% of the extent of "
-        "its path, depths to 2.0%."
+        "its path, the best known depths to 2.0%."
     )
     best = verdict(walk(30, 30), walk(5, 5), known(0.00012, 0.02))
     assert "known to 0.03% of the extent" in best.sentence
@@ -38,7 +38,7 @@ def test_a_good_run_says_how_good():
     [
         (20, 0.001, 0.01, "the camera was lost in 33% of the frames"),
         (30, 0.1, 0.01, "its place is known only to 28% of the extent"),
-        (30, 0.001, 0.4, "depths are known only to 40%"),
+        (30, 0.001, 0.4, "even the best known depths are known only to 40%"),
         (30, 0.001, np.inf, "depths are known only to nothing"),
     ],
 )

@@ -14,9 +14,9 @@ right, but it is not what the video is about."""
 MAX_POSITION_DEVIATION = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MAX_DEPTH_DEVIATION = 0.2
-"""Relative deviation of depths."""
+"""Relative deviation of the best known depths."""
 NO_SHAPE = 0.5
-"""Relative deviation of depths from which on they are no evidence of a surface."""
+"""Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Verdict:
     rotation_deg: float
     """Median deviation of its orientation."""
     depth: float
-    """Median relative deviation of depths."""
+    """Median relative deviation of depths, of the best known quarter of what each keyframe sees."""
 
     @property
     def has_shape(self) -> bool:
@@ -75,13 +75,13 @@ def verdict(
     if not position <= MAX_POSITION_DEVIATION:
         reasons.append(f"its place is known only to {_percent(position)} of the extent of its path")
     if not depth <= MAX_DEPTH_DEVIATION:
-        reasons.append(f"depths are known only to {_percent(depth)}")
+        reasons.append(f"even the best known depths are known only to {_percent(depth)}")
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."
     else:
         sentence = (
             "Trajectory and shape are reliable: the camera's place is known to "
-            f"{_finely(position)} of the extent of its path, depths to {depth:.1%}."
+            f"{_finely(position)} of the extent of its path, the best known depths to {depth:.1%}."
         )
     return Verdict(not reasons, sentence, lost, orientation_only, position, rotation, depth)
 

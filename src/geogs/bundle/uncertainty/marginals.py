@@ -26,6 +26,9 @@ ALIKE = 2.25
 much their sum says less than its weights do. Measured on rendered rooms at the start of a map,
 where the errors are 0.4 to 0.9 of what the weights foretell in the median, and up to 1.3 times that
 at their upper tenth."""
+BEST_KNOWN = 0.25
+"""Part of a keyframe's cells that stands for its depths. Of bare walls matches tell nothing, however
+far the camera has moved, and a room of them is no worse known where there is something to see."""
 PLACES = 8, 5
 """Parts of the image, across and down; what matches of one part have in common is taken for
 independent of what those of another have."""
@@ -65,9 +68,9 @@ class Marginals:
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
-        """Median of ``relative_depth`` over the cells with matches; infinite without any."""
-        known = torch.where(self.relative_depth.isfinite(), self.relative_depth, torch.nan)
-        return known.nanmedian(-1).values.nan_to_num(torch.inf)
+        """That of the ``BEST_KNOWN`` of its cells whose depths are known best; infinite where fewer
+        have matches."""
+        return self.relative_depth.quantile(BEST_KNOWN, -1, interpolation="higher")
 
 
 def marginals(
