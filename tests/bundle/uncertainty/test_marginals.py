@@ -1,5 +1,6 @@
 """Marginal variances against the inverse of the full normal equations, and against samples."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ from geogs.bundle.uncertainty.marginals import (
     ALIKE,
     COMMON_FLOW,
     COMMON_PLACE,
+    Marginals,
     common_covariance,
     marginals,
 )
@@ -177,6 +179,23 @@ def test_what_nothing_measures_is_open():
     assert bool(found.relative_depth[2, :7].isfinite().all())
     weight[problem.source == 2] = 0
     assert marginals(grid, replace(problem, weight=weight), EXACT).depth_deviation[2] == torch.inf
+
+
+def test_bare_walls_leave_what_stands_before_them_known():
+    grid, problem = turning(0.05)
+    every = marginals(grid, problem, EXACT).depth_deviation
+
+    def seen(tenths: int) -> Marginals:
+        weight = problem.weight.clone()
+        weight[:, torch.arange(grid.size) % 10 >= tenths] = 0
+        return marginals(grid, replace(problem, weight=weight), EXACT)
+
+    found = seen(3)
+    assert bool((found.depth_deviation < 3 * every).all())
+    rows = [sorted(row.tolist()) for row in found.relative_depth]
+    by_hand = [row[math.ceil(0.25 * (len(row) - 1))] for row in rows]
+    assert found.depth_deviation.tolist() == pytest.approx(by_hand)
+    assert not seen(2).depth_deviation.isfinite().any()
 
 
 def test_some_cells_stand_for_all():

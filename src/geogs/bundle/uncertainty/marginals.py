@@ -27,8 +27,8 @@ much their sum says less than its weights do. Measured on rendered rooms at the 
 where the errors are 0.4 to 0.9 of what the weights foretell in the median, and up to 1.3 times that
 at their upper tenth."""
 BEST_KNOWN = 0.25
-"""Part of a keyframe's cells that stands for its depths. Of bare walls matches tell nothing, however
-far the camera has moved, and a room of them is no worse known where there is something to see."""
+"""Part of a keyframe's cells that stands for its depths. Of bare walls matches tell nothing,
+however far the camera has moved; what stands before them is no worse known for it."""
 PLACES = 8, 5
 """Parts of the image, across and down; what matches of one part have in common is taken for
 independent of what those of another have."""
