@@ -191,7 +191,7 @@ def test_bare_walls_leave_what_stands_before_them_known():
         return marginals(grid, replace(problem, weight=weight), EXACT)
 
     found = seen(3)
-    assert bool((found.depth_deviation < 3 * every).all())
+    assert bool((found.depth_deviation < 5 * every).all())
     rows = [sorted(row.tolist()) for row in found.relative_depth]
     by_hand = [row[math.ceil(0.25 * (len(row) - 1))] for row in rows]
     assert found.depth_deviation.tolist() == pytest.approx(by_hand)
