@@ -109,9 +109,7 @@ def test_video_plays(sequence: Path) -> None:
 
 def test_jpeg_without_depth(tmp_path: Path, raycaster: Raycaster) -> None:
     seen: list[int] = []
-    write_sequence(
-        tmp_path, 2, 32, 24, 1, depth=False, on_frame=seen.append, raycaster=raycaster
-    )
+    write_sequence(tmp_path, 2, 32, 24, 1, depth=False, on_frame=seen.append, raycaster=raycaster)
     assert sorted(p.name for p in (tmp_path / "results").iterdir()) == [
         "frame000000.jpg",
         "frame000001.jpg",
