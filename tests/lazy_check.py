@@ -8,12 +8,14 @@ then one of many; everywhere else all are.
 
 import dataclasses
 import inspect
+import threading
 from collections.abc import Callable
 from functools import partial, wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 import jaxtyping
 from beartype import beartype
+from beartype.roar import BeartypeCallHintReturnViolation, BeartypeCallHintViolation
 
 P, R = ParamSpec("P"), TypeVar("R")
 FIRST, EVERY = 8, 32
@@ -43,19 +45,31 @@ class Calls:
 CALLS = Calls()
 
 _inner: dict[tuple[str, str, str], Callable] = {}
-"""What checks functions within others, by module, name and annotations.
-
-jaxtyping has empty twins of functions checked, which differ in nothing else.
-"""
+"""What checks functions within others, by module, name and annotations; made once for them all."""
 _jaxtyped = jaxtyping.jaxtyped
 _own_names = _jaxtyped("context")
 """In which sizes have names of their own, as in a call that is checked."""
 
 
+class _ToCall(threading.local):
+    """Functions within others between the check of their arguments and their call."""
+
+    def __init__(self) -> None:
+        self.functions: list[Callable] = []
+
+
+_TO_CALL = _ToCall()
+
+
 def jaxtyped(
     function: Callable[P, R] | type | None = None, *, typechecker: Callable
 ) -> Callable[P, R] | type | Callable:
-    """What jaxtyping decorates functions and dataclasses with, not at work at every call."""
+    """What jaxtyping decorates functions and dataclasses with, not at work at every call.
+
+    jaxtyping's own prepares its check where a function is defined, within others at every call of
+    those, and checks arguments again with the result. Of generators, whose results jaxtyping
+    treats otherwise, it does the work.
+    """
     if function is None:
         return partial(jaxtyped, typechecker=typechecker)
     if inspect.isclass(function):
@@ -63,7 +77,14 @@ def jaxtyped(
         if dataclasses.is_dataclass(function) and made and not hasattr(made, "__wrapped__"):
             function.__init__ = jaxtyped(made, typechecker=typechecker)
         return function
-    check, count = _jaxtyped(function, typechecker=typechecker), CALLS.count_of(function)
+    count = CALLS.count_of(function)
+    names = {
+        n: _resolved(t, function) for n, t in function.__annotations__.items() if isinstance(t, str)
+    }
+    if inspect.isgeneratorfunction(function):
+        check = _jaxtyped(function, typechecker=typechecker)
+    else:
+        check = _named(typechecker(_annotated(function, names) if names else function))
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -73,6 +94,44 @@ def jaxtyped(
                 with _own_names:
                     return function(*args, **kwargs)
         return check(*args, **kwargs)
+
+    return call
+
+
+def _annotated(function: Callable[P, R], types: dict[str, object]) -> Callable[P, R]:
+    """The function with other types for some of its arguments."""
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return function(*args, **kwargs)
+
+    call.__annotations__ = {**function.__annotations__, **types}
+    return call
+
+
+def _resolved(annotation: object, function: Callable) -> object:
+    """The type that a text, or texts within, tell of by now; any where that is none."""
+    holder = lambda: None  # noqa: E731
+    holder.__annotations__ = {"value": annotation}
+    try:
+        return get_type_hints(holder, inspect.unwrap(function).__globals__, include_extras=True)[
+            "value"
+        ]
+    except Exception:
+        return Any
+
+
+def _named(checker: Callable[P, R]) -> Callable[P, R]:
+    """The checker where sizes have names of their own, with jaxtyping's error."""
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            with _own_names:
+                return checker(*args, **kwargs)
+        except BeartypeCallHintViolation as error:
+            is_result = isinstance(error, BeartypeCallHintReturnViolation)
+            part = "return value" if is_result else "parameters"
+            raise jaxtyping.TypeCheckError(f"Wrong type in the {part}: {error}") from error
 
     return call
 
@@ -91,9 +150,25 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _checker(function: Callable[P, R]) -> Callable[P, R]:
+    types = {name: _resolved(t, function) for name, t in function.__annotations__.items()}
     if "<locals>" not in function.__qualname__:
-        return beartype(function)
+        return beartype(_annotated(function, types))
     key = (function.__module__, function.__qualname__, str(function.__annotations__))
     if key not in _inner:
-        _inner[key] = beartype(function)
-    return _inner[key]
+
+        def last(*args: P.args, **kwargs: P.kwargs) -> R:
+            return _TO_CALL.functions.pop()(*args, **kwargs)
+
+        _inner[key] = beartype(_annotated(wraps(function)(last), types))
+    check = _inner[key]
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        waiting = _TO_CALL.functions
+        others = len(waiting)
+        waiting.append(function)
+        try:
+            return check(*args, **kwargs)
+        finally:
+            del waiting[others:]
+
+    return call

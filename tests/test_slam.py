@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from called_commands import done
 from data_set_layouts import asl_truth, sensor_yaml
 from geogs.application.result_settings import RemeshSettings
 from geogs.application.results.remesh import mesh_settings, remesh
@@ -69,11 +70,10 @@ def small_result(small_room, once) -> Path:
     """What it leaves of smaller images, with all that can be asked for."""
 
     def run(folder: Path) -> None:
-        done = geogs(
+        done(
             "run", small_room, "--stop", SMALL_FRAMES, "-o", folder, "--online-results",
             "--depth-mesh", *SMALL,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
 
     return once("small-slam", run)
 

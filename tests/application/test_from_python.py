@@ -122,6 +122,7 @@ class Impatient(geogs.application.RunProgress):
         self.said.append(text)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tmp_path, capfd):
     stop = Interruption()
     progress = Impatient(stop, 22)
@@ -141,6 +142,7 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_reconstruction_is_that_of_the_command_and_writes_nothing(
     small_room, tmp_path, capfd, monkeypatch
 ):

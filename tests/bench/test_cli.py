@@ -15,7 +15,7 @@ pytestmark = pytest.mark.system
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 TINY = [
-    "mapping.render-long-edge=96", "mapping.disk.stride=2", "input.stride=8",
+    "mapping.render-long-edge=96", "mapping.disk.stride=2", "input.stride=12",
     "search.least-steps=20", "search.steps-per-view=1", "no-check-poses",
 ]  # fmt: skip
 
@@ -33,32 +33,31 @@ def room(small_room, tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_benchmark_runs_scores_and_resumes(room, tmp_path):
+def test_a_benchmark_runs_scores_and_resumes(room, tmp_path, capsys):
     output = tmp_path / "out"
     settings = [word for text in TINY for word in ("--set", text)]
-    call = ["bench", "rooms", room, "--known-poses", "--budgets", "4", "-o", output,
+    call = ["bench", "rooms", str(room), "--known-poses", "--budgets", "2", "-o", str(output),
             "--device", "cpu", *settings]  # fmt: skip
-    done = geogs(*call)
-    assert done.returncode == 0, done.stderr
-    assert "rooms-known-poses: den 4s" in done.stderr
-    assert "Acc (cm)" in done.stdout
+    code, done = cli.main(call), capsys.readouterr()
+    assert code == 0, done.err
+    assert "rooms-known-poses: den 2s" in done.err
+    assert "Acc (cm)" in done.out
     (record,) = json.loads((output / "results.json").read_text())
-    assert record["variant"] == "4s"
+    assert record["variant"] == "2s"
     assert record["error"] is None
     assert record["provenance"]["device"] == "cpu"
-    assert record["cost"]["frames"] == 8
+    assert record["cost"]["frames"] == 5
     assert record["cost"]["disks"] > 0
     assert record["cost"]["map_bytes"] > 0
     (stage,) = record["stages"]
     assert {s["weighting"] for s in stage["surfaces"]} == {"vertices", "area"}
     assert all(0 < s["accuracy"] < 30 for s in stage["surfaces"])
-    assert (output / "den" / "4s" / "report" / "bench_surface.png").is_file()
+    assert (output / "den" / "2s" / "report" / "bench_surface.png").is_file()
     page = (output / "report" / "index.html").read_text()
-    assert "../den/4s/report/bench_surface.png" in page
-    assert "| den, 4s |" in (output / "results.md").read_text()
-    again = geogs(*call)
-    assert again.returncode == 0
-    assert "done before" in again.stderr
+    assert "../den/2s/report/bench_surface.png" in page
+    assert "| den, 2s |" in (output / "results.md").read_text()
+    assert cli.main(call) == 0
+    assert "done before" in capsys.readouterr().err
 
 
 def test_a_failing_scene_is_exit_code_2_with_its_reason_in_the_tables(room, tmp_path):

@@ -35,6 +35,12 @@ pytestmark = pytest.mark.system
 FROM = Provenance("run", "abc123", "a processor, 2 cores", "cpu", 0, "0123456789ab")
 
 
+@pytest.fixture
+def no_pictures(monkeypatch) -> None:
+    """Scores come without their pictures, which take longer than they do."""
+    monkeypatch.setattr("geogs_bench.scoring.scores.draw", lambda *_: None)
+
+
 def made_by(command: str) -> Record:
     """The record of a run that has not been scored."""
     return Record("", "hall", "", "", Provenance(command, "", "", "cpu", 0, ""))
@@ -73,6 +79,7 @@ def test_slam_stages_are_aligned_each_by_its_own_trajectory(tmp_path):
     assert (tmp_path / "out" / "report" / "bench_trajectory.png").is_file()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_result_in_metres_is_aligned_rigidly_too(tmp_path):
     scene = write_truth(tmp_path / "hall")
     write_result(tmp_path / "out", 0.01, None)
@@ -105,6 +112,7 @@ def test_published_figures_with_depth_stand_beside_results_with_depth():
     assert "Figures of SplaTAM" in text
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_result_without_refinement_is_the_papers_stage(tmp_path):
     scene = write_truth(tmp_path / "hall")
     write_result(tmp_path / "out", 0.01, 0.0, refined=False)
@@ -116,6 +124,7 @@ def test_a_result_without_refinement_is_the_papers_stage(tmp_path):
     assert adjusted.surface("area").chamfer < 0.3
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_known_poses_are_not_aligned_and_make_a_curve(tmp_path):
     scene = write_truth(tmp_path / "hall")
     result = tmp_path / "out"

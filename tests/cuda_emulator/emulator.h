@@ -1,6 +1,7 @@
 // A small CUDA machine for tests on computers without a GPU: blocks run one after another, the
 // threads of a block are fibers of one operating-system thread that switch at every barrier.
 #pragma once
+#include <setjmp.h>
 #include <sys/mman.h>
 #include <ucontext.h>
 
@@ -80,8 +81,10 @@ static inline void __threadfence_block() {}
 
 // ---------------------------------------------------------------- fibers and barriers
 struct Barrier { int arrived, generation; };
-struct Fiber { ucontext_t context; bool done; Index3 index; };
-static ucontext_t emu_main;
+// A fiber is made once and runs one thread of every block. Between fibers _longjmp jumps, which unlike
+// swapcontext asks the operating system for nothing.
+struct Fiber { jmp_buf place; bool done; Index3 index; };
+static jmp_buf emu_main;
 static std::vector<Fiber> emu_fibers;
 static std::vector<char> emu_dynamic;
 static int emu_current, emu_count, emu_live, emu_live_in_warp[64], emu_predicates[1024];
@@ -91,9 +94,8 @@ static std::function<void()> emu_body;
 
 static inline int emu_thread() { return emu_current; }
 static inline void emu_switch_out() {
-  int me = emu_current;
-  swapcontext(&emu_fibers[me].context, &emu_main);
-  threadIdx = emu_fibers[me].index;
+  if (!_setjmp(emu_fibers[emu_current].place)) _longjmp(emu_main, 1);
+  threadIdx = emu_fibers[emu_current].index;
 }
 static inline void emu_arrive(Barrier& b, const int& live) {
   int generation = b.generation;
@@ -146,13 +148,14 @@ static inline int __any_sync(unsigned m, int p) { return __ballot_sync(m, p) != 
 static inline int __all_sync(unsigned m, int p) { return __ballot_sync(m, !p) == 0; }
 
 static void emu_enter() {
-  int me = emu_current;
-  threadIdx = emu_fibers[me].index;
-  emu_body();
-  emu_fibers[me].done = true;
-  emu_live--;
-  emu_live_in_warp[me >> 5]--;
-  swapcontext(&emu_fibers[me].context, &emu_main);
+  threadIdx = emu_fibers[emu_current].index;
+  for (;;) {
+    emu_body();
+    emu_fibers[emu_current].done = true;
+    emu_live--;
+    emu_live_in_warp[emu_current >> 5]--;
+    emu_switch_out();
+  }
 }
 
 // Stacks of all threads of a block; memory is only taken where it is used.
@@ -162,33 +165,41 @@ static char* emu_stacks() {
                                     MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
   return stacks;
 }
+static void emu_begin(int thread) {
+  static ucontext_t fresh;
+  getcontext(&fresh);
+  fresh.uc_stack.ss_sp = emu_stacks() + EMU_STACK * thread;
+  fresh.uc_stack.ss_size = EMU_STACK;
+  fresh.uc_link = nullptr;
+  makecontext(&fresh, emu_enter, 0);
+  if (!_setjmp(emu_main)) setcontext(&fresh);
+}
+static void emu_go_on(int thread) {
+  if (!_setjmp(emu_main)) _longjmp(emu_fibers[thread].place, 1);
+}
 
 static void emu_run(const unsigned* grid, const unsigned* block, size_t shared, std::function<void()> body) {
+  static int begun = 0;
   emu_body = body;
   blockDim = {block[0], block[1], block[2]};
   gridDim = {grid[0], grid[1], grid[2]};
   emu_count = block[0] * block[1] * block[2];
   if (emu_count > 1024) abort();
-  emu_fibers.resize(emu_count);
+  if ((int)emu_fibers.size() < emu_count) emu_fibers.resize(emu_count);
   emu_dynamic.assign(shared + 16, 0x7f);
+  for (int t = 0; t < emu_count; t++)
+    emu_fibers[t].index = {t % block[0], t / block[0] % block[1], t / (block[0] * block[1])};
   for (unsigned z = 0; z < grid[2]; z++) for (unsigned y = 0; y < grid[1]; y++) for (unsigned x = 0; x < grid[0]; x++) {
     blockIdx = {x, y, z};
     emu_block = {0, 0};
     emu_live = emu_count;
     for (int w = 0; w < 64; w++) { emu_warp[w] = {0, 0}; emu_live_in_warp[w] = std::max(0, std::min(32, emu_count - 32 * w)); }
-    for (int t = 0; t < emu_count; t++) {
-      Fiber& f = emu_fibers[t];
-      getcontext(&f.context);
-      f.context.uc_stack.ss_sp = emu_stacks() + EMU_STACK * t;
-      f.context.uc_stack.ss_size = EMU_STACK;
-      f.context.uc_link = &emu_main;
-      f.done = false;
-      f.index = {t % block[0], t / block[0] % block[1], t / (block[0] * block[1])};
-      makecontext(&f.context, emu_enter, 0);
-    }
+    for (int t = 0; t < emu_count; t++) emu_fibers[t].done = false;
     while (emu_live) for (int t = 0; t < emu_count; t++) if (!emu_fibers[t].done) {
       emu_current = t;
-      swapcontext(&emu_main, &emu_fibers[t].context);
+      if (t < begun) { emu_go_on(t); continue; }
+      begun = t + 1;
+      emu_begin(t);
     }
   }
 }

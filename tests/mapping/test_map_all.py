@@ -15,7 +15,7 @@ from quick_systems import Work, quick_config
 
 pytestmark = pytest.mark.system
 
-FRAMES, AT = 34, 28
+FRAMES, AT = 26, 20
 
 
 class Interrupted(Exception):

@@ -22,7 +22,7 @@ from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.replica_files import write_sequence
 from lit_rooms import lit_room
 
-FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 2
+FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 3
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +107,9 @@ def test_video_plays(sequence: Path) -> None:
     assert np.abs(frames[2].astype(float) - image).mean() < 8
 
 
-def test_jpeg_without_depth(tmp_path: Path) -> None:
+def test_jpeg_without_depth(tmp_path: Path, raycaster: Raycaster) -> None:
     seen: list[int] = []
-    write_sequence(tmp_path, 2, 32, 24, 1, depth=False, on_frame=seen.append)
+    write_sequence(tmp_path, 2, 32, 24, 1, depth=False, on_frame=seen.append, raycaster=raycaster)
     assert sorted(p.name for p in (tmp_path / "results").iterdir()) == [
         "frame000000.jpg",
         "frame000001.jpg",
@@ -117,7 +117,7 @@ def test_jpeg_without_depth(tmp_path: Path) -> None:
     assert seen == [0, 1]
 
 
-def test_bad_input(tmp_path: Path) -> None:
+def test_bad_input(tmp_path: Path, raycaster: Raycaster) -> None:
     with pytest.raises(InputError, match="at least 1 frame"):
         write_sequence(tmp_path, 0)
     with pytest.raises(InputError, match="16 to"):
@@ -127,7 +127,7 @@ def test_bad_input(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError):
-        write_sequence(tmp_path / "file", 1, 32, 24)
+        write_sequence(tmp_path / "file", 1, 32, 24, raycaster=raycaster)
 
 
 def test_the_command_says_motion_and_flaws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from lit_rooms import lit_room
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    return lit_room(1).scene
+    return lit_room(3).scene
 
 
 TIMES = np.arange(0, 10, 1 / 60)

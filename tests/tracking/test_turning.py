@@ -146,8 +146,8 @@ def test_no_keyframe_is_made_where_no_depth_is_known(turning_away):
 
 
 def test_frames_before_a_start_are_located_by_its_keyframes():
-    looking = [pose(-0.5, yaw=0.55 * (1 - np.cos(0.125 * k))) for k in range(51)]
-    path = [*looking, *sideways(40)[1:]]
+    looking = [pose(-0.5, yaw=0.55 * (1 - np.cos(0.18 * k))) for k in range(36)]
+    path = [*looking, *sideways(30)[1:]]
     segments, _ = run(frames(path))
     trajectory = segments.trajectory()
     assert "lost" not in trajectory.states

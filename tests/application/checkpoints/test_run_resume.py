@@ -15,6 +15,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from called_commands import done
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, run_state
 from geogs.application.progress.run_progress import RunProgress
@@ -35,7 +36,6 @@ from stopped_commands import STOPPED, stop
 # process that reads it just then gets another result.
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("resumed-room")]
 
-GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 FRAMES = 26
 QUICK = [
     "--stop", str(FRAMES), "--tracking.init-keyframes", "6",
@@ -46,11 +46,6 @@ QUICK = [
     "--input.readout", "0.01",
 ]  # fmt: skip
 OFTEN = ["--checkpoint-every", "0.001"]
-
-
-def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [*GEOGS, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=1800)
 
 
 @pytest.fixture(scope="session")
@@ -64,8 +59,7 @@ def whole(own_room, once) -> Path:
     """The result of a run that nothing disturbed, without a checkpoint."""
 
     def run(folder: Path) -> None:
-        done = geogs("run", own_room, "-o", folder, *QUICK, "--checkpoint-every", 0)
-        assert done.returncode == 0, done.stderr
+        done("run", own_room, "-o", folder, *QUICK, "--checkpoint-every", 0, report=False)
 
     return once("resumed-whole", run)
 

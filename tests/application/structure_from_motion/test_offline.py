@@ -18,11 +18,12 @@ FRAMES = 12
 
 
 @pytest.mark.system
+@pytest.mark.usefixtures("no_report")
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(chosen_frames, "FEWEST", FRAMES // 2)
     monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
-    room = render_room(FRAMES, 3, 320, 240)
+    room = render_room(FRAMES, 3, 240, 180)
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
     c, output = room.camera, tmp_path / "out"

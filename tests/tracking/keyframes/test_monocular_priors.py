@@ -17,8 +17,8 @@ from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
+from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
 
@@ -38,7 +38,7 @@ class Score:
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[list[RenderedView], np.ndarray]:
-    scene = with_bare_walls(make_room(0))
+    scene = with_bare_walls(lit_room(0).scene)
     T_wc = handheld_trajectory(scene, FRAMES)
     caster = Raycaster(scene)
     return [caster.render(CAMERA, T) for T in T_wc], T_wc

@@ -174,15 +174,18 @@ class SurfaceDistance:
         index = self._tree.query(points, k=k, workers=-1)[1].reshape(len(points), k)
         best = np.full(len(points), np.inf)
         closest, normal = np.zeros_like(points), np.zeros_like(points)
-        for column in index.T:
-            face = self._face[column]
+        faces = self._face[index]
+        for n, column in enumerate(faces.T):
+            # A triangle that several candidates are of is looked at once.
+            rows = np.flatnonzero((faces[:, :n] != column[:, None]).all(1))
+            face = column[rows]
             corners = (self._surface.vertices[self._surface.faces[face, i]] for i in range(3))
-            candidate = closest_point_on_triangle(points, *corners)
-            distance = np.linalg.norm(candidate - points, axis=1)
-            better = distance < best
-            best = np.where(better, distance, best)
-            closest[better] = candidate[better]
-            normal[better] = self._surface.face_normals[face[better]]
+            candidate = closest_point_on_triangle(points[rows], *corners)
+            distance = np.linalg.norm(candidate - points[rows], axis=1)
+            better = distance < best[rows]
+            rows = rows[better]
+            best[rows], closest[rows] = distance[better], candidate[better]
+            normal[rows] = self._surface.face_normals[face[better]]
         return best, closest, normal
 
 
