@@ -330,7 +330,7 @@ def test_depths_are_searched_for_as_many_images_as_time_allows():
     fewer = spread_order(range(48))[:12]
     assert max(np.diff(sorted(fewer))) <= 5
     slow = replace(SMALL, search=replace(SMALL.search, depth_ratio=0.001))
-    scene = Reconstruction(WORKING, slow, budget=3.0)
+    scene = Reconstruction(WORKING, slow, budget=6.0)
     for view in make_scene().views:
         scene.add(view.image, view.T_cw)
     scene.finish()
