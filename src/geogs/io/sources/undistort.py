@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel, distorted_pixels
+from geogs.geometry.distortion import LensModel, distorted_pixels, lens_maps
 from geogs.io.sources.calibration import Calibration
 from geogs.shutter.rolling_camera import RollingCamera
 
@@ -106,19 +106,6 @@ class Rectifier:
         return u, v
 
 
-def lens_maps(
-    target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
-) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
-    K, target_K, size = _matrix(source), _matrix(target), (target.width, target.height)
-    D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
-    if lens == "fisheye":
-        maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
-    else:
-        maps = cv2.initUndistortRectifyMap(K, D, None, target_K, size, cv2.CV_32FC1)
-    return maps[0], maps[1]
-
-
 @dataclass(frozen=True)
 class _Bending:
     """How the lens of a source bends rays."""
@@ -180,10 +167,6 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
 def _focal(degrees: float, camera: Camera) -> float:
     """Focal length of a pinhole image of the camera's size by the view along its longer side."""
     return max(camera.width, camera.height) / 2 / math.tan(math.radians(degrees) / 2)
-
-
-def _matrix(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    return camera.matrix().numpy()
 
 
 def _zoomed(camera: Camera, zoom: float) -> Camera:
