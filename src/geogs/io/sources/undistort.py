@@ -22,6 +22,10 @@ FISHEYE_VIEW = 90.0
 """Degrees that are kept of a fisheye where nobody asks for others; a pinhole stretches more."""
 
 
+RIM = 0.03
+"""Part of a field of view that is asked for which may be the colour of the border."""
+
+
 class Rectifier:
     """Makes working images: longer side at most ``long_edge`` pixels, straight lines straight.
 
@@ -154,7 +158,7 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
     """The factor for a field of view. Raises InputError if the lens does not see so much."""
     source = bends.source
     zoom = _focal(degrees, source) / source.fx
-    if not bends.sees(zoom) and zoom < (least := bends.least_zoom()):
+    if not bends.sees(zoom) and zoom < (1 - RIM) * (least := bends.least_zoom()):
         edge = max(source.width, source.height)
         most = 2 * math.degrees(math.atan(edge / 2 / (least * source.fx)))
         raise InputError(
