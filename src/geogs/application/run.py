@@ -69,7 +69,7 @@ def run(
     for sentence in () if settings.offline else idle_settings(config):
         progress.write(f"note: {sentence}")
     base = None if settings.map is None else load_result(settings.map, device)
-    opened = _opened(settings, base)
+    opened = opened_for(settings, base)
     for sentence in opened.depths_found if config.input.depth == "auto" else ():
         progress.write(f"note: {sentence}")
     if isinstance(scale, SensorScale) and not opened.uses_depth:
@@ -95,18 +95,15 @@ def run(
         return _completed(driver, settings, work)
 
 
-def _opened(settings: RunSettings, base: SavedResult | None) -> Source:
+def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
     """The sources; to go on in a map whose lens was found, through the pinhole of its keyframes."""
     config = settings.config
     if base is None:
         return open_source(settings.source, config.input)
     seen = seen_by(base, config)
-    opened, camera = open_source(settings.source, seen), base.camera
-    is_same = math.isclose(opened.camera.fx, camera.fx, rel_tol=1e-6)
-    if seen is config.input or is_same or seen.field_of_view != "auto":
-        return opened
-    view = math.degrees(2 * math.atan(camera.long_edge / 2 / camera.fx))
-    return open_source(settings.source, replace(seen, field_of_view=view))
+    opened, focal = open_source(settings.source, seen), base.camera.fx
+    is_same = seen is config.input or math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
+    return opened if is_same or seen.field_of_view != "auto" else opened.with_focal(focal)
 
 
 def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Written:

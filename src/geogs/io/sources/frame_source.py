@@ -202,6 +202,10 @@ class Source:
         """The same frames, with their rows rectified by another readout."""
         return Source([images.with_shutter(shutter) for images in self._recordings])
 
+    def with_focal(self, focal: float) -> "Source":
+        """The same frames, as a pinhole of that focal length sees them."""
+        return Source([images.with_focal(focal) for images in self._recordings])
+
     @property
     def rolling_camera(self) -> RollingCamera:
         """The camera of the images that :meth:`clips` gives."""

@@ -22,10 +22,6 @@ FISHEYE_VIEW = 90.0
 """Degrees that are kept of a fisheye where nobody asks for others; a pinhole stretches more."""
 
 
-RIM = 0.03
-"""Part of a field of view that is asked for which may be the colour of the border."""
-
-
 class Rectifier:
     """Makes working images: longer side at most ``long_edge`` pixels, straight lines straight.
 
@@ -35,9 +31,17 @@ class Rectifier:
     """
 
     def __init__(
-        self, calibration: Calibration, long_edge: int, field_of_view: FieldOfView = "auto"
+        self,
+        calibration: Calibration,
+        long_edge: int,
+        field_of_view: FieldOfView = "auto",
+        focal: float | None = None,
     ) -> None:
-        """Raises InputError if the lens folds the image, or does not see so much."""
+        """``focal`` of the working image instead of a field of view: what the lens did not see has
+        the colour of the border.
+
+        Raises InputError if the lens folds the image, or does not see so much.
+        """
         source = calibration.camera()
         distortion = calibration.distortion if calibration.is_distorted else ()
         self._distortion, self._lens = distortion, calibration.lens
@@ -53,7 +57,9 @@ class Rectifier:
         self.camera = resized
         """The pinhole camera of the working image."""
         bends = _Bending(resized, distortion, calibration.lens)
-        if field_of_view != "auto":
+        if focal is not None:
+            self.zoom = focal / resized.fx
+        elif field_of_view != "auto":
             self.zoom = _zoom_to(field_of_view, bends)
         elif calibration.lens == "fisheye":
             self.zoom = max(_focal(FISHEYE_VIEW, resized) / resized.fx, bends.least_zoom())
@@ -158,7 +164,7 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
     """The factor for a field of view. Raises InputError if the lens does not see so much."""
     source = bends.source
     zoom = _focal(degrees, source) / source.fx
-    if not bends.sees(zoom) and zoom < (1 - RIM) * (least := bends.least_zoom()):
+    if not bends.sees(zoom) and zoom < (least := bends.least_zoom()):
         edge = max(source.width, source.height)
         most = 2 * math.degrees(math.atan(edge / 2 / (least * source.fx)))
         raise InputError(
