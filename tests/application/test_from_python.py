@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import geogs
-import geogs.application.run as run_module
 from geogs.application.interrupt import Interruption
-from geogs.application.run import run
+from geogs.application.run import opened_for, run
 from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli
 from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
@@ -181,7 +180,6 @@ def test_a_run_in_one_call_is_that_of_the_command_too(small_room, tmp_path, capf
 LIGHT = """
 import sys
 import geogs
-import geogs.application.run as run_module
 heavy = ("torch", "numpy", "numba", "cv2", "scipy", "matplotlib", "av", "rich", "tyro")
 print([name for name in heavy if name in sys.modules])
 print(all(hasattr(geogs, name) for name in geogs.__all__))
@@ -225,7 +223,7 @@ def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, 
     off = np.abs(saved.image(3).astype(float) - straight).mean()
     assert off < 0.3 * np.abs(shown.image.astype(float) - straight).mean()
     going_on = RunSettings((small_room,), map=folder)
-    opened = run_module.opened_for(going_on, saved)
+    opened = opened_for(going_on, saved)
     assert opened.camera.fx == pytest.approx(saved.camera.fx, rel=1e-9)
     image = next(iter(opened)).image
     assert np.abs(image.astype(float) - next(iter(plain)).image).mean() > 0.5

@@ -112,7 +112,7 @@ def with_bend(
             )
             columns.append((high - low).reshape(-1) / (2 * step))
         found = found + np.linalg.lstsq(np.stack(columns, 1), off.reshape(-1), rcond=1e-9)[0]
-    return tuple(found.tolist())
+    return tuple(found.round(12).tolist())
 
 
 def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
