@@ -22,6 +22,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.segment_trackers import Segments
 from geogs.types import (
+    FoundLens,
     MapSnapshot,
     MetricScale,
     RenderedKeyframe,
@@ -68,6 +69,12 @@ class SlamOutput:
         if self.world.metric_scale is not None or not self.segments.main.segment.is_metric:
             return self.world.metric_scale
         return MetricScale("depth sensor", 1.0, self.config.sensor.ratio)
+
+    @property
+    def lens(self) -> FoundLens | None:
+        """What the last adjustment found that images bend beside what was said of the lens; poses,
+        keyframes and map are without it."""
+        return self.world.keyframes.lens
 
     @property
     def T_cw(self) -> Float64[Tensor, "4 4"] | None:
@@ -119,6 +126,7 @@ class SlamOutput:
             "refined": self.world.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
             "poses": self._pose_agreement(),
+            "lens": None if self.lens is None else asdict(self.lens),
             "moving": round(dynamic_fraction(self.segments.main.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.world.segments.why_not or None,

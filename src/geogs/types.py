@@ -124,6 +124,20 @@ class MetricScale:
     """Standard deviation of the factor, as a part of it."""
 
 
+@dataclass(frozen=True, slots=True)
+class FoundLens:
+    """OpenCV's k1 and k2 that all matches found in images that were taken for those of a pinhole.
+
+    A ray x, y of the pinhole was seen at (1 + k1 r^2 + k2 r^4) times that.
+    """
+
+    k1: float
+    k2: float
+    deviation_k1: AtLeast0
+    """Standard deviation."""
+    deviation_k2: AtLeast0
+
+
 FrameState = Literal["tracked", "orientation only", "lost"]
 """What is known of a frame: its pose, its orientation alone, or nothing."""
 

@@ -4,20 +4,24 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import geogs
 from geogs.application.interrupt import Interruption
-from geogs.application.run import run
+from geogs.application.run import opened_for, run
 from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli
 from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
+from geogs.config import InputConfig
+from geogs.geometry.distortion import lens_maps
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.pose_estimate import PoseEstimate
+from geogs.types import FoundLens
 from posed_scene import vertices
 
 pytestmark = pytest.mark.system
@@ -191,3 +195,37 @@ def test_the_package_loads_nothing_before_it_is_used():
         assert set(dir(module)) == set(module.__all__)
         with pytest.raises(AttributeError, match="no attribute nothing"):
             _ = module.nothing
+
+
+def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, monkeypatch):
+    found = FoundLens(0.1, -0.05, 0.002, 0.003)
+    patch = "geogs.loop.global_bundle.correct_lens"
+    folder = tmp_path / "out"
+    argv = [str(small_room), *RUN, "--device", "cpu"]
+    with monkeypatch.context() as patched:
+        patched.setattr(patch, lambda *_args: found)
+        assert cli.main(["run", *argv, "-o", str(folder)]) == 0
+    (said,) = re.findall(r"Lens: .*", capfd.readouterr().err)
+    assert "(none) still bend: k1 0.1000 +- 0.0020, k2 -0.0500 +- 0.0030" in said
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["lens"] == asdict(found)
+    document = json.loads((folder / "intrinsics.json").read_text())
+    assert document["source"]["distortion"] == pytest.approx([0.1, -0.05, 0.0, 0.0], abs=1e-9)
+    assert document["source"]["fx"] == document["fx"]
+    given = re.findall(r"--intrinsics (\S+) ", said)[0]
+    again = geogs.open_source(small_room, InputConfig(intrinsics=given))
+    assert again.calibration.distortion == pytest.approx((0.1, -0.05, 0.0, 0.0))
+    plain = geogs.open_source(small_room)
+    saved = geogs.load_result(folder)
+    time = saved.keyframes[3].timestamp
+    shown = next(f for f in plain if f.timestamp == pytest.approx(time))
+    camera = plain.camera
+    maps = lens_maps(camera, camera, (0.1, -0.05, 0.0, 0.0), "polynomial")
+    straight = cv2.remap(shown.image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    off = np.abs(saved.image(3).astype(float) - straight).mean()
+    assert off < 0.3 * np.abs(shown.image.astype(float) - straight).mean()
+    going_on = RunSettings((small_room,), map=folder)
+    opened = opened_for(going_on, saved)
+    assert opened.camera.fx == pytest.approx(saved.camera.fx, rel=1e-9)
+    image = next(iter(opened)).image
+    assert np.abs(image.astype(float) - next(iter(plain)).image).mean() > 0.5

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import FISHEYE_LIMIT, distorted_pixels, undistorted_rays
+from geogs.geometry.distortion import (
+    FISHEYE_LIMIT,
+    distorted_pixels,
+    lens_maps,
+    undistorted_rays,
+    with_bend,
+)
 
 CAMERA = Camera(500.0, 490.0, 321.0, 237.0, 640, 480)
 RAYS = np.array([[0.0, 0.0], [0.3, 0.2], [-0.35, 0.1], [0.1, -0.3], [0.55, 0.4]])
@@ -66,3 +72,37 @@ def test_what_a_fisheye_sees_behind_itself_is_given_at_the_limit():
     pixels = np.array([[321 + 500 * 1.8, 237.0], [321.0, 237 - 490 * 2.5]])
     angles = np.arctan(np.linalg.norm(undistorted_rays(pixels, CAMERA, (), "fisheye"), axis=1))
     np.testing.assert_allclose(angles, FISHEYE_LIMIT, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "distortion", [(), (-0.2, 0.06, 0.002, -0.003), (-0.1, 0.02, 0.0, 0.0, 0.01)]
+)
+def test_maps_say_where_the_lens_shows_what_a_pinhole_does(distortion):
+    u, v = lens_maps(CAMERA, CAMERA, distortion, "polynomial")
+    for row, column in [(0, 0), (237, 321), (100, 500), (479, 639)]:
+        ray = np.array([[(column - 321) / 500, (row - 237) / 490]])
+        (seen,) = distorted_pixels(ray, CAMERA, distortion)
+        np.testing.assert_allclose([u[row, column], v[row, column]], seen, atol=1e-3)
+
+
+BENT = [
+    ((), "polynomial", 1e-6),
+    ((-0.1, 0.02, 0.001, -0.002), "polynomial", 0.1),
+    ((-0.1, 0.02, 0.001, -0.002, 0.01), "polynomial", 0.01),
+    ((-0.1, 0.02, 0.001, -0.002, 0.01, 0.01, 0.0, 0.0), "polynomial", 0.01),
+    ((-0.02, 0.004, -0.003, 0.0007), "fisheye", 0.05),
+]
+
+
+@pytest.mark.parametrize(("distortion", "lens", "pixels"), BENT)
+def test_a_lens_with_another_before_it_is_both_in_turn(distortion, lens, pixels):
+    k1, k2 = 0.02, -0.03
+    both = with_bend(CAMERA, distortion, lens, (k1, k2))
+    assert len(both) == (len(distortion) or 4)
+    worst = 0.0
+    for x, y in [(0.0, 0.0), (0.3, 0.2), (-0.35, 0.1), (0.1, -0.3), (0.5, 0.4), (-0.6, -0.45)]:
+        factor = 1 + k1 * (x * x + y * y) + k2 * (x * x + y * y) ** 2
+        wanted = distorted_pixels(np.array([[x * factor, y * factor]]), CAMERA, distortion, lens)
+        found = distorted_pixels(np.array([[x, y]]), CAMERA, both, lens)
+        worst = max(worst, float(np.abs(found - wanted).max()))
+    assert worst < pixels

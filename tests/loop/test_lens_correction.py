@@ -112,6 +112,26 @@ def test_the_bend_is_told_as_it_is():
     assert (bend.k1, bend.k2) == pytest.approx(BEND, rel=0.1)
 
 
+def test_the_end_of_tracking_straightens_images_once(monkeypatch):
+    tracker, _ = tracker_of(BEND)
+    global_bundle(tracker)
+    assert tracker.keyframes.table.lens is None  # it goes on
+    images = [np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8) for _ in range(COUNT)]
+    for n, image in enumerate(images):
+        image[:] = 5 + np.arange(CAMERA.width, dtype=np.uint8)[None, :, None]
+        tracker.keyframes.table.arrays.put("image", n, image, recent=True)
+    monkeypatch.setattr(BentFlow, "encode", lambda self, image: 0, raising=False)
+    global_bundle(tracker, ends=True)
+    lens = tracker.keyframes.table.lens
+    assert lens is not None
+    assert (lens.k1, lens.k2) == pytest.approx(BEND, rel=0.1)
+    assert 0 < lens.deviation_k1 < 0.02
+    straight = tracker.keyframes[3].image
+    assert not np.array_equal(straight, images[3])
+    assert not global_bundle(tracker, ends=True).after
+    assert tracker.keyframes[3].image is straight
+
+
 def test_a_lens_that_is_known_is_left_alone():
     tracker, _ = tracker_of((0.0, 0.0))
     ids = list(range(COUNT))

@@ -7,6 +7,7 @@ from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.mapping.view_arrays import MapCameras
+from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from keyframe_samples import views_of
@@ -30,3 +31,18 @@ def test_the_nearest_come_in_the_order_in_which_they_were_given():
             assert [v.id for v in views.near(views[id], views, count)] == nearest
     segment[3].T_cw = segment[11].T_cw
     assert [v.id for v in views.near(views[11], views, 2)] == [3, 11]
+
+
+def test_views_have_the_images_that_took_the_places_of_others():
+    config, store = Config(), KeyframeTable.on(SampleGrid(CAMERA))
+    segment, cameras = store.new_set(), MapCameras.of(CAMERA, config.mapping)
+    views = views_of(store, cameras, config.mapping.loss)
+    image = np.random.default_rng(0).integers(1, 255, (48, 64, 3), np.uint8)
+    view = views.add(segment.add(0, 0.0, image, None, torch.eye(4, dtype=torch.float64)).id)
+    before, segments = view.depth_view.grey.copy(), view.bare_segments
+    segment.straighten(FoundLens(0.3, 0.1, 0.01, 0.01))
+    views.arrays.forget_images()
+    assert np.array_equal(view.depth_view.image, segment[0].image)
+    assert not np.array_equal(view.depth_view.image, image)
+    assert not np.array_equal(view.depth_view.grey, before)
+    assert view.bare_segments is not segments

@@ -14,6 +14,7 @@ from geogs.config import Config
 from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.frame_source import Source
 from geogs.shutter.shutter import Shutter
+from geogs.types import FoundLens
 
 if TYPE_CHECKING:
     from geogs.shutter.readout import FoundReadout
@@ -100,6 +101,17 @@ def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
     return (
         f"warning: the video does not tell its focal length: {failure}; {assumed} stays assumed. "
         "Move sideways and turn while recording, or give --intrinsics fx,fy,cx,cy."
+    )
+
+
+def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
+    """What was known of a lens, what all matches say of it, and what was done, in a sentence."""
+    was = ",".join(f"{k:.4g}" for k in before.distortion) if before.is_distorted else "none"
+    return (
+        f"Lens: images straightened by what was said of its distortion ({was}) still bend: "
+        f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "
+        f"{found.deviation_k2:.4f} by all matches; poses, depths and the images of the map are "
+        f"corrected. Next time give --intrinsics {after.numbers} (intrinsics.json has it)."
     )
 
 

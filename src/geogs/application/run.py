@@ -1,5 +1,6 @@
 """A run, from the paths of its videos to the files of its result; or on from a checkpoint."""
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,7 @@ def run(
     for sentence in () if settings.offline else idle_settings(config):
         progress.write(f"note: {sentence}")
     base = None if settings.map is None else load_result(settings.map, device)
-    opened = open_source(settings.source, config.input if base is None else seen_by(base, config))
+    opened = opened_for(settings, base)
     for sentence in opened.depths_found if config.input.depth == "auto" else ():
         progress.write(f"note: {sentence}")
     if isinstance(scale, SensorScale) and not opened.uses_depth:
@@ -92,6 +93,17 @@ def run(
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
         return _completed(driver, settings, work)
+
+
+def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
+    """The sources; to go on in a map whose lens was found, through the pinhole of its keyframes."""
+    config = settings.config
+    if base is None:
+        return open_source(settings.source, config.input)
+    seen = seen_by(base, config)
+    opened, focal = open_source(settings.source, seen), base.camera.fx
+    is_same = seen is config.input or math.isclose(opened.camera.fx, focal, rel_tol=1e-6)
+    return opened if is_same or seen.field_of_view != "auto" else opened.with_focal(focal)
 
 
 def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Written:

@@ -8,6 +8,7 @@ from typing import Literal
 
 import torch
 
+from geogs.application.calibrate import lens_said
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
@@ -158,6 +159,9 @@ class TrackedVideo:
 
     def _adjust(self, driver: Driver, new: Path) -> None:
         self.scene.adjust(driver.report)
+        if (lens := self.scene.lens) is not None:
+            before, self.source = self.source, self.source.with_lens(lens)
+            driver.progress.write(lens_said(before.calibration, lens, self.source.calibration))
         if self.scene.will_refine:
             self._write_stage("adjusted", driver, new)
 

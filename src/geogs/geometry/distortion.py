@@ -21,6 +21,8 @@ FISHEYE_LIMIT = np.radians(88.0)
 _POLISHING = 8
 """Corrections after OpenCV's own few, which leave errors that an image can show."""
 _HALVINGS = 52
+_FITTING = 4
+"""Steps of a fit of coefficients, most of which enter linearly."""
 
 
 def distorted_pixels(
@@ -70,6 +72,47 @@ def undistorted_rays(
     for _ in range(_POLISHING):
         rays = rays + (pixels - distorted_pixels(rays, camera, distortion)) / (camera.fx, camera.fy)
     return rays
+
+
+def lens_maps(
+    target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
+) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
+    K, target_K, size = _matrix(source), _matrix(target), (target.width, target.height)
+    D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
+    if lens == "fisheye":
+        maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(K, D, None, target_K, size, cv2.CV_32FC1)
+    return maps[0], maps[1]
+
+
+def with_bend(
+    camera: Camera,
+    distortion: Sequence[float],
+    lens: LensModel,
+    bend: tuple[float, float],
+) -> tuple[float, ...]:
+    """The coefficients of a lens that bends rays by OpenCV's k1 and k2 before it does what it did.
+
+    As many as there are of it, of a pinhole four: those that put the rays that the image sees
+    where both in turn do, by least squares (exactly for a pinhole). Source: Gauss-Newton.
+    """
+    v, u = (x.reshape(-1) for x in np.mgrid[: camera.height : 16j, : camera.width : 16j])
+    rays = undistorted_rays(np.stack([u, v], 1), camera, distortion, lens)
+    square = np.square(rays).sum(1, keepdims=True)
+    wanted = rays * (1 + bend[0] * square + bend[1] * np.square(square))
+    seen = distorted_pixels(wanted, camera, distortion, lens)
+    found, step = np.array(distortion or (0.0,) * 4), 1e-4
+    for _ in range(_FITTING):
+        off, columns = seen - distorted_pixels(rays, camera, tuple(found), lens), []
+        for change in step * np.eye(len(found)):
+            low, high = (
+                distorted_pixels(rays, camera, tuple(found + s * change), lens) for s in (-1, 1)
+            )
+            columns.append((high - low).reshape(-1) / (2 * step))
+        found = found + np.linalg.lstsq(np.stack(columns, 1), off.reshape(-1), rcond=1e-9)[0]
+    return tuple(found.round(12).tolist())
 
 
 def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:

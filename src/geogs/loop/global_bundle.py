@@ -40,6 +40,7 @@ def global_bundle(
     tracker: Tracker,
     progress: Callable[[float, str], None] | None = None,
     keyframes: Sequence[int] | None = None,
+    ends: bool = False,
 ) -> PoseCorrection:
     """Refine keyframes of a tracker on a fresh graph that also joins places seen again.
 
@@ -49,14 +50,15 @@ def global_bundle(
     sharpens the next. Poses, inverse depth and information of the tracker are updated, and its
     graph holds the fresh edges alone: one that goes on tracking needs only those that
     ``FrameGraph.retire`` leaves of them. ``progress`` is called with the fraction done and a
-    message. Returns the poses before and after; scales are 1. A tracker without a map is left
-    alone.
+    message. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking and a
+    lens was found, images are straightened by that. A tracker without a map is left alone, and one
+    whose images are straight already.
     """
     config, segment = tracker.config, tracker.segment
     store, graph, odometry = segment.keyframes, tracker.map.graph, tracker.map.odometry
     ids = tracker.segment.ids if keyframes is None else list(keyframes)
     before = {k: store[k].T_cw for k in ids}
-    if not ids:
+    if not ids or store.table.lens is not None:
         return PoseCorrection({}, {}, {})
     fixed = set(segment.fixed)
     free = [k for k in ids if k not in fixed]
@@ -80,7 +82,9 @@ def global_bundle(
         odometry.update_scale_by_all()
     free_poses = free if fixed else ids[1:]
     correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
-    correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS)
+    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS)
+    if lens is not None and ends:
+        store.straighten(lens)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:

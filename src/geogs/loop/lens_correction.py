@@ -2,8 +2,8 @@
 
 Images were undistorted by what was said of the lens, which may be nothing. What is left is a small
 k1 and k2 that all matches of the video tell together. They are taken off the matches, and
-everything is adjusted again; images, flow and focal length stay as they are. Until then a walk
-straight on drifts in scale (docs/tracking.md).
+everything is adjusted again; flow and focal length stay as they are. Until then a walk straight on
+drifts in scale (docs/tracking.md).
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from geogs.tracking.frames.row_errors import TOGETHER
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import lens_estimate
 from geogs.tracking.tracker import Tracker
+from geogs.types import FoundLens
 from geogs.world.edges import PackedEdge, Pair
 
 ROUNDS = 3
@@ -31,7 +32,7 @@ def correct_lens(
     free_pose: Sequence[int],
     free_depth: Sequence[int],
     options: BundleOptions,
-) -> LensBend | None:
+) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
     What was measured of the frames between the keyframes is corrected, too. Not in the world of a
@@ -39,18 +40,20 @@ def correct_lens(
     """
     graph, keyframes = tracker.map.graph, tracker.keyframes
     measured = graph.packed
-    bend = LensBend()
+    bend, deviation = LensBend(), (0.0, 0.0)
     for n in range(ROUNDS if measured and not tracker.segment.fixed else 0):
         said = lens_estimate(tracker, list(free_depth))
         if said is None or (n == 0 and said.evidence < EVIDENCE):
             break
         bend = bend.plus(said.size)
+        k1, k2 = said.covariance.diagonal().sqrt().tolist()
+        deviation = k1, k2
         _shift(graph, measured, bend)
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
     if bend == LensBend():
         return None
     shift_lens(tracker.map.recorder.log, keyframes, bend)
-    return bend
+    return FoundLens(bend.k1, bend.k2, *deviation)
 
 
 def _shift(graph: FrameGraph, measured: dict[Pair, PackedEdge], bend: LensBend) -> None:

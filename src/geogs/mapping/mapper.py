@@ -220,8 +220,12 @@ class Mapper:
 
     def refine(self, progress: Progress = silent) -> None:
         """Train over all mapped keyframes, which there must be, with the final poses, after
-        searching their depths again."""
+        searching their depths again, and by images that were straightened meanwhile."""
         searched, start = self._searched(), SEARCHED if self.config.final_depth else 0.0
+        if self.keyframes.lens is not None:
+            self.views.arrays.forget_images()
+            for view in searched:
+                self.depths.engine.observe(view.depth_view)
         if self.config.final_depth and searched:
             self.depths.estimate(searched, lambda fraction: progress(SEARCHED * fraction))
             self.check_depths()

@@ -111,6 +111,14 @@ class ViewArrays:
             self._write(id, view)
         self.table.resident = [id for id, _ in loaded]
 
+    def forget_images(self) -> None:
+        """Begin anew with the images of all keyframes, as they have been replaced."""
+        self.settle()
+        self._ahead.begin([])
+        self.loaded = LruCache(self.loaded.limit, self._write)
+        for id in self.table.views:
+            self.table.arrays.recent("bare segments").drop(id)
+
     def load(self, id: int) -> LoadedView:
         """Everything in memory, brought back if need be."""
         loaded = self.loaded.get(id, lambda: self._ahead.take(id) or self._load(id))

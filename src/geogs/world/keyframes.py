@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, cast
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
@@ -12,9 +13,10 @@ from torch import Tensor
 
 from geogs.config.setting import Range
 from geogs.errors import InputError
+from geogs.geometry.distortion import distorted_pixels, lens_maps
 from geogs.geometry.lie import scaled, se3_inverse, sim3_scale
 from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
-from geogs.types import MeasuredPose, PoseCorrection
+from geogs.types import FoundLens, MeasuredPose, PoseCorrection
 from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
 from geogs.world.cell_depths import KeyframePrior, MeasuredCells
 from geogs.world.grid import SampleGrid
@@ -171,12 +173,18 @@ class Keyframe:
     def depth_field(
         self,
     ) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
-        """Inverse depth and its ``confident_information`` as images of cells, on the CPU."""
-        shape = (self.grid.height, self.grid.width)
-        return (
-            self.inverse_depth.reshape(shape).cpu().numpy(),
-            self.confident_information.reshape(shape).cpu().numpy(),
-        )
+        """Inverse depth and its ``confident_information`` as images of cells, on the CPU.
+
+        Of the cells of the image as it is now; matches are of cells that bend with the lens.
+        """
+        grid, lens = self.grid, self.table.lens
+        fields = torch.stack([self.inverse_depth, self.confident_information], 1)
+        if lens is not None:
+            rays = grid.rays[:, :2].double().cpu().numpy()
+            seen = distorted_pixels(rays, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
+            fields = grid.sample_field(fields, torch.from_numpy(seen).to(fields))
+        depth, information = fields.mT.reshape(2, grid.height, grid.width).cpu().numpy()
+        return depth, information
 
 
 @dataclass(eq=False)
@@ -191,6 +199,9 @@ class KeyframeTable:
     keyframes: dict[Id, Keyframe] = field(default_factory=dict)
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
+    lens: FoundLens | None = None
+    """By which images were straightened after the last adjustment; none where they are as they
+    were tracked."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
     encode: Encode | None = field(init=False, repr=False, metadata=NOT_STORED)
     """The flow operator's; images are encoded again by it when needed."""
@@ -219,7 +230,7 @@ class KeyframeTable:
 
     def mirror(self) -> "KeyframeTable":
         """A table without keyframes that has the large arrays of this one."""
-        twin = KeyframeTable(arrays=self.arrays)
+        twin = KeyframeTable(arrays=self.arrays, lens=self.lens)
         twin.grid, twin.encode, twin.set_of = self.grid, self.encode, {}
         return twin
 
@@ -360,6 +371,31 @@ class KeyframeSet:
             keyframe.T_cw = T.to(keyframe.T_cw)
             keyframe.rescale(1 / correction.scale.get(id, 1.0))
         self._corrections.append(correction)
+
+    def straighten(self, lens: FoundLens) -> None:
+        """Have all images as the pinhole of the grid sees them, which a lens bent; once, and when
+        nothing is tracked on them any more.
+
+        What is beyond the border gets its colour; what was masked out stays black. Poses, and
+        depths as the adjustment has them, stay.
+        """
+        camera, arrays = self.grid.camera, self.table.arrays
+        maps = lens_maps(camera, camera, (lens.k1, lens.k2, 0.0, 0.0), "polynomial")
+        column, row = (
+            np.rint(m).astype(int).clip(0, size - 1)
+            for m, size in zip(maps, (camera.width, camera.height), strict=True)
+        )
+        for keyframe in self:
+            image = keyframe.image
+            straight = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            straight[image[row, column].max(-1) == 0] = 0
+            arrays.put("image", keyframe.id, straight, recent=True)
+            arrays.recent("encoded").drop(keyframe.id)
+            for name in ("prior normal", "sensor depth"):
+                values = arrays.get(name, keyframe.id)
+                if values is not None:
+                    arrays.put(name, keyframe.id, values[row, column])
+        self.table.lens = lens
 
     def take_corrections(self) -> list[PoseCorrection]:
         """Corrections made since the last call, earliest first."""

@@ -78,6 +78,7 @@ class TrackedOrPlaced(Work):
             outcome = Outcome.STOPPED if driver.stop.requested else outcome
         if failure is not None:
             raise failure
+        self._take(tracked)  # whose lens is known by now
         return tracked.map(driver, outcome)
 
     def _take(self, work: "TrackedVideo | PlacedOffline") -> None:

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel
+from geogs.geometry.distortion import LensModel, with_bend
+from geogs.types import FoundLens
 
 _LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0
 """Focal lengths by the longer side of the image: fields of view from 157 down to 0.6 degrees."""
@@ -91,6 +92,20 @@ class Calibration:
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
         return Camera(self.fx, self.fy, self.cx, self.cy, *self._size())
+
+    @property
+    def numbers(self) -> str:
+        """As the command line takes them."""
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        name = ["fisheye"] if self.lens == "fisheye" else []
+        return ",".join(name + [f"{value:.6g}" for value in values])
+
+    def with_lens(self, found: FoundLens) -> "Calibration":
+        """The calibration with what images straightened by it bend, once the size is known."""
+        bend = found.k1, found.k2
+        distortion = with_bend(self.camera(), self.distortion, self.lens, bend)
+        origin = f"{self.origin}; bent as all matches say, by k1 {found.k1:.4f}, k2 {found.k2:.4f}"
+        return replace(self, distortion=distortion, origin=origin)
 
     def _size(self) -> tuple[int, int]:
         assert self.width is not None, "fit() the calibration to the images first"

@@ -1,5 +1,6 @@
 """A source: one or several recordings of a place, read as a single stream of frames."""
 
+import copy
 import logging
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from geogs.io.sources.reader import RawFrame, fingerprint_of
 from geogs.io.sources.working_images import WorkingImages
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.shutter import Shutter
-from geogs.types import Frame
+from geogs.types import FoundLens, Frame
 
 _log = logging.getLogger(__name__)
 PAUSE = 1.0
@@ -186,6 +187,12 @@ class Source:
         """The same frames, undistorted by another calibration of the images as they came."""
         return Source([images.with_calibration(calibration) for images in self._recordings])
 
+    def with_lens(self, found: FoundLens) -> "Source":
+        """The same frames, as they are, of images whose lens is known better by now."""
+        same = copy.copy(self)
+        same.calibration = self.calibration.with_lens(found)
+        return same
+
     @property
     def is_shutter_open(self) -> bool:
         """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
@@ -194,6 +201,10 @@ class Source:
     def with_shutter(self, shutter: Shutter) -> "Source":
         """The same frames, with their rows rectified by another readout."""
         return Source([images.with_shutter(shutter) for images in self._recordings])
+
+    def with_focal(self, focal: float) -> "Source":
+        """The same frames, as a pinhole of that focal length sees them."""
+        return Source([images.with_focal(focal) for images in self._recordings])
 
     @property
     def rolling_camera(self) -> RollingCamera:

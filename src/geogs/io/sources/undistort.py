@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel, distorted_pixels
+from geogs.geometry.distortion import LensModel, distorted_pixels, lens_maps
 from geogs.io.sources.calibration import Calibration
 from geogs.shutter.rolling_camera import RollingCamera
 
@@ -31,9 +31,17 @@ class Rectifier:
     """
 
     def __init__(
-        self, calibration: Calibration, long_edge: int, field_of_view: FieldOfView = "auto"
+        self,
+        calibration: Calibration,
+        long_edge: int,
+        field_of_view: FieldOfView = "auto",
+        focal: float | None = None,
     ) -> None:
-        """Raises InputError if the lens folds the image, or does not see so much."""
+        """``focal`` of the working image instead of a field of view: what the lens did not see has
+        the colour of the border.
+
+        Raises InputError if the lens folds the image, or does not see so much.
+        """
         source = calibration.camera()
         distortion = calibration.distortion if calibration.is_distorted else ()
         self._distortion, self._lens = distortion, calibration.lens
@@ -49,7 +57,9 @@ class Rectifier:
         self.camera = resized
         """The pinhole camera of the working image."""
         bends = _Bending(resized, distortion, calibration.lens)
-        if field_of_view != "auto":
+        if focal is not None:
+            self.zoom = focal / resized.fx
+        elif field_of_view != "auto":
             self.zoom = _zoom_to(field_of_view, bends)
         elif calibration.lens == "fisheye":
             self.zoom = max(_focal(FISHEYE_VIEW, resized) / resized.fx, bends.least_zoom())
@@ -104,19 +114,6 @@ class Rectifier:
             return self._maps
         v, u = np.mgrid[: self.size[1], : self.size[0]].astype(np.float32)
         return u, v
-
-
-def lens_maps(
-    target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
-) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
-    K, target_K, size = _matrix(source), _matrix(target), (target.width, target.height)
-    D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
-    if lens == "fisheye":
-        maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
-    else:
-        maps = cv2.initUndistortRectifyMap(K, D, None, target_K, size, cv2.CV_32FC1)
-    return maps[0], maps[1]
 
 
 @dataclass(frozen=True)
@@ -180,10 +177,6 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
 def _focal(degrees: float, camera: Camera) -> float:
     """Focal length of a pinhole image of the camera's size by the view along its longer side."""
     return max(camera.width, camera.height) / 2 / math.tan(math.radians(degrees) / 2)
-
-
-def _matrix(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    return camera.matrix().numpy()
 
 
 def _zoomed(camera: Camera, zoom: float) -> Camera:

@@ -55,10 +55,12 @@ class WorkingImages:
         config: InputConfig,
         calibration: Calibration | None = None,
         shutter: Shutter | None = None,
+        focal: float | None = None,
     ) -> None:
         """``calibration`` of the upright images, where it is known better than the reader's.
 
-        ``shutter``, where it is known better than the settings'.
+        ``shutter``, where it is known better than the settings'; ``focal`` of the working images
+        instead of what the settings ask for.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -83,7 +85,8 @@ class WorkingImages:
         """The camera of the images as they came, upright, with its distortion."""
         self.shutter = shutter or shutter_of(config.readout)
         """By which rows are rectified."""
-        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
+        self._focal = focal
+        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
         self.camera = self._rectifier.camera
         """The pinhole camera of the working images."""
         check_large_enough(self.camera, info.name)
@@ -128,7 +131,7 @@ class WorkingImages:
     def with_calibration(self, calibration: Calibration) -> "WorkingImages":
         """The same images, undistorted by another calibration of the images as they came."""
         fitted = calibration.fit(self.reader.info.width, self.reader.info.height)
-        return WorkingImages(self.reader, self._config, fitted, self.shutter)
+        return WorkingImages(self.reader, self._config, fitted, self.shutter, self._focal)
 
     @property
     def is_live(self) -> bool:
@@ -144,7 +147,11 @@ class WorkingImages:
 
     def with_shutter(self, shutter: Shutter) -> "WorkingImages":
         """The same images, with their rows rectified by another readout."""
-        return WorkingImages(self.reader, self._config, self.calibration, shutter)
+        return WorkingImages(self.reader, self._config, self.calibration, shutter, self._focal)
+
+    def with_focal(self, focal: float) -> "WorkingImages":
+        """The same images, as a pinhole of that focal length sees them."""
+        return WorkingImages(self.reader, self._config, self.calibration, self.shutter, focal)
 
     @property
     def rolling_camera(self) -> RollingCamera:

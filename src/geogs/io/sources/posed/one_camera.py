@@ -11,11 +11,12 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.distortion import lens_maps
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.posed.posed_set import PosedFile
 from geogs.io.sources.posed.stored_pictures import stored_size
-from geogs.io.sources.undistort import Rectifier, lens_maps
+from geogs.io.sources.undistort import Rectifier
 
 _log = logging.getLogger(__name__)
 
