@@ -126,9 +126,10 @@ class MetricScale:
 
 @dataclass(frozen=True, slots=True)
 class FoundLens:
-    """OpenCV's k1 and k2 that all matches found in images that were taken for those of a pinhole.
+    """OpenCV's k1 and k2 that all matches found in images that were taken for those of a pinhole,
+    and its focal length.
 
-    A ray x, y of the pinhole was seen at (1 + k1 r^2 + k2 r^4) times that.
+    A ray x, y was seen at focal (1 + k1 r^2 + k2 r^4) times that.
     """
 
     k1: float
@@ -136,6 +137,9 @@ class FoundLens:
     deviation_k1: AtLeast0
     """Standard deviation."""
     deviation_k2: AtLeast0
+    focal: Positive = 1.0
+    """The focal length over what it was taken for; 1 where that was not asked, or is right."""
+    deviation_focal: AtLeast0 = 0.0
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]

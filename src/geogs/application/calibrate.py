@@ -107,8 +107,12 @@ def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
 def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
     """What was known of a lens, what all matches say of it, and what was done, in a sentence."""
     was = ",".join(f"{k:.4g}" for k in before.distortion) if before.is_distorted else "none"
+    focal = ""
+    if found.focal != 1:
+        deviation = found.deviation_focal * after.fx
+        focal = f"fx {after.fx:.1f} +- {deviation:.1f} instead of {before.fx:.1f}, "
     return (
-        f"Lens: images straightened by what was said of its distortion ({was}) still bend: "
+        f"Lens: images straightened by what was said of its distortion ({was}) still bend: {focal}"
         f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "
         f"{found.deviation_k2:.4f} by all matches; poses, depths and the images of the map are "
         f"corrected. Next time give --intrinsics {after.numbers} (intrinsics.json has it)."

@@ -7,6 +7,7 @@ a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8); without coefficients the radius is th
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import cv2
@@ -92,17 +93,20 @@ def with_bend(
     distortion: Sequence[float],
     lens: LensModel,
     bend: tuple[float, float],
+    factor: float = 1.0,
 ) -> tuple[float, ...]:
-    """The coefficients of a lens that bends rays by OpenCV's k1 and k2 before it does what it did.
+    """The coefficients of a lens that bends rays by OpenCV's k1 and k2 and stretches them by a
+    factor before it does what it did, for a focal length of so many times the camera's.
 
     As many as there are of it, of a pinhole four: those that put the rays that the image sees
     where both in turn do, by least squares (exactly for a pinhole). Source: Gauss-Newton.
     """
     v, u = (x.reshape(-1) for x in np.mgrid[: camera.height : 16j, : camera.width : 16j])
-    rays = undistorted_rays(np.stack([u, v], 1), camera, distortion, lens)
+    rays = undistorted_rays(np.stack([u, v], 1), camera, distortion, lens) / factor
     square = np.square(rays).sum(1, keepdims=True)
-    wanted = rays * (1 + bend[0] * square + bend[1] * np.square(square))
+    wanted = factor * rays * (1 + bend[0] * square + bend[1] * np.square(square))
     seen = distorted_pixels(wanted, camera, distortion, lens)
+    camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
     found, step = np.array(distortion or (0.0,) * 4), 1e-4
     for _ in range(_FITTING):
         off, columns = seen - distorted_pixels(rays, camera, tuple(found), lens), []

@@ -82,7 +82,7 @@ def global_bundle(
         odometry.update_scale_by_all()
     free_poses = free if fixed else ids[1:]
     correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
-    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS)
+    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends)
     if lens is not None and ends:
         store.straighten(lens)
     for start in range(0, len(free), PRIORS_TOGETHER):

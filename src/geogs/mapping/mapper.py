@@ -71,7 +71,7 @@ class Mapper:
         """
         self.config = config
         self.keyframes = keyframes
-        self.cameras = MapCameras.of(keyframes.grid.camera, config)
+        self.cameras = MapCameras.of(keyframes.camera, config)
         render = self.cameras.render
         if table is None:
             table = MapTable.empty(keyframes.grid.device, seed)

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from geogs.bundle.problem import StreamedProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.gauge import deviations_after_alignment
-from geogs.bundle.uncertainty.lens_error import LensEstimate, LensEvidence, lens_evidence
+from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence
 from geogs.bundle.uncertainty.marginals import ALIKE, Marginals, common_covariance, marginals
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
@@ -92,15 +92,15 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
     return KeyframeUncertainty(tuple(ids), position, rotation, depth, residual)
 
 
-def lens_estimate(tracker: Tracker, ids: list[int]) -> LensEstimate | None:
-    """What edges between some keyframes, earliest first, say of k1 and k2 beside what is known."""
+def said_of_lens(tracker: Tracker, ids: list[int]) -> LensEvidence | None:
+    """What edges between some keyframes, earliest first, say of the lens beside what is known."""
     found = None
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         said = _solution(tracker, ids[first : first + TOGETHER + 1])
         if said is not None and said.known.is_bounded:
             part = said.lens()
             found = part if found is None else found.joined(part)
-    return None if found is None else found.bend
+    return found
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,9 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     found, covariance = solution.known, solution.known.covariance
     if found.is_bounded:
         common = common_covariance(solution.grid, solution.problem, OPTIONS, found, CELLS)
-        covariance = covariance + common + solution.lens().considered()
+        lens = tracker.keyframes.table.lens
+        focal = 0.0 if lens is None else lens.deviation_focal
+        covariance = covariance + common + solution.lens().considered(focal)
     own = torch.tensor([solution.frames.index(k) for k in ids])
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     return Marginals(

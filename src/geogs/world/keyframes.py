@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, cast
 
 import cv2
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from geogs.config.setting import Range
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import distorted_pixels, lens_maps
 from geogs.geometry.lie import scaled, se3_inverse, sim3_scale
 from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
@@ -180,8 +181,8 @@ class Keyframe:
         grid, lens = self.grid, self.table.lens
         fields = torch.stack([self.inverse_depth, self.confident_information], 1)
         if lens is not None:
-            rays = grid.rays[:, :2].double().cpu().numpy()
-            seen = distorted_pixels(rays, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
+            straight = SampleGrid(self.table.camera).rays[:, :2].double().numpy()
+            seen = distorted_pixels(straight, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
             fields = grid.sample_field(fields, torch.from_numpy(seen).to(fields))
         depth, information = fields.mT.reshape(2, grid.height, grid.width).cpu().numpy()
         return depth, information
@@ -203,6 +204,9 @@ class KeyframeTable:
     """By which images were straightened after the last adjustment; none where they are as they
     were tracked."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
+    """Of matches and depths, with the camera that saw what they are of."""
+    camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
+    """The pinhole that the images are of, or will be once they are straight."""
     encode: Encode | None = field(init=False, repr=False, metadata=NOT_STORED)
     """The flow operator's; images are encoded again by it when needed."""
     set_of: dict[int, "KeyframeSet"] = field(init=False, repr=False, metadata=NOT_STORED)
@@ -222,16 +226,25 @@ class KeyframeTable:
     ) -> "KeyframeTable":
         """The table with what belongs to the process: where depth is kept, how images are encoded,
         and how many of the large arrays of a name stay in memory."""
-        self.grid, self.encode, self.set_of = grid, encode, {}
+        self.grid, self.camera, self.encode, self.set_of = grid, grid.camera, encode, {}
+        if self.lens is not None:
+            self.refocus(self.lens.focal)
         self.arrays.resident = resident
         for keyframe in self.keyframes.values():
             keyframe.table = self
         return self
 
+    def refocus(self, factor: float) -> None:
+        """Have matches and depths as a focal length saw them that is so many times the images'."""
+        camera = self.camera
+        seen = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+        self.grid = SampleGrid(seen, self.grid.device)
+
     def mirror(self) -> "KeyframeTable":
         """A table without keyframes that has the large arrays of this one."""
         twin = KeyframeTable(arrays=self.arrays, lens=self.lens)
-        twin.grid, twin.encode, twin.set_of = self.grid, self.encode, {}
+        twin.grid, twin.camera = self.grid, self.camera
+        twin.encode, twin.set_of = self.encode, {}
         return twin
 
     def __getitem__(self, id: int) -> Keyframe:
@@ -288,6 +301,11 @@ class KeyframeSet:
     def grid(self) -> SampleGrid:
         """Where depth is kept."""
         return self.table.grid
+
+    @property
+    def camera(self) -> Camera:
+        """Of the images."""
+        return self.table.camera
 
     @property
     def ids(self) -> list[int]:
@@ -373,14 +391,16 @@ class KeyframeSet:
         self._corrections.append(correction)
 
     def straighten(self, lens: FoundLens) -> None:
-        """Have all images as the pinhole of the grid sees them, which a lens bent; once, and when
-        nothing is tracked on them any more.
+        """Have all images as the table's pinhole sees them, which a lens bent, or another focal
+        length saw (:meth:`KeyframeTable.refocus`); once, and when nothing is tracked on them any
+        more.
 
         What is beyond the border gets its colour; what was masked out stays black. Poses, and
         depths as the adjustment has them, stay.
         """
-        camera, arrays = self.grid.camera, self.table.arrays
-        maps = lens_maps(camera, camera, (lens.k1, lens.k2, 0.0, 0.0), "polynomial")
+        self.table.refocus(lens.focal)
+        camera, arrays = self.table.camera, self.table.arrays
+        maps = lens_maps(camera, self.grid.camera, (lens.k1, lens.k2, 0.0, 0.0), "polynomial")
         column, row = (
             np.rint(m).astype(int).clip(0, size - 1)
             for m, size in zip(maps, (camera.width, camera.height), strict=True)

@@ -113,17 +113,24 @@ class LensEvidence:
         """Of k1 and k2, the focal length being right."""
         return _estimate(self.information[:, 1:, 1:], self.gradient[:, 1:], LEAST[1:])
 
-    def considered(self) -> Float[Tensor, "m m"]:
+    @property
+    def whole(self) -> "LensEstimate":
+        """Of all sizes together."""
+        return _estimate(self.information, self.gradient, LEAST)
+
+    def considered(self, focal: float = 0.0) -> Float[Tensor, "m m"]:
         """Second moment of the moves of all poses by the error that the lens has.
 
         By what matches say of it and ``PRIOR`` together: their estimate moves poses as far as it
-        would if it were taken off, and what it leaves open does too.
+        would if it were taken off, and what it leaves open does too; and by a deviation of the
+        logarithm of the ``focal`` length that they do not tell of.
         """
-        said = _estimate(self.information, self.gradient, LEAST)
+        said = self.whole
         prior = self.moves.new_tensor(PRIOR).square()
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
+        left[0, 0] += focal**2
         return self.moves @ (left + size[:, None] * size) @ self.moves.mT
 
 

@@ -102,10 +102,13 @@ class Calibration:
 
     def with_lens(self, found: FoundLens) -> "Calibration":
         """The calibration with what images straightened by it bend, once the size is known."""
-        bend = found.k1, found.k2
-        distortion = with_bend(self.camera(), self.distortion, self.lens, bend)
+        bend, factor = (found.k1, found.k2), found.focal
+        distortion = with_bend(self.camera(), self.distortion, self.lens, bend, factor)
         origin = f"{self.origin}; bent as all matches say, by k1 {found.k1:.4f}, k2 {found.k2:.4f}"
-        return replace(self, distortion=distortion, origin=origin)
+        if factor != 1:
+            origin += f", fx times {factor:.4f}"
+        fx, fy = factor * self.fx, factor * self.fy
+        return replace(self, fx=fx, fy=fy, distortion=distortion, origin=origin)
 
     def _size(self) -> tuple[int, int]:
         assert self.width is not None, "fit() the calibration to the images first"

@@ -53,6 +53,11 @@ class FrameGraph:
         self.edges: dict[Pair, Edge] = {} if edges is None else edges
         self.bundle = bundle_solver(keyframes.grid)
 
+    def refocus(self, factor: float) -> None:
+        """Take matches and depths for what a focal length saw that is so many times the images'."""
+        self.keyframes.table.refocus(factor)
+        self.bundle = bundle_solver(self.keyframes.grid)
+
     @property
     def pairs(self) -> list[Pair]:
         """Measured pairs."""
