@@ -1,6 +1,7 @@
 """OpenCV's lens: against its formula written out, and there and back."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -106,3 +107,15 @@ def test_a_lens_with_another_before_it_is_both_in_turn(distortion, lens, pixels)
         found = distorted_pixels(np.array([[x, y]]), CAMERA, both, lens)
         worst = max(worst, float(np.abs(found - wanted).max()))
     assert worst < pixels
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.1, 0.03, 0.001, -0.002)])
+def test_a_lens_of_another_focal_length_shows_rays_where_both_in_turn_do(distortion):
+    k1, k2, focal = 0.04, -0.06, 0.94
+    both = with_bend(CAMERA, distortion, "polynomial", (k1, k2), focal)
+    camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy)
+    for x, y in [(0.0, 0.0), (0.3, 0.2), (-0.35, 0.1), (0.1, -0.3), (0.5, 0.4)]:
+        factor = focal * (1 + k1 * (x * x + y * y) + k2 * (x * x + y * y) ** 2)
+        wanted = distorted_pixels(np.array([[x * factor, y * factor]]), CAMERA, distortion)
+        found = distorted_pixels(np.array([[x, y]]), camera, both)
+        np.testing.assert_allclose(found, wanted, atol=0.3)

@@ -15,6 +15,7 @@ from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeSet
 from geogs.world.segments import TrackState
 from planted_walk import PlantedFlow, true_inverse_depth
 
@@ -23,11 +24,11 @@ GRID, COUNT = SampleGrid(CAMERA), 24
 BEND = 0.06, -0.1
 
 
-def forward() -> Tensor:
-    """World to camera: straight on along a corridor, looking a little about."""
+def forward(turn: float = 0.08) -> Tensor:
+    """World to camera: straight on along a corridor, looking about by such an angle."""
     k = np.arange(COUNT)
     xi = np.zeros((COUNT, 6))
-    xi[:, 4] = 1.57 + 0.08 * np.sin(0.5 * k)
+    xi[:, 4] = 1.57 + turn * np.sin(0.5 * k)
     T_wc = se3_exp(torch.from_numpy(xi))
     T_wc[:, :3, 3] = torch.from_numpy(np.stack([0.2 * k, 0.03 * np.sin(k), 0.0 * k], -1))
     return se3_inverse(T_wc)
@@ -36,8 +37,9 @@ def forward() -> Tensor:
 class BentFlow(PlantedFlow):
     """Exact matches between images of a lens."""
 
-    def __init__(self, T: Tensor, bend: tuple[float, float]) -> None:
-        self.bend = torch.tensor([0.0, *bend])
+    def __init__(self, T: Tensor, bend: tuple[float, float], focal: float = 0.0) -> None:
+        """``focal``: by which part of what they are taken for the images' focal length is less."""
+        self.bend = torch.tensor([focal, *bend])
         shown = self._pinhole(GRID.pixels)
         centre, focal = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
         self.rays = torch.cat([(shown - centre) / focal, torch.ones(GRID.size, 1)], 1)
@@ -62,9 +64,9 @@ class BentFlow(PlantedFlow):
         return FlowMatch(pixels, weight)
 
 
-def tracker_of(bend: tuple[float, float]) -> tuple[Tracker, Tensor]:
-    T = forward()
-    flow = BentFlow(T, bend)
+def tracker_of(bend: tuple[float, float], focal: float = 0.0) -> tuple[Tracker, Tensor]:
+    T = forward(0.3 if focal else 0.08)  # what tells a focal length is rotation
+    flow = BentFlow(T, bend, focal)
     tracker = lone_tracker(CAMERA, operator=flow)
     for n in range(COUNT):
         image = np.full((4, 4, 3), (n, 0, 0), np.uint8)
@@ -130,6 +132,35 @@ def test_the_end_of_tracking_straightens_images_once(monkeypatch):
     assert not np.array_equal(straight, images[3])
     assert not global_bundle(tracker, ends=True).after
     assert tracker.keyframes[3].image is straight
+
+
+def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatch):
+    monkeypatch.setattr(KeyframeSet, "straighten", lambda self, lens: None)
+    tracker, truth = tracker_of(BEND, -0.05)
+    monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", np.inf)
+    global_bundle(tracker, ends=True)
+    bent = error(tracker, truth)
+    assert tracker.keyframes.grid.camera == CAMERA
+    monkeypatch.undo()
+    monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 3)
+    monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)  # two dozen keyframes tell little
+    straightened = []
+    monkeypatch.setattr(KeyframeSet, "straighten", lambda self, lens: straightened.append(lens))
+    tracker, truth = tracker_of(BEND, -0.05)
+    global_bundle(tracker, ends=True)
+    (lens,) = straightened
+    # Shown at x, the ray is at 1.05 x and what the lens adds, to first order of the matches' own.
+    assert lens.focal == pytest.approx(1 / 1.05, abs=0.01)
+    assert abs(lens.focal - 1 / 1.05) < 2 * lens.deviation_focal < 0.04
+    assert tracker.keyframes.grid.camera.fx == pytest.approx(CAMERA.fx * lens.focal)
+    assert tracker.keyframes.camera == CAMERA
+    assert error(tracker, truth) < 0.5 * bent
+
+
+def test_while_tracking_goes_on_the_focal_length_stays():
+    tracker, _ = tracker_of(BEND, -0.05)
+    global_bundle(tracker)
+    assert tracker.keyframes.grid.camera == CAMERA
 
 
 def test_a_lens_that_is_known_is_left_alone():

@@ -1,5 +1,7 @@
 """Images that a found lens bent, straightened: against what a pinhole sees of the same room."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -79,6 +81,31 @@ def test_depths_go_with_the_image_and_those_of_the_adjustment_stay():
     seen = 79.5 + 110 * x * (1 + 0.1 * square - 0.2 * square**2)
     low, high = float(grid.pixels[:, 0].min()), float(grid.pixels[:, 0].max())
     np.testing.assert_allclose(field, 0.5 + seen.clip(low, high) / 160, atol=1e-4)
+
+
+def test_a_focal_length_that_was_found_is_taken_off_images_and_depths():
+    u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    image = np.stack([u, v, 0.5 * (u + v)], -1).astype(np.uint8)
+    keyframes = one_keyframe(image)
+    keyframe, before = keyframes[0], keyframes.grid
+    keyframe.inverse_depth = 0.5 + before.pixels[:, 0] / 160
+    keyframe.information = torch.full_like(keyframe.inverse_depth, 100.0)
+    keyframes.straighten(replace(LENS, focal=0.95))
+    assert (keyframes.camera, keyframes.grid.camera.fx) == (CAMERA, pytest.approx(0.95 * 110))
+    straight = keyframe.image
+    for row, column in [(60, 80), (20, 30), (100, 130), (60, 12)]:
+        x, y = (column - 79.5) / 110, (row - 59.5) / 110
+        factor = 0.95 * (1 + 0.1 * (x * x + y * y) - 0.2 * (x * x + y * y) ** 2)
+        seen = np.array([79.5 + 110 * x * factor, 59.5 + 110 * y * factor])
+        np.testing.assert_allclose(straight[row, column, :2], seen, atol=1.0)
+    x, y = (before.rays[:, k].numpy() for k in (0, 1))
+    square = x * x + y * y
+    seen = 79.5 + 110 * x * 0.95 * (1 + 0.1 * square - 0.2 * square**2)
+    low, high = float(before.pixels[:, 0].min()), float(before.pixels[:, 0].max())
+    field = keyframe.depth_field()[0].reshape(-1)
+    np.testing.assert_allclose(field, 0.5 + seen.clip(low, high) / 160, atol=1e-4)
+    again = KeyframeTable(lens=keyframes.table.lens).attached(SampleGrid(CAMERA))
+    assert again.grid.camera == keyframes.grid.camera
 
 
 def test_black_stays_black_and_features_are_made_anew():

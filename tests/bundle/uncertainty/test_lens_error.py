@@ -160,3 +160,5 @@ def test_without_evidence_the_lens_is_as_unsure_as_before():
     wanted = torch.diag(torch.tensor(PRIOR).double().square())
     # Nothing is said of it, whatever is estimated.
     assert float((found.considered() - wanted).abs().max()) < 1e-3 * float(wanted.max())
+    more = found.considered(0.01) - found.considered()
+    assert torch.allclose(more, torch.diag(torch.tensor([1e-4, 0, 0]).double()))
