@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.application.calibrate import refined, self_calibrated
+from geogs.application.calibrate import lens_said, refined, self_calibrated
 from geogs.application.interrupt import Interruption
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
@@ -18,6 +18,7 @@ from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.self_calibration import SelfCalibration
+from geogs.types import FoundLens
 from tracking_scenes import CAMERA, pose, render
 
 
@@ -148,3 +149,16 @@ def test_what_was_found_at_working_size_is_carried_to_the_source():
     assert after.refinement.deviation_k1 == 0.004
     assert not after.is_nominal
     assert "k1 -0.0800 +- 0.0040 (EXIF says 1500.0)" in after.origin
+
+
+def test_a_focal_length_that_all_matches_find_takes_the_place_of_the_guess():
+    guess = Calibration(200.0, 202.0, 159.5, 119.5, (), 320, 240, "auto", is_guess=True)
+    found = FoundLens(0.1, -0.2, 0.002, 0.003, focal=0.95, deviation_focal=0.01)
+    known = guess.with_lens(found)
+    assert (known.fx, known.fy, known.is_guess) == (pytest.approx(190), pytest.approx(191.9), False)
+    assert known.distortion == pytest.approx((0.1, -0.2, 0, 0), abs=1e-9)
+    assert known.refinement is not None
+    assert known.refinement.deviation == pytest.approx(1.9)
+    said = lens_said(guess, found, known)
+    assert "still bend: fx 190.0 +- 1.9 instead of 200.0, k1 0.1000 +- 0.0020" in said
+    assert "--intrinsics 190,191.9,159.5,119.5,0.1,-0.2," in said

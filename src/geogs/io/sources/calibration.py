@@ -105,10 +105,15 @@ class Calibration:
         bend, factor = (found.k1, found.k2), found.focal
         distortion = with_bend(self.camera(), self.distortion, self.lens, bend, factor)
         origin = f"{self.origin}; bent as all matches say, by k1 {found.k1:.4f}, k2 {found.k2:.4f}"
-        if factor != 1:
-            origin += f", fx times {factor:.4f}"
-        fx, fy = factor * self.fx, factor * self.fy
-        return replace(self, fx=fx, fy=fy, distortion=distortion, origin=origin)
+        bent = replace(self, distortion=distortion, origin=origin)
+        if factor == 1:
+            return bent
+        fx, said = factor * self.fx, self.refinement or FocalRefinement()
+        return replace(
+            bent, fx=fx, fy=factor * self.fy, is_guess=False, is_nominal=False,
+            origin=f"{origin}, fx times {factor:.4f}",
+            refinement=replace(said, deviation=found.deviation_focal * fx, failure=None),
+        )  # fmt: skip
 
     def _size(self) -> tuple[int, int]:
         assert self.width is not None, "fit() the calibration to the images first"
