@@ -41,8 +41,8 @@ class BentFlow(PlantedFlow):
         """``focal``: by which part of what they are taken for the images' focal length is less."""
         self.bend = torch.tensor([focal, *bend])
         shown = self._pinhole(GRID.pixels)
-        centre, focal = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
-        self.rays = torch.cat([(shown - centre) / focal, torch.ones(GRID.size, 1)], 1)
+        centre, scale = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
+        self.rays = torch.cat([(shown - centre) / scale, torch.ones(GRID.size, 1)], 1)
         own = SampleGrid(CAMERA)
         object.__setattr__(own, "rays", self.rays)
         super().__init__(GRID, T, true_inverse_depth(T, own), 0.0)

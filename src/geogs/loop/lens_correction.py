@@ -2,9 +2,9 @@
 
 Images were undistorted by what was said of the lens, which may be nothing. What is left is a small
 k1 and k2 that all matches of the video tell together. They are taken off the matches, and
-everything is adjusted again; flow stays as it is. So is the focal length, where they ask for it
-beside: one that was found while the lens was taken for a pinhole is off by several percent. Until
-then a walk straight on drifts in scale (docs/tracking.md).
+everything is adjusted again; flow stays as it is. Until then a walk straight on drifts in scale.
+The focal length is corrected with them where they ask for that, too: one that was found while the
+lens was taken for a pinhole is off by several percent (docs/tracking.md).
 """
 
 import math
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.lens_error import LensBend, LensEstimate
+from geogs.bundle.uncertainty.lens_error import LensBend
 from geogs.tracking.frames.pose_filling import shift_lens
 from geogs.tracking.frames.row_errors import TOGETHER
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -52,38 +52,34 @@ def correct_lens(
     """
     graph, keyframes = tracker.map.graph, tracker.keyframes
     measured = graph.packed
-    bend, deviation, focal, is_asked = LensBend(), [0.0] * 3, 0.0, False
+    bend, said, focal, is_asked = LensBend(), None, 0.0, False
     left = ROUNDS if measured and not tracker.segment.fixed else 0
     while left:
         evidence = said_of_lens(tracker, list(free_depth))
-        if evidence is None or (bend == LensBend() and evidence.bend.evidence < EVIDENCE):
+        if evidence is None or (said is None and evidence.bend.evidence < EVIDENCE):
             break
         said, left = evidence.whole, left - 1
-        if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * _deviations(said)[0]:
+        if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:
             is_asked, left = True, ROUNDS
         if is_asked:
             focal += float(said.size[0])
             graph.refocus(math.exp(focal))
         else:
             said = evidence.bend
-        deviation = _deviations(said)
-        if all(abs(x) < CONVERGED * d for x, d in zip(said.size, deviation, strict=True)):
+        if bool((said.size.abs() < CONVERGED * said.deviation).all()):
             left = 0
         bend = bend.plus(said.size[-2:])
         _shift(graph, measured, bend)
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
-    if bend == LensBend():
+    if said is None:
         return None
     shift_lens(tracker.map.recorder.log, keyframes, bend)
-    found = FoundLens(bend.k1, bend.k2, deviation[-2], deviation[-1])
+    *of_focal, k1, k2 = said.deviation.tolist()
+    found = FoundLens(bend.k1, bend.k2, k1, k2)
     if not is_asked:
         return found
-    open_focal = math.hypot(deviation[0], FOCAL_LEFT * focal)
+    open_focal = math.hypot(*of_focal, FOCAL_LEFT * focal)
     return replace(found, focal=math.exp(focal), deviation_focal=open_focal)
-
-
-def _deviations(said: LensEstimate) -> list[float]:
-    return [math.sqrt(float(variance)) for variance in said.covariance.diagonal()]
 
 
 def _shift(graph: FrameGraph, measured: dict[Pair, PackedEdge], bend: LensBend) -> None:

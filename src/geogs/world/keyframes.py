@@ -181,7 +181,7 @@ class Keyframe:
         grid, lens = self.grid, self.table.lens
         fields = torch.stack([self.inverse_depth, self.confident_information], 1)
         if lens is not None:
-            straight = SampleGrid(self.table.camera).rays[:, :2].double().numpy()
+            straight = lens.focal * grid.rays[:, :2].double().cpu().numpy()
             seen = distorted_pixels(straight, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
             fields = grid.sample_field(fields, torch.from_numpy(seen).to(fields))
         depth, information = fields.mT.reshape(2, grid.height, grid.width).cpu().numpy()

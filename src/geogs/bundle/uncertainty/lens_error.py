@@ -141,6 +141,11 @@ class LensEstimate(NamedTuple):
     covariance: Float[Tensor, "k k"]
 
     @property
+    def deviation(self) -> Float[Tensor, "k"]:
+        """Standard deviation of each size."""
+        return self.covariance.diagonal().sqrt()
+
+    @property
     def evidence(self) -> float:
         """Square of the sizes in their deviations."""
         return float(self.size @ torch.linalg.solve(self.covariance, self.size))
