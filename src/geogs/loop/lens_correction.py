@@ -85,8 +85,9 @@ def correct_lens(
 def _shift(graph: FrameGraph, measured: dict[Pair, PackedEdge], bend: LensBend) -> None:
     """Have the measured edges with their matches where a pinhole would have them."""
     grid, keyframes, pairs = graph.keyframes.grid, graph.keyframes, sorted(measured)
-    for start in range(0, len(pairs), TOGETHER):
-        part = pairs[start : start + TOGETHER]
+    size = TOGETHER[grid.on_gpu]
+    for start in range(0, len(pairs), size):
+        part = pairs[start : start + size]
         T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         shifts = bend.of_matches(grid.camera, grid.rays, T_ji, depth)
         for pair, shift in zip(part, shifts, strict=True):

@@ -10,7 +10,7 @@ from geogs.bundle.problem import StreamedProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.gauge import deviations_after_alignment
 from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence
-from geogs.bundle.uncertainty.marginals import ALIKE, Marginals, common_covariance, marginals
+from geogs.bundle.uncertainty.marginals import Marginals, common_covariance, marginals
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
@@ -96,52 +96,50 @@ def said_of_lens(tracker: Tracker, ids: list[int]) -> LensEvidence | None:
     """What edges between some keyframes, earliest first, say of the lens beside what is known."""
     found = None
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        said = _solution(tracker, ids[first : first + TOGETHER + 1])
-        if said is not None and said.known.is_bounded:
-            part = said.lens()
+        matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
+        part = None if matches is None else matches.lens()
+        if part is not None:
             found = part if found is None else found.joined(part)
     return found
 
 
 @dataclass(frozen=True)
-class _Solution:
-    """Some keyframes' poses and depths as they are, and what their edges say of them."""
+class _Matches:
+    """Some keyframes' poses and depths as they are, and the edges between them."""
 
     grid: SampleGrid
     problem: StreamedProblem
     frames: list[int]
-    known: Marginals
 
-    def lens(self) -> LensEvidence:
-        """What matches say of the lens."""
-        covariance = self.known.covariance / ALIKE
-        return lens_evidence(self.grid, self.problem, OPTIONS, covariance, CELLS)
+    @staticmethod
+    def among(tracker: Tracker, ids: list[int]) -> "_Matches | None":
+        """Those of some keyframes; none where no edge joins them."""
+        free = ids if tracker.segment.fixed else ids[1:]
+        among = {*ids, *tracker.segment.fixed}
+        edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
+        if not edges:
+            return None
+        problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
+        return _Matches(tracker.keyframes.grid, problem, frames)
 
-
-def _solution(tracker: Tracker, ids: list[int]) -> _Solution | None:
-    """Of some keyframes, by the edges between them; none where there are none."""
-    free = ids if tracker.segment.fixed else ids[1:]
-    among = {*ids, *tracker.segment.fixed}
-    edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
-    if not edges:
-        return None
-    problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
-    grid = tracker.keyframes.grid
-    return _Solution(grid, problem, frames, marginals(grid, problem, OPTIONS, CELLS))
+    def lens(self) -> LensEvidence | None:
+        """What they say of the lens; nothing where they do not tell of all poses."""
+        return lens_evidence(self.grid, self.problem, OPTIONS, CELLS)
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     """Marginals of some keyframes, with what all their matches have wrong in common."""
-    solution = _solution(tracker, ids)
-    if solution is None:
+    matches = _Matches.among(tracker, ids)
+    if matches is None:
         return None
-    found, covariance = solution.known, solution.known.covariance
-    if found.is_bounded:
-        common = common_covariance(solution.grid, solution.problem, OPTIONS, found, CELLS)
+    found = marginals(matches.grid, matches.problem, OPTIONS, CELLS)
+    covariance, said = found.covariance, matches.lens() if found.is_bounded else None
+    if said is not None:
+        common = common_covariance(matches.grid, matches.problem, OPTIONS, found, CELLS)
         lens = tracker.keyframes.table.lens
         focal = 0.0 if lens is None else lens.deviation_focal
-        covariance = covariance + common + solution.lens().considered(focal)
-    own = torch.tensor([solution.frames.index(k) for k in ids])
+        covariance = covariance + common + said.considered(focal)
+    own = torch.tensor([matches.frames.index(k) for k in ids])
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     return Marginals(
         covariance[rows[:, None], rows], found.relative_depth[own], found.normalised_residual[own]

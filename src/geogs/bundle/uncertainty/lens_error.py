@@ -26,6 +26,7 @@ from geogs.bundle.projection import (
     relative_motion,
 )
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.uncertainty.marginals import pose_covariance
 from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
@@ -170,27 +171,29 @@ def _estimate(
 
 
 def lens_evidence(
-    grid: SampleGrid,
-    problem: AnyProblem,
-    options: BundleOptions,
-    covariance: Float[Tensor, "m m"],
-    cells: int = 1024,
-) -> LensEvidence:
+    grid: SampleGrid, problem: AnyProblem, options: BundleOptions, cells: int = 1024
+) -> LensEvidence | None:
     """What the matches of a problem at its solution say of the error of the lens.
+
+    None where they do not tell of all poses.
 
     Args:
         grid: where the depths are.
-        problem: as of :func:`~geogs.bundle.uncertainty.marginals.marginals`.
+        problem: as of :func:`~geogs.bundle.uncertainty.marginals.marginals`; it is linearised once.
         options: Huber's limit and the damping of depths.
-        covariance: inverse of the reduced equations of all poses, finite.
         cells: most cells of a frame that are asked; the others are taken to say the same.
     """
     thinned = ThinnedProblem(grid, problem, cells)
     scale = 1 / thinned.fraction
-    pull = torch.zeros(len(covariance), SHAPES, dtype=torch.float64)
+    size = 6 * len(problem.T_cw)
+    poses, pull = (torch.zeros(size, width, dtype=torch.float64) for width in (size, SHAPES))
     each = list(_reduced(thinned, options))
     for s in each:
+        poses[s.rows[:, None], s.rows] += scale * s.poses
         pull[s.rows] += scale * s.pull
+    covariance = pose_covariance(problem, poses)
+    if not bool(covariance.isfinite().all()):
+        return None
     moves = covariance @ pull
     information = [s.information - s.pull.mT @ moves[s.rows] for s in each]
     gradient = [s.gradient + moves[s.rows].mT @ s.descent for s in each]
@@ -201,6 +204,7 @@ class _Reduced(NamedTuple):
     """Equations of the poses that a source joins, and of the sizes, its depths eliminated."""
 
     rows: Int[Tensor, "c"]
+    poses: Float[Tensor, "c c"]
     pull: Float[Tensor, "c k"]
     """Of matches that are off by a size of one on the poses."""
     descent: Float[Tensor, "c"]
@@ -225,10 +229,12 @@ def _reduced(thinned: ThinnedProblem, options: BundleOptions) -> Iterator[_Reduc
             follow = depth.coupling * free
             information = torch.einsum("keap,leap,eap->kl", S, S, w)
             gradient = -torch.einsum("keap,eap,eap->k", S, r, w)
+            poses, descent = source.edges.chained()
             yield _Reduced(
                 source.edges.rows(len(part.T_cw)),
+                poses,
                 chain.mT @ (along - follow @ on_depth.mT).double(),
-                source.edges.chained()[1],
+                descent,
                 (information - (on_depth * free) @ on_depth.mT).double(),
                 (gradient + (on_depth * free) @ depth.gradient).double(),
             )

@@ -91,8 +91,13 @@ def marginals(
     Where at most one pose is fixed, lengths are relative to the distances of the cameras from it.
     """
     part = ThinnedProblem(grid, problem, cells)
-    covariance = ALIKE * _pose_covariance(problem, part, options)
-    relative = torch.zeros(len(problem.T_cw), part.count)
+    n = len(problem.T_cw)
+    poses = torch.zeros(6 * n, 6 * n, dtype=torch.float64)
+    for source in part.sources(options):
+        rows = source.edges.rows(n)
+        poses[rows[:, None], rows] += source.edges.chained()[0] / part.fraction
+    covariance = ALIKE * pose_covariance(problem, poses)
+    relative = torch.zeros(n, part.count)
     relative[problem.free_depth.cpu()] = torch.inf
     for source in part.sources(options):
         frame = source.frame
@@ -168,19 +173,16 @@ def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
     return torch.nn.functional.one_hot(at, across * down).to(pixels)
 
 
-def _pose_covariance(
-    problem: AnyProblem, part: ThinnedProblem, options: BundleOptions
-) -> Float[Tensor, "m m"]:
-    """Inverse of the reduced camera system over all poses, zero for the fixed ones."""
-    n, fixed = len(problem.T_cw), ~problem.free_pose.cpu()
-    H = torch.zeros(6 * n, 6 * n, dtype=torch.float64)
-    for source in part.sources(options):
-        rows = source.edges.rows(n)
-        H[rows[:, None], rows] += source.edges.chained()[0] / part.fraction
+def pose_covariance(problem: AnyProblem, H: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
+    """Inverse of a reduced camera system over all poses, zero for the fixed ones.
+
+    Infinite where that cannot be told. Where at most one pose is fixed, the unit of length is.
+    """
+    fixed = ~problem.free_pose.cpu()
     if int(fixed.sum()) <= 1:
         origin = int(torch.nonzero(fixed)[0, 0]) if bool(fixed.any()) else 0
         along = _scaling(problem.T_cw.double().cpu(), origin)
-        H += 1e3 * H.diagonal().max() * along[:, None] * along
+        H = H + 1e3 * H.diagonal().max() * along[:, None] * along
     free = torch.nonzero(~fixed.repeat_interleave(6))[:, 0]
     S = H[free[:, None], free]
     # What no match tells of is open, not an error: its variance becomes very large.

@@ -21,8 +21,9 @@ from geogs.world.edges import in_steps, unpacked_positions
 from geogs.world.frames import FrameLog, FrameRecord, Observation
 from geogs.world.keyframes import KeyframeSet
 
-SOLVED_TOGETHER = 64
-"""Frames whose poses are solved, or observations that are corrected, at a time; bounds memory."""
+SOLVED_TOGETHER = 64, 512
+"""Frames whose poses are solved, or observations that are corrected, at a time, on the CPU and on a
+GPU; bounds memory."""
 ITERATIONS = 8
 """Steps of the motion-only adjustment of a frame."""
 HUBER = 3.0
@@ -102,8 +103,9 @@ def _seen_by(
 ) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int]]]:
     """What was found of frames in keyframes, and the ids of these; some at a time."""
     seen = [(r, o) for r in frames.records for o in r.observations if o.keyframe in keyframes]
-    for start in range(0, len(seen), SOLVED_TOGETHER):
-        part = seen[start : start + SOLVED_TOGETHER]
+    size = SOLVED_TOGETHER[keyframes.grid.on_gpu]
+    for start in range(0, len(seen), size):
+        part = seen[start : start + size]
         yield part, [o.keyframe for _, o in part]
 
 
@@ -124,8 +126,9 @@ def observed(
         r for r in tracked
         if r.index not in are_keyframes and any(o.keyframe in keyframes for o in r.observations)
     ]  # fmt: skip
-    for start in range(0, len(seen), SOLVED_TOGETHER):
-        part = seen[start : start + SOLVED_TOGETHER]
+    size = SOLVED_TOGETHER[keyframes.grid.on_gpu]
+    for start in range(0, len(seen), size):
+        part = seen[start : start + size]
         yield part, _problem(part, keyframes)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import carried_over, project, seen_from_targets
@@ -27,8 +27,8 @@ NODES = 5
 """Frames whose poses say where a point is at the time of its row."""
 LONGEST_INTERVAL = 0.07
 """Seconds between two frames; over more, their poses say less of the rows than the video does."""
-TOGETHER = 64
-"""Edges that are corrected at a time; bounds memory."""
+TOGETHER = 64, 512
+"""Edges that are corrected at a time, on the CPU and on a GPU; bounds memory."""
 LARGEST = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
 
@@ -143,13 +143,18 @@ class RowErrors:
         known = [n for n, frame in enumerate(frames) if frame in self._rectified]
         if not known:
             return error
-        rectified = [self._rectified[frames[n]] for n in known]
-        at = torch.tensor(known, device=pixels.device)
+        # Of several edges of a frame, what it has of its own is brought here once.
+        order = {frame: n for n, frame in enumerate(dict.fromkeys(frames[n] for n in known))}
+        rectified = [self._rectified[frame] for frame in order]
+        at, which = (
+            torch.tensor(numbers, device=pixels.device)
+            for numbers in (known, [order[frames[n]] for n in known])
+        )
         shown, d = pixels[at], inverse_depth[at]
-        offset, seconds = _seen([f.rows for f in rectified], shown)
+        offset, seconds = _seen([f.rows for f in rectified], which, shown)
         seconds = self._factor * seconds
-        T = torch.stack([f.motions for f in rectified]).to(shown)
-        times = torch.stack([f.times for f in rectified]).to(shown)
+        T = torch.stack([f.motions for f in rectified]).to(shown)[which]
+        times = torch.stack([f.times for f in rectified]).to(shown)[which]
         weights, camera = lagrange(times, seconds), self._grid.camera
         focal, centre = (
             shown.new_tensor([camera.fx, camera.fy]), shown.new_tensor([camera.cx, camera.cy])
@@ -175,8 +180,9 @@ def edge_shifts(
     ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame.
     """
     pairs, grid = sorted(measured), keyframes.grid
-    for start in range(0, len(pairs), TOGETHER):
-        part = pairs[start : start + TOGETHER]
+    size = TOGETHER[grid.on_gpu]
+    for start in range(0, len(pairs), size):
+        part = pairs[start : start + size]
         source, target = ([pair[k] for pair in part] for k in (0, 1))
         T_ji = keyframes.relative_poses(part)
         pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
@@ -217,11 +223,12 @@ def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
 
 
 def _seen(
-    rows: Sequence[SeenRows], pixels: Float[Tensor, "e p 2"]
+    rows: Sequence[SeenRows], which: Int[Tensor, "e"], pixels: Float[Tensor, "e p 2"]
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
-    """Offsets and seconds at pixels, bilinear between the nodes as the image was made."""
+    """Offsets and seconds at pixels, each in ``which`` of the rows, bilinear between the nodes as
+    the image was made."""
     laid = [torch.cat([r.offset, r.seconds[..., None]], -1) for r in rows]
-    field = torch.stack(laid).to(pixels).permute(0, 3, 1, 2)
+    field = torch.stack(laid).to(pixels).permute(0, 3, 1, 2)[which]
     size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
     position = 2 * (pixels + CELL + 0.5) / size - 1
     values = torch.nn.functional.grid_sample(
