@@ -83,7 +83,9 @@ def _candidates(cuda_major: str) -> list[str]:
     spec = importlib.util.find_spec("torch")
     if spec is not None and spec.origin is not None:
         folders += [Path(spec.origin).parents[1] / "nvidia", Path(spec.origin).parent / "lib"]
-    found = [str(p) for f in folders if f.is_dir() for p in sorted(f.rglob(name))]
+    # Only where packages have it: a walk through all that NVIDIA's hold takes seconds.
+    places = [place + name for place in ("", "*/lib/", "*/bin/", "*/bin/*/")]
+    found = [str(p) for f in folders for place in places for p in sorted(f.glob(place))]
     return list(dict.fromkeys(found + sorted(glob.glob(f"/usr/local/cuda*/lib64/{name}"))))
 
 

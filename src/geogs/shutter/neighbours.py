@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from geogs.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between
 from geogs.shutter.rates import FlowMeter, angular_velocity, parallax
 from geogs.shutter.rolling_camera import RollingCamera
+from geogs.threads import Each
 
 
 @runtime_checkable
@@ -31,40 +32,64 @@ Picture = TypeVar("Picture", bound=Image)
 
 
 def with_angular_motion(
-    images: Iterable[Picture], camera: RollingCamera, readout: float, wanted: Callable[[int], bool]
+    images: Iterable[Picture],
+    camera: RollingCamera,
+    readout: float,
+    wanted: Callable[[int], bool],
+    each: Each = map,
 ) -> Iterator[tuple[Picture, AngularMotion]]:
     """Those images whose position is wanted, each with how the camera turned then.
 
-    One image more than the one that is given has been read by then. What is given depends on an
-    image and its two neighbours alone, so it is the same wherever reading begins.
+    What is given depends on an image and its two neighbours alone, so it is the same wherever
+    reading begins.
 
     Args:
         images: neighbours in the video.
         camera: that took them.
         readout: seconds from the first to the last row.
         wanted: says of positions 0, 1, 2, ... whether the image is to be given.
+        each: how flow is measured of one pair of neighbours after the other; with ``map`` one image
+            more than the one that is given has been read by then.
     """
-    meter, position = FlowMeter(camera), -1
-    last: _Seen[Picture] | None = None
+    meter = FlowMeter(camera)
+
+    def stepped(
+        pair: tuple[_Seen[Picture], _Seen[Picture] | None],
+    ) -> tuple[_Seen[Picture], AngularStep | None]:
+        first, second = pair
+        if second is None or not (first.is_wanted or second.is_wanted):
+            return first, None
+        return first, _step(meter, first, second, readout)
+
     before: AngularStep | None = None
-    for position, image in enumerate(images):
-        here = _Seen(image, None if image.image is None else meter.small(image.image))
-        after = None
-        if last is not None and (wanted(position - 1) or wanted(position)):
-            after = _step(meter, last, here, readout)
-        if last is not None and wanted(position - 1):
-            yield last.image, angular_motion_between(before, after)
-        before, last = after, here
-    if last is not None and wanted(position):
-        yield last.image, angular_motion_between(before, None)
+    for here, after in each(stepped, _neighbours(images, meter, wanted)):
+        if here.is_wanted:
+            yield here.image, angular_motion_between(before, after)
+        before = after
 
 
 @dataclass(frozen=True)
 class _Seen(Generic[Picture]):
-    """An image, and the small one that flow is measured on."""
+    """An image, the small one that flow is measured on, and whether its turning is asked for."""
 
     image: Picture
     small: UInt8[np.ndarray, "h w"] | None
+    is_wanted: bool
+
+
+def _neighbours(
+    images: Iterable[Picture], meter: FlowMeter, wanted: Callable[[int], bool]
+) -> Iterator[tuple[_Seen[Picture], _Seen[Picture] | None]]:
+    """Each image with the next; the last one alone."""
+    last: _Seen[Picture] | None = None
+    for position, image in enumerate(images):
+        small = None if image.image is None else meter.small(image.image)
+        here = _Seen(image, small, wanted(position))
+        if last is not None:
+            yield last, here
+        last = here
+    if last is not None:
+        yield last, None
 
 
 def _step(

@@ -1,6 +1,7 @@
 """The angular velocity of a camera between two images of a video, from their flow."""
 
 import math
+import threading
 from dataclasses import dataclass, replace
 
 import cv2
@@ -48,7 +49,7 @@ class RayFlow:
 
 
 class FlowMeter:
-    """Measures flow between images of one camera; two threads need two of them."""
+    """Measures flow between images of one camera, in any thread."""
 
     def __init__(self, camera: RollingCamera) -> None:
         """``camera`` of the images that :meth:`small` is given."""
@@ -64,7 +65,7 @@ class FlowMeter:
         self._pixels = pixels
         self._rays = self._camera.rays(pixels)
         self._times = self._camera.line_times(pixels)
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._of_thread = threading.local()
 
     def small(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
         """The grey image that flow is measured on."""
@@ -75,8 +76,10 @@ class FlowMeter:
 
     def measure(self, first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> RayFlow:
         """Flow from one small image to another."""
-        # OpenCV makes the output where None is given, which its stubs do not say.
-        dense = self._dis.calc(first, second, None)  # type: ignore[call-overload]
+        # OpenCV's own has buffers that two threads cannot share.
+        if not hasattr(self._of_thread, "dis"):
+            self._of_thread.dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        dense = self._of_thread.dis.calc(first, second, None)
         ends = self._pixels + dense[self._cells].reshape(-1, 2)
         width, height = self._size
         inside = (ends >= BORDER).all(1) & (ends <= (width - 1 - BORDER, height - 1 - BORDER)).all(

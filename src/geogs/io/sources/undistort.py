@@ -1,5 +1,6 @@
 """From the image as it came to the working image: resize, then straighten it."""
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -106,12 +107,12 @@ class Rectifier:
         self, offsets: Float[np.ndarray, "h w 2"] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Column and row of each pixel of the working image in the resized image."""
-        u, v = self._lens_maps()
+        u, v = self._maps or self._pixels
         return (u, v) if offsets is None else (u + offsets[..., 0], v + offsets[..., 1])
 
-    def _lens_maps(self) -> tuple[np.ndarray, np.ndarray]:
-        if self._maps is not None:
-            return self._maps
+    @functools.cached_property
+    def _pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where they are without a lens."""
         v, u = np.mgrid[: self.size[1], : self.size[0]].astype(np.float32)
         return u, v
 

@@ -27,6 +27,7 @@ from geogs.io.sources.reader import (
     Reader,
     of_one_size,
     read_ahead,
+    read_side_by_side,
 )
 from geogs.io.sources.readout_clips import read_clips
 from geogs.io.sources.undistort import Rectifier
@@ -35,6 +36,7 @@ from geogs.shutter.neighbours import with_angular_motion
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
+from geogs.threads import Each
 from geogs.types import MeasuredDepth
 
 LEAST_EDGE = 12
@@ -239,15 +241,19 @@ class WorkingImages:
 
         images = map(self._at_working_size, self.reader.read(start - before, stop, 1))
         offsets = RowOffsets(rolling, self.camera)
-        for raw, turning in with_angular_motion(images, rolling, readout, is_selected):
+
+        def straight(seen: tuple[RawFrame, AngularMotion]) -> RawFrame:
+            raw, turning = seen
             if raw.image is None:
-                yield raw
-                continue
+                return raw
             nodes = offsets.nodes(AngularMotion() if turning.is_still else turning, readout)
             moved = None if turning.is_still else offsets.dense(nodes)
             image = self._rectifier.straightened(raw.image, moved)
             depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
-            yield replace(raw, image=image, depth=depth, rows=rows)
+            return replace(raw, image=image, depth=depth, rows=rows)
+
+        each: Each = map if self.is_live else read_side_by_side
+        yield from each(straight, with_angular_motion(images, rolling, readout, is_selected, each))
 
     def why_short(self, read: int, last: float) -> str:
         """What to say where fewer images came than the recording says; nothing where all did.
