@@ -1,7 +1,7 @@
 """A video whose frames are tracked one by one, mapped, and checkpointed on the way."""
 
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -70,28 +70,21 @@ class TrackedVideo:
         if outcome is Outcome.FINISHED:
             checkpoint.write()
         self._write_stage("online", driver, new)
-        is_adjusted = False
-        with _full_memory_said(driver):
-            is_adjusted = outcome is Outcome.FINISHED and driver.stop.lets_finish(
-                lambda: self._adjust(driver, new)
-            )
-        return Outcome.STOPPED if outcome is Outcome.FINISHED and not is_adjusted else outcome
+        return _finished(driver, outcome, lambda: self._adjust(driver, new))
 
     def map(self, driver: Driver, outcome: Outcome) -> Outcome:
         """The map after :meth:`locate` came to ``outcome``: where it was cut short or this is, one
         in little time."""
-        slam, is_mapped = self.scene, False
+        slam, was_cut = self.scene, outcome is not Outcome.FINISHED
         if outcome is Outcome.FINISHED and slam.world.maps_at_end and not driver.kernels.is_working:
             self._write_preview(driver)
-        with _full_memory_said(driver):
-            is_mapped = outcome is Outcome.FINISHED and driver.stop.lets_finish(
-                lambda: self._refine(driver)
-            )
-            if not is_mapped:
-                slam.refine(driver.progress.stage, BRIEFLY)
+        outcome = _finished(driver, outcome, lambda: self._refine(driver))
+        if was_cut or outcome is Outcome.STOPPED:
+            briefly = lambda: slam.refine(driver.progress.stage, BRIEFLY)  # noqa: E731
+            _finished(driver, Outcome.FINISHED, briefly)
         scale = scale_source(self.metadata.settings.scale_from)
         make_metric(slam, self.source, scale, driver.progress)
-        return Outcome.STOPPED if outcome is Outcome.FINISHED and not is_mapped else outcome
+        return outcome
 
     def _track(self, driver: Driver, checkpoint: Checkpoint) -> Outcome:
         """All frames through the system, until a request to stop."""
@@ -181,13 +174,18 @@ def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:
         yield frame
 
 
-@contextmanager
-def _full_memory_said(driver: Driver) -> Iterator[None]:
-    """A final stage that ends where the memory of the GPU is full, in a sentence."""
+def _finished(driver: Driver, outcome: Outcome, stage: Callable[[], object]) -> Outcome:
+    """What the work comes to after a final stage, which is left out where it was cut short before.
+
+    Where the memory of the GPU is full, what there is by then is kept.
+    """
+    if outcome is not Outcome.FINISHED:
+        return outcome
     try:
-        yield
+        return outcome if driver.stop.lets_finish(stage) else Outcome.STOPPED
     except torch.cuda.OutOfMemoryError:
         torch.cuda.empty_cache()
         driver.progress.write(
             "The GPU has no memory left for the final stages; keeping what there is."
         )
+        return Outcome.MEMORY_FULL
