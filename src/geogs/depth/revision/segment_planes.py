@@ -77,7 +77,9 @@ class PlanarDepth:
     """Flat indices."""
     depth: Float32[np.ndarray, "n"]
     """z of the planes there."""
-    coefficients: Float64[np.ndarray, "n 3"]
+    plane: Int32[np.ndarray, "n"]
+    """Which that is."""
+    coefficients: Float64[np.ndarray, "p 3"]
     """Of inverse depth in x and y over the image's width and height, from its middle, and 1."""
 
     def normals(self, camera: Camera) -> Float32[np.ndarray, "n 3"]:
@@ -87,10 +89,10 @@ class PlanarDepth:
         n = (a fx, b fy, a cx + b cy + c).
         """
         a, b = self.coefficients[:, 0] / camera.width, self.coefficients[:, 1] / camera.height
-        v, u = np.divmod(self.pixels, camera.width)
-        c = 1 / self.depth - a * u - b * v
+        middle_u, middle_v = (camera.width - 1) / 2, (camera.height - 1) / 2
+        c = self.coefficients[:, 2] - a * middle_u - b * middle_v
         n = np.stack([a * camera.fx, b * camera.fy, a * camera.cx + b * camera.cy + c], -1)
-        return (-n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)
+        return (-n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)[self.plane]
 
 
 @dataclass(frozen=True)
@@ -106,31 +108,11 @@ class SegmentPlane:
     typical: float
     """Their mean inverse depth."""
 
-    def at(self, places: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-        """Inverse depth at some places."""
-        return (places * self.coefficients).sum(-1)
-
-    def holds(
-        self, places: Float64[np.ndarray, "n 3"], value: Float64[np.ndarray, "n"]
-    ) -> Bool[np.ndarray, "n"]:
-        """Where an inverse depth lies on it."""
-        return np.abs(self.at(places) - value) < TOLERANCE * value
-
-    def deviation(self, places: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-        """Relative deviation of that: as the fit carries on half the tolerance of its pixels."""
-        inverse = np.linalg.inv(self.information + 1e-9 * np.eye(3))
-        variance = ALIKE * _quadratic(places, inverse)
-        own = np.maximum(self.at(places), 1e-9)
-        return np.sqrt(variance) * TOLERANCE / 2 * self.typical / own
-
-
-def _quadratic(
-    places: Float64[np.ndarray, "n 3"], form: Float64[np.ndarray, "3 3"]
-) -> Float64[np.ndarray, "n"]:
-    """Values of a symmetric form at (x, y, 1): written out, as a library's threads cost more."""
-    x, y = places[:, 0], places[:, 1]
-    mixed = form[0, 1] * x * y + form[0, 2] * x + form[1, 2] * y
-    return form[0, 0] * x * x + form[1, 1] * y * y + form[2, 2] + 2 * mixed
+    @property
+    def covariance(self) -> Float64[np.ndarray, "3 3"]:
+        """Of the coefficients: as the fit carries on half the tolerance of its pixels."""
+        deviation = TOLERANCE / 2 * self.typical
+        return ALIKE * deviation**2 * np.linalg.inv(self.information + 1e-9 * np.eye(3))
 
 
 def on_planes(
@@ -147,15 +129,18 @@ def on_planes(
         sky: where nothing is.
         seed: of the samples that are tried.
     """
+    from geogs.depth.revision.segment_plane_kernels import planar_pixels
+
     shape = found.depth.shape
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
-    which = _resized(which, shape).ravel()
-    pixels = np.flatnonzero((which > 0) & (found.confidence.ravel() <= UNSURE))
-    coefficients = np.array([p.coefficients for p in planes]).reshape(-1, 3)[which[pixels] - 1]
-    value = (coefficients * _places(shape, pixels)).sum(-1)
-    own = 1 / found.depth.ravel()[pixels]
-    good = (value > own / FARTHEST) & (value < FARTHEST * own)
-    return PlanarDepth(pixels[good], (1 / value[good]).astype(np.float32), coefficients[good])
+    which = _resized(which, shape)
+    coefficients = np.array([p.coefficients for p in planes]).reshape(-1, 3)
+    pixels, depth = np.empty(which.size, np.int64), np.empty(which.size, np.float32)
+    count = planar_pixels(
+        which, coefficients, found.depth, found.confidence, UNSURE, FARTHEST, pixels, depth
+    )
+    taken = pixels[:count]
+    return PlanarDepth(taken, depth[:count], which.ravel()[taken] - 1, coefficients)
 
 
 def _planes_of_segments(
@@ -165,67 +150,43 @@ def _planes_of_segments(
     rng: np.random.Generator,
 ) -> tuple[list[SegmentPlane], Int32[np.ndarray, "sh sw"]]:
     """Planes, and which of them, from 1 on, the pixels of the segments lie on where that is known
-    well; 0 for none."""
+    well; 0 for none.
+
+    Of an unsure part at whose own rim most of what is sure lies on no plane nothing is known: a
+    segment may go on beyond an edge that is too faint to be seen.
+    """
+    from geogs.depth.revision import segment_plane_kernels as kernels
+
     shape = labels.shape
     depth, confidence = (_resized(m, shape) for m in (found.depth, found.confidence))
-    sky = None if sky is None else _resized(sky.astype(np.uint8), shape)
+    is_sky = np.zeros(shape, bool) if sky is None else _resized(sky.view(np.uint8), shape) > 0
+    sure, unsure = confidence > SURE, confidence <= UNSURE
     reach = max(1, round(RIM * max(shape)))
-    rim = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    boxes, counts = (np.empty((int(labels.max(initial=0)), k), np.int64) for k in (4, 3))
+    kernels.segment_boxes(labels, unsure, is_sky, boxes, counts)
+    worth_it = (counts[:, 1] >= _LEAST) & (counts[:, 2] <= SKY * counts[:, 0])
     planes, which = list[SegmentPlane](), np.zeros(shape, np.int32)
-    for label in range(1, int(labels.max(initial=0)) + 1):
-        around = _box(labels == label, reach)
-        segment, sure = labels[around] == label, confidence[around]
-        is_sky = sky is not None and sky[around][segment].mean() > SKY
-        if is_sky or np.count_nonzero(segment & (sure <= UNSURE)) < _LEAST:
-            continue
-        known = np.flatnonzero((cv2.dilate(segment.astype(np.uint8), rim) > 0) & (sure > SURE))
-        places = _places(shape, known, around)
-        value = 1 / depth[around].ravel()[known].astype(np.float64)
-        some = slice(None, None, -(-len(known) // _MOST) or 1)
-        weight = sure.ravel()[known[some]].astype(np.float64)
-        own = list(segment_planes(places[some], value[some], weight, rng))
+    parts, told = np.zeros((2, *shape), np.int32)
+    for label in np.flatnonzero(worth_it) + 1:
+        top, left, low, right = box = tuple(boxes[label - 1].tolist())
+        known = kernels.rim_pixels(labels, label, box, reach, sure)
+        some = known[:: -(-len(known) // _MOST) or 1]
+        value, weight = (m.ravel()[some].astype(np.float64) for m in (depth, confidence))
+        own = list(segment_planes(_places(shape, some), 1 / value, weight, rng))
         if not own:
             continue
-        is_on = np.zeros(segment.shape, bool)
-        is_on.ravel()[known] = np.any([plane.holds(places, value) for plane in own], 0)
-        unsure = _told_by_rim(segment & (sure <= UNSURE), sure > SURE, is_on, rim)
-        for plane, mine in zip(own, _nearest(own, known[some], unsure), strict=True):
+        kernels.told_by_rim(
+            labels, label, box, reach, unsure, sure, depth, np.stack([p.coefficients for p in own]),
+            TOLERANCE, MOSTLY, _LEAST, parts, told,
+        )  # fmt: skip
+        nearest = _nearest(own, some, shape)[top:low, left:right]
+        for number, plane in enumerate(own):
             planes.append(plane)
-            pixels = np.flatnonzero(mine)
-            stable = plane.deviation(_places(shape, pixels, around)) < STABLE
-            v, u = np.divmod(pixels[stable], segment.shape[1])
-            which[v + around[0].start, u + around[1].start] = len(planes)
+            kernels.mark_stable(
+                told, label, nearest, number, box, plane.coefficients, plane.covariance, STABLE,
+                len(planes), which,
+            )  # fmt: skip
     return planes, which
-
-
-def _told_by_rim(
-    unsure: Bool[np.ndarray, "h w"],
-    sure: Bool[np.ndarray, "h w"],
-    is_on: Bool[np.ndarray, "h w"],
-    rim: UInt8[np.ndarray, "k k"],
-) -> Bool[np.ndarray, "h w"]:
-    """The connected unsure parts at whose own rim most of what is sure lies on a plane.
-
-    A segment may go on beyond an edge that is too faint to be seen, and what is unsure there is on
-    none of its planes.
-    """
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(unsure.astype(np.uint8))
-    told = np.zeros(unsure.shape, bool)
-    for number in range(1, count):
-        if stats[number, cv2.CC_STAT_AREA] < _LEAST:
-            continue
-        part = parts == number
-        around = (cv2.dilate(part.astype(np.uint8), rim) > 0) & sure
-        if np.count_nonzero(around & is_on) >= MOSTLY * max(1, int(np.count_nonzero(around))):
-            told |= part
-    return told
-
-
-def _box(segment: Bool[np.ndarray, "h w"], reach: int) -> tuple[slice, slice]:
-    """Rows and columns around a segment, widened."""
-    x, y, width, height = cv2.boundingRect(segment.astype(np.uint8))
-    rows = slice(max(0, y - reach), min(segment.shape[0], y + height + reach))
-    return rows, slice(max(0, x - reach), min(segment.shape[1], x + width + reach))
 
 
 def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -235,18 +196,12 @@ def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_NEAREST)
 
 
-def _places(
-    shape: tuple[int, ...], pixels: Int[np.ndarray, "n"], box: tuple[slice, slice] | None = None
-) -> Float64[np.ndarray, "n 3"]:
-    """(x, y, 1) of flat indices in an image or a box of it, x and y over the image's width and
-    height and from its middle."""
+def _places(shape: tuple[int, ...], pixels: Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    """(x, y, 1) of flat indices in an image, x and y over its width and height and from its
+    middle."""
     height, width = shape
-    rows, columns = box or (slice(0, height), slice(0, width))
-    v, u = np.divmod(pixels, columns.stop - columns.start)
-    places = np.ones((len(pixels), 3))
-    places[:, 0] = (u + (columns.start + 0.5)) / width - 0.5
-    places[:, 1] = (v + (rows.start + 0.5)) / height - 0.5
-    return places
+    v, u = np.divmod(pixels, width)
+    return np.stack([(u + 0.5) / width - 0.5, (v + 0.5) / height - 0.5, np.ones(len(pixels))], -1)
 
 
 def segment_planes(
@@ -284,50 +239,24 @@ def _plane(
     rng: np.random.Generator,
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"], Bool[np.ndarray, "n"]] | None:
     """The plane that most of the weight lies on, by samples of three, and fitted to that."""
-    drawn = rng.choice(len(value), (_TRIES, 3), p=weight / weight.sum())
-    drawn = drawn[np.abs(np.linalg.det(at[drawn])) > 1e-9]
-    if not len(drawn):
-        return None
-    tried = np.linalg.solve(at[drawn], value[drawn][..., None])
-    on = _most(tried[..., 0], at, value, weight)
-    for _ in range(_ROUNDS):
-        if np.count_nonzero(on) < _LEAST:
-            return None
-        weighted = at[on] * weight[on, None]
-        information = np.einsum("ni,nj->ij", weighted, at[on])
-        target = (weighted * value[on, None]).sum(0)
-        plane = np.linalg.solve(information + 1e-12 * np.eye(3), target)
-        on = np.abs((at * plane).sum(1) - value) < TOLERANCE * value
-    return plane, information, on
+    from geogs.depth.revision.segment_plane_kernels import fit_plane
 
-
-def _most(
-    tried: Float64[np.ndarray, "t 3"],
-    at: Float64[np.ndarray, "n 3"],
-    value: Float64[np.ndarray, "n"],
-    weight: Float64[np.ndarray, "n"],
-) -> Bool[np.ndarray, "n"]:
-    """What lies on that of the planes on which most of the weight lies.
-
-    Within two arrays, as a new one for each step took twice the time.
-    """
-    off, part = (np.multiply.outer(tried[:, k], at[:, k]) for k in (0, 1))
-    off += part
-    off += np.subtract.outer(tried[:, 2], value, out=part)
-    on = np.abs(off, out=off) < TOLERANCE * value
-    return on[np.argmax(np.multiply(on, weight, out=part).sum(1))]
+    plane, information, on = np.empty(3), np.empty((3, 3)), np.empty(len(value), bool)
+    uniform = rng.random((_TRIES, 3))
+    if fit_plane(at, value, weight, uniform, TOLERANCE, _ROUNDS, _LEAST, on, plane, information):
+        return plane, information, on
+    return None
 
 
 def _nearest(
-    planes: Sequence[SegmentPlane], known: Int[np.ndarray, "n"], unsure: Bool[np.ndarray, "h w"]
-) -> list[Bool[np.ndarray, "h w"]]:
-    """Which of the unsure pixels are nearest to those of the known ones that lie on each plane."""
+    planes: Sequence[SegmentPlane], known: Int[np.ndarray, "n"], shape: tuple[int, ...]
+) -> Int[np.ndarray, "h w"]:
+    """On which plane that of the known pixels lies that is nearest to each pixel."""
     if len(planes) < 2:
-        return [unsure] * len(planes)
+        return np.zeros(shape, np.int64)
     distances = []
     for plane in planes:
-        empty = np.ones(unsure.shape, np.uint8)
+        empty = np.ones(shape, np.uint8)
         empty.ravel()[known[plane.on]] = 0
         distances.append(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
-    nearest = np.argmin(distances, 0)
-    return [unsure & (nearest == number) for number in range(len(planes))]
+    return np.argmin(distances, 0)

@@ -1,0 +1,255 @@
+"""Compiled loops of the planes of bare segments: the rim of a segment, and the planes through it.
+
+Images are (h, w) and C-contiguous; a box is its first row and column, and those behind its last.
+Every kernel releases the interpreter lock.
+"""
+
+import numpy as np
+from numba import njit
+
+_EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
+_FAST = {**_EXACT, "fastmath": {"contract", "nsz", "reassoc"}}
+
+
+@njit(**_EXACT)
+def segment_boxes(labels, unsure, sky, boxes, counts):
+    """Of the segments from 1 on: their boxes, and how many pixels they have, of those how many that
+    are ``unsure`` and how many of ``sky``; ``boxes`` (n, 4), ``counts`` (n, 3)."""
+    height, width = labels.shape
+    boxes[:, 0], boxes[:, 1] = height, width
+    boxes[:, 2:], counts[:] = 0, 0
+    for v in range(height):
+        for u in range(width):
+            if labels[v, u] > 0:
+                box, count = boxes[labels[v, u] - 1], counts[labels[v, u] - 1]
+                box[0], box[1] = min(box[0], v), min(box[1], u)
+                box[2], box[3] = max(box[2], v + 1), max(box[3], u + 1)
+                count[0] += 1
+                count[1] += unsure[v, u]
+                count[2] += sky[v, u]
+
+
+@njit(**_EXACT)
+def widened(box, reach, shape):
+    """A box with what is within ``reach`` of it in an image."""
+    return (
+        max(0, box[0] - reach), max(0, box[1] - reach),
+        min(shape[0], box[2] + reach), min(shape[1], box[3] + reach),
+    )  # fmt: skip
+
+
+@njit(**_EXACT)
+def near_part(parts, number, box, reach):
+    """Which pixels of a box are at most ``reach`` rows and columns from a part that lies in it, as
+    an array of the size of the box."""
+    top, left, low, right = box
+    height, width = low - top, right - left
+    across, near = np.empty((height, width), np.uint8), np.empty((height, width), np.uint8)
+    for v in range(height):
+        since = reach + 1
+        for u in range(width):
+            since = 0 if parts[top + v, left + u] == number else since + 1
+            across[v, u] = since <= reach
+        since = reach + 1
+        for u in range(width - 1, -1, -1):
+            since = 0 if parts[top + v, left + u] == number else since + 1
+            across[v, u] |= since <= reach
+    count = np.zeros(width, np.int32)
+    for v in range(-reach, height):
+        if v + reach < height:
+            count += across[v + reach]
+        if v > reach:
+            count -= across[v - reach - 1]
+        if v >= 0:
+            near[v] = count > 0
+    return near
+
+
+@njit(**_EXACT)
+def rim_pixels(labels, label, box, reach, sure):
+    """Flat indices of what is ``sure`` within ``reach`` of a segment, row by row."""
+    top, left, low, right = wide = widened(box, reach, labels.shape)
+    near = near_part(labels, label, wide, reach)
+    pixels, count = np.empty(near.size, np.int64), 0
+    for v in range(top, low):
+        for u in range(left, right):
+            pixels[count] = v * labels.shape[1] + u
+            count += near[v - top, u - left] & sure[v, u]
+    return pixels[:count].copy()
+
+
+@njit(**_EXACT)
+def at_pixel(plane, v, u, shape):
+    """Inverse depth of a plane at a pixel, and the place (x, y) of that."""
+    x, y = (u + 0.5) / shape[1] - 0.5, (v + 0.5) / shape[0] - 0.5
+    return plane[0] * x + plane[1] * y + plane[2], x, y
+
+
+@njit(**_EXACT)
+def connected(labels, label, unsure, v0, u0, parts, number, pixels):
+    """Marks what is connected with a pixel, to the eight around, of what is ``unsure`` in a segment
+    by a ``number`` in ``parts``; returns the box of that and how many ``pixels``, flat indices,
+    that are."""
+    height, width = labels.shape
+    parts[v0, u0], pixels[0] = number, v0 * width + u0
+    done, found = 0, 1
+    top, left, low, right = v0, u0, v0, u0
+    while done < found:
+        v, u = pixels[done] // width, pixels[done] % width
+        done += 1
+        top, left, low, right = min(top, v), min(left, u), max(low, v), max(right, u)
+        for y in range(max(v - 1, 0), min(v + 2, height)):
+            for x in range(max(u - 1, 0), min(u + 2, width)):
+                if parts[y, x] == 0 and labels[y, x] == label and unsure[y, x]:
+                    parts[y, x], pixels[found] = number, y * width + x
+                    found += 1
+    return (top, left, low + 1, right + 1), found
+
+
+@njit(**_EXACT)
+def told_by_rim(
+    labels, label, box, reach, unsure, sure, depth, planes, tolerance, mostly, least, parts, told
+):  # fmt: skip
+    """Writes its label into ``told`` at the connected unsure parts of a segment, of at least so
+    many pixels, at whose own rim the part ``mostly`` of what is ``sure`` lies on one of its
+    ``planes`` (n, 3).
+
+    ``parts``, of the segment zero on entry, receives numbers of these that no others have.
+    """
+    pixels = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32)
+    for v0 in range(box[0], box[2]):
+        for u0 in range(box[1], box[3]):
+            if parts[v0, u0] != 0 or labels[v0, u0] != label or not unsure[v0, u0]:
+                continue
+            number = 1 + v0 * labels.shape[1] + u0
+            own, count = connected(labels, label, unsure, v0, u0, parts, number, pixels)
+            if count < least:
+                continue
+            wide = widened(own, reach, labels.shape)
+            near = near_part(parts, number, wide, reach)
+            around, on = 0, 0
+            for v in range(wide[0], wide[2]):
+                for u in range(wide[1], wide[3]):
+                    if near[v - wide[0], u - wide[1]] and sure[v, u]:
+                        around += 1
+                        value, is_on = 1 / np.float64(depth[v, u]), False
+                        for plane in planes:
+                            off = abs(at_pixel(plane, v, u, labels.shape)[0] - value)
+                            is_on |= off < tolerance * value
+                        on += is_on
+            if on >= mostly * max(1, around):
+                for k in range(count):
+                    told[pixels[k] // labels.shape[1], pixels[k] % labels.shape[1]] = label
+
+
+@njit(**_EXACT)
+def mark_stable(told, label, nearest, number, box, plane, covariance, most, mark, which):
+    """Writes ``mark`` into ``which`` at the pixels of a segment that are ``told``, are ``nearest``,
+    in its box, to a plane, and where the relative deviation of that is below ``most``."""
+    c = covariance
+    for v in range(box[0], box[2]):
+        for u in range(box[1], box[3]):
+            if told[v, u] == label and nearest[v - box[0], u - box[1]] == number:
+                own, x, y = at_pixel(plane, v, u, told.shape)
+                mixed = c[0, 1] * x * y + c[0, 2] * x + c[1, 2] * y
+                variance = c[0, 0] * x * x + c[1, 1] * y * y + c[2, 2] + 2 * mixed
+                if np.sqrt(variance) < most * max(own, 1e-9):
+                    which[v, u] = mark
+
+
+@njit(**_EXACT)
+def planar_pixels(which, planes, depth, confidence, unsure, farthest, pixels, found):
+    """Where the depth that was found is at most ``unsure`` and that of the plane of a pixel not so
+    many times nearer or farther: flat indices, and z of the plane; returns how many."""
+    count, shape = 0, which.shape
+    for v in range(shape[0]):
+        for u in range(shape[1]):
+            if which[v, u] == 0 or not confidence[v, u] <= unsure:
+                continue
+            value = at_pixel(planes[which[v, u] - 1], v, u, shape)[0]
+            own = 1 / depth[v, u]
+            if value > own / farthest and value < farthest * own:
+                pixels[count], found[count] = v * shape[1] + u, 1 / value
+                count += 1
+    return count
+
+
+@njit(**_EXACT)
+def solved(a, b, c, d, e, f, x, y, z):
+    """What the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) takes to (x, y, z)."""
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    inverse = 1 / (a * A + b * B + c * C)
+    return (
+        (A * x + B * y + C * z) * inverse,
+        (B * x + D * y + E * z) * inverse,
+        (C * x + E * y + F * z) * inverse,
+    )
+
+
+@njit(**_FAST)
+def explained(x, y, value, weight, tolerance, a, b, c):
+    """Weight of what lies on the plane a x + b y + c."""
+    total = 0.0
+    for i in range(len(value)):
+        off = abs(a * x[i] + b * y[i] + c - value[i])
+        total += weight[i] if off < tolerance * value[i] else 0.0
+    return total
+
+
+@njit(**_EXACT)
+def best_sample(x, y, value, weight, uniform, tolerance):
+    """The plane through three of the pixels on which most of the weight lies, and that weight,
+    negative if there is none.
+
+    ``uniform`` (t, 3) draws the pixels, as likely as their weight says.
+    """
+    chance = np.cumsum(weight / weight.sum())
+    chance /= chance[-1]
+    best, most = (0.0, 0.0, 0.0), -1.0
+    for t in range(len(uniform)):
+        i, j, k = np.searchsorted(chance, uniform[t], side="right")
+        x1, y1, v1 = x[j] - x[i], y[j] - y[i], value[j] - value[i]
+        x2, y2, v2 = x[k] - x[i], y[k] - y[i], value[k] - value[i]
+        area = x1 * y2 - x2 * y1
+        if abs(area) <= 1e-9:
+            continue
+        a, b = (v1 * y2 - v2 * y1) / area, (x1 * v2 - x2 * v1) / area
+        c = value[i] - a * x[i] - b * y[i]
+        on = explained(x, y, value, weight, tolerance, a, b, c)
+        if on > most:
+            best, most = (a, b, c), on
+    return best, most
+
+
+@njit(**_EXACT)
+def fit_plane(places, value, weight, uniform, tolerance, rounds, least, on, plane, information):
+    """The plane that most of the weight lies on, by samples of three, and fitted to that.
+
+    Returns whether there is one on which ``least`` pixels lie. ``on`` (n) receives what lies on it,
+    ``plane`` (3) its coefficients, ``information`` (3, 3) the sum of the weighted products of
+    ``places`` (n, 3): x, y and 1.
+    """
+    x, y = places[:, 0].copy(), places[:, 1].copy()
+    (a, b, c), most = best_sample(x, y, value, weight, uniform, tolerance)
+    if most < 0:
+        return False
+    for _ in range(rounds):
+        count, xx, xy, yy, sx, sy, s1 = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        vx, vy, v1 = 0.0, 0.0, 0.0
+        for i in range(len(value)):
+            if abs(a * x[i] + b * y[i] + c - value[i]) < tolerance * value[i]:
+                count += 1
+                wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
+                xx, xy, yy = xx + wx * x[i], xy + wx * y[i], yy + wy * y[i]
+                sx, sy, s1 = sx + wx, sy + wy, s1 + w
+                vx, vy, v1 = vx + wx * value[i], vy + wy * value[i], v1 + w * value[i]
+        if count < least:
+            return False
+        tiny = 1e-12
+        a, b, c = solved(xx + tiny, xy, sx, yy + tiny, sy, s1 + tiny, vx, vy, v1)
+    for i in range(len(value)):
+        on[i] = abs(a * x[i] + b * y[i] + c - value[i]) < tolerance * value[i]
+    plane[:] = a, b, c
+    information[0], information[1], information[2] = (xx, xy, sx), (xy, yy, sy), (sx, sy, s1)
+    return True
