@@ -1,14 +1,31 @@
 """Compiled loops of the planes of bare segments: the rim of a segment, and the planes through it.
 
-Images are (h, w) and C-contiguous; a box is its first row and column, and those behind its last.
-Every kernel releases the interpreter lock.
+Images are (h, w) and C-contiguous; a box is its first row and column, and those behind its last;
+places are x and y over the image's width and height, from its middle. Every kernel releases the
+interpreter lock.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 _EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
 _FAST = {**_EXACT, "fastmath": {"contract", "nsz", "reassoc"}}
+
+
+class PlaneRules(NamedTuple):
+    """What the planes of a segment are told by; in :mod:`geogs.depth.revision.segment_planes`."""
+
+    reach: int
+    """Pixels around a segment, or a part of it, that are its rim."""
+    tolerance: float
+    least_share: float
+    mostly: float
+    alike: int
+    least: int
+    most: int
+    rounds: int
 
 
 @njit(**_EXACT)
@@ -107,26 +124,23 @@ def connected(labels, label, unsure, v0, u0, parts, number, pixels):
 
 
 @njit(**_EXACT)
-def told_by_rim(
-    labels, label, box, reach, unsure, sure, depth, planes, tolerance, mostly, least, parts, told
-):  # fmt: skip
-    """Writes its label into ``told`` at the connected unsure parts of a segment, of at least so
-    many pixels, at whose own rim the part ``mostly`` of what is ``sure`` lies on one of its
-    ``planes`` (n, 3).
+def told_by_rim(labels, label, box, unsure, sure, depth, planes, rules, parts, told):
+    """Writes its label into ``told`` at the connected unsure parts of a segment, of ``least``
+    pixels, at whose own rim the part ``mostly`` of what is ``sure`` lies on one of its planes.
 
     ``parts``, of the segment zero on entry, receives numbers of these that no others have.
     """
-    pixels = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32)
+    pixels, shape = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32), labels.shape
     for v0 in range(box[0], box[2]):
         for u0 in range(box[1], box[3]):
             if parts[v0, u0] != 0 or labels[v0, u0] != label or not unsure[v0, u0]:
                 continue
-            number = 1 + v0 * labels.shape[1] + u0
+            number = 1 + v0 * shape[1] + u0
             own, count = connected(labels, label, unsure, v0, u0, parts, number, pixels)
-            if count < least:
+            if count < rules.least:
                 continue
-            wide = widened(own, reach, labels.shape)
-            near = near_part(parts, number, wide, reach)
+            wide = widened(own, rules.reach, shape)
+            near = near_part(parts, number, wide, rules.reach)
             around, on = 0, 0
             for v in range(wide[0], wide[2]):
                 for u in range(wide[1], wide[3]):
@@ -134,27 +148,48 @@ def told_by_rim(
                         around += 1
                         value, is_on = 1 / np.float64(depth[v, u]), False
                         for plane in planes:
-                            off = abs(at_pixel(plane, v, u, labels.shape)[0] - value)
-                            is_on |= off < tolerance * value
+                            off = abs(at_pixel(plane, v, u, shape)[0] - value)
+                            is_on |= off < rules.tolerance * value
                         on += is_on
-            if on >= mostly * max(1, around):
+            if on >= rules.mostly * max(1, around):
                 for k in range(count):
-                    told[pixels[k] // labels.shape[1], pixels[k] % labels.shape[1]] = label
+                    told[pixels[k] // shape[1], pixels[k] % shape[1]] = label
 
 
 @njit(**_EXACT)
-def mark_stable(told, label, nearest, number, box, plane, covariance, most, mark, which):
-    """Writes ``mark`` into ``which`` at the pixels of a segment that are ``told``, are ``nearest``,
-    in its box, to a plane, and where the relative deviation of that is below ``most``."""
-    c = covariance
+def planes_of_segment(
+    labels, label, box, unsure, sure, depth, confidence, draws, rules, parts, told
+):  # fmt: skip
+    """The planes (p, 3) of a segment, covariances of these, and how many were tried; ``told`` and
+    ``parts`` as in ``told_by_rim``. Also flat indices of some pixels that are known at the segment
+    and its rim, and the number of the plane, from 1 on, that each lies on."""
+    known = rim_pixels(labels, label, box, rules.reach, sure)
+    some = known[:: max(1, -(-len(known) // rules.most))]
+    x, y, value, weight = np.empty((4, len(some)))
+    for i in range(len(some)):
+        v, u = some[i] // labels.shape[1], some[i] % labels.shape[1]
+        x[i], y[i] = (u + 0.5) / labels.shape[1] - 0.5, (v + 0.5) / labels.shape[0] - 0.5
+        value[i], weight[i] = 1 / np.float64(depth[v, u]), confidence[v, u]
+    planes, covariances, of, tried = segment_planes(x, y, value, weight, draws, rules)
+    if len(planes):
+        told_by_rim(labels, label, box, unsure, sure, depth, planes, rules, parts, told)
+    return planes, covariances, tried, some, of
+
+
+@njit(**_EXACT)
+def mark_stable(told, label, nearest, box, planes, covariances, most, first, which):
+    """Writes into ``which`` the numbers, from ``first`` on, of the planes ``nearest`` to the pixels
+    of a segment that are ``told``, where the relative deviation of these is below ``most``."""
     for v in range(box[0], box[2]):
         for u in range(box[1], box[3]):
-            if told[v, u] == label and nearest[v - box[0], u - box[1]] == number:
-                own, x, y = at_pixel(plane, v, u, told.shape)
+            if told[v, u] == label:
+                number = nearest[v, u]
+                own, x, y = at_pixel(planes[number], v, u, told.shape)
+                c = covariances[number]
                 mixed = c[0, 1] * x * y + c[0, 2] * x + c[1, 2] * y
                 variance = c[0, 0] * x * x + c[1, 1] * y * y + c[2, 2] + 2 * mixed
                 if np.sqrt(variance) < most * max(own, 1e-9):
-                    which[v, u] = mark
+                    which[v, u] = first + number
 
 
 @njit(**_EXACT)
@@ -175,8 +210,11 @@ def planar_pixels(which, planes, depth, confidence, unsure, farthest, pixels, fo
 
 
 @njit(**_EXACT)
-def solved(a, b, c, d, e, f, x, y, z):
-    """What the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) takes to (x, y, z)."""
+def solved(sums, damping, x, y, z):
+    """What the symmetric matrix of these six numbers, with more on its diagonal, takes to x, y, z.
+    """
+    a, b, c, d, e, f = sums
+    a, d, f = a + damping, d + damping, f + damping
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
     inverse = 1 / (a * A + b * B + c * C)
@@ -223,33 +261,54 @@ def best_sample(x, y, value, weight, uniform, tolerance):
 
 
 @njit(**_EXACT)
-def fit_plane(places, value, weight, uniform, tolerance, rounds, least, on, plane, information):
-    """The plane that most of the weight lies on, by samples of three, and fitted to that.
-
-    Returns whether there is one on which ``least`` pixels lie. ``on`` (n) receives what lies on it,
-    ``plane`` (3) its coefficients, ``information`` (3, 3) the sum of the weighted products of
-    ``places`` (n, 3): x, y and 1.
+def fit_plane(x, y, value, weight, uniform, rules):
+    """The plane that most of the weight lies on, by samples of three, and fitted to that; what lies
+    on it; and xx, xy, x, yy, y and 1 summed over these by weight. Not one where they are too few.
     """
-    x, y = places[:, 0].copy(), places[:, 1].copy()
-    (a, b, c), most = best_sample(x, y, value, weight, uniform, tolerance)
-    if most < 0:
-        return False
-    for _ in range(rounds):
-        count, xx, xy, yy, sx, sy, s1 = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        vx, vy, v1 = 0.0, 0.0, 0.0
-        for i in range(len(value)):
-            if abs(a * x[i] + b * y[i] + c - value[i]) < tolerance * value[i]:
-                count += 1
-                wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
-                xx, xy, yy = xx + wx * x[i], xy + wx * y[i], yy + wy * y[i]
-                sx, sy, s1 = sx + wx, sy + wy, s1 + w
-                vx, vy, v1 = vx + wx * value[i], vy + wy * value[i], v1 + w * value[i]
-        if count < least:
-            return False
-        tiny = 1e-12
-        a, b, c = solved(xx + tiny, xy, sx, yy + tiny, sy, s1 + tiny, vx, vy, v1)
-    for i in range(len(value)):
-        on[i] = abs(a * x[i] + b * y[i] + c - value[i]) < tolerance * value[i]
-    plane[:] = a, b, c
-    information[0], information[1], information[2] = (xx, xy, sx), (xy, yy, sy), (sx, sy, s1)
-    return True
+    (a, b, c), most = best_sample(x, y, value, weight, uniform, rules.tolerance)
+    on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
+    sums = np.zeros(6)
+    for _ in range(rules.rounds):
+        if most < 0 or np.count_nonzero(on) < rules.least:
+            on[:] = False
+            break
+        sums[:] = 0.0
+        xv, yv, v = 0.0, 0.0, 0.0
+        for i in np.flatnonzero(on):
+            wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
+            sums[0], sums[1], sums[2] = sums[0] + wx * x[i], sums[1] + wx * y[i], sums[2] + wx
+            sums[3], sums[4], sums[5] = sums[3] + wy * y[i], sums[4] + wy, sums[5] + w
+            xv, yv, v = xv + wx * value[i], yv + wy * value[i], v + w * value[i]
+        a, b, c = solved(sums, 1e-12, xv, yv, v)
+        on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
+    return (a, b, c), on, sums
+
+
+@njit(**_EXACT)
+def segment_planes(x, y, value, weight, draws, rules):
+    """The planes that explain what is known of a segment, that of most first: coefficients of x, y
+    and 1 (p, 3) and covariances of these, the number of the plane, from 1 on, that each pixel lies
+    on, and how many were tried.
+
+    ``draws`` (n, t, 3) draw the samples of the at most n that are tried. What a plane is fitted to
+    deviates by half the tolerance, and of ``alike`` pixels one counts.
+    """
+    planes, covariances = np.empty((len(draws), 3)), np.empty((len(draws), 3, 3))
+    of, left, found, tried = np.zeros(len(x), np.int32), np.arange(len(x)), 0, 0
+    while tried < len(draws) and len(left) >= rules.least:
+        plane, on, sums = fit_plane(
+            x[left], y[left], value[left], weight[left], draws[tried], rules
+        )  # fmt: skip
+        tried += 1
+        mine = left[on]
+        if len(mine) == 0 or weight[mine].sum() < rules.least_share * weight.sum():
+            break
+        variance = rules.alike * (rules.tolerance / 2 * value[mine].mean()) ** 2
+        planes[found, 0], planes[found, 1], planes[found, 2] = plane
+        for k, unit in enumerate(variance * np.eye(3)):
+            row = solved(sums, 1e-9, unit[0], unit[1], unit[2])
+            covariances[found, k, 0], covariances[found, k, 1], covariances[found, k, 2] = row
+        found += 1
+        of[mine] = found
+        left = left[~on]
+    return planes[:found], covariances[:found], of, tried

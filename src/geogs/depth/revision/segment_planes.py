@@ -7,7 +7,6 @@ Gelautz 2005). What the search is sure of stays as it is, so that what is curved
 flattened.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -95,26 +94,6 @@ class PlanarDepth:
         return (-n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32)[self.plane]
 
 
-@dataclass(frozen=True)
-class SegmentPlane:
-    """Inverse depth as a linear function of the place in the image, and what it was fitted to."""
-
-    coefficients: Float64[np.ndarray, "3"]
-    """Of x and y over the image's width and height, from its middle, and of 1."""
-    information: Float64[np.ndarray, "3 3"]
-    """Sum of the weighted products of (x, y, 1)."""
-    on: Bool[np.ndarray, "n"]
-    """Which of the pixels that told it lie on it."""
-    typical: float
-    """Their mean inverse depth."""
-
-    @property
-    def covariance(self) -> Float64[np.ndarray, "3 3"]:
-        """Of the coefficients: as the fit carries on half the tolerance of its pixels."""
-        deviation = TOLERANCE / 2 * self.typical
-        return ALIKE * deviation**2 * np.linalg.inv(self.information + 1e-9 * np.eye(3))
-
-
 def on_planes(
     found: KeyframeDepth,
     labels: Int32[np.ndarray, "sh sw"],
@@ -131,16 +110,14 @@ def on_planes(
     """
     from geogs.depth.revision.segment_plane_kernels import planar_pixels
 
-    shape = found.depth.shape
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
-    which = _resized(which, shape)
-    coefficients = np.array([p.coefficients for p in planes]).reshape(-1, 3)
+    which = _resized(which, found.depth.shape)
     pixels, depth = np.empty(which.size, np.int64), np.empty(which.size, np.float32)
     count = planar_pixels(
-        which, coefficients, found.depth, found.confidence, UNSURE, FARTHEST, pixels, depth
+        which, planes, found.depth, found.confidence, UNSURE, FARTHEST, pixels, depth
     )
     taken = pixels[:count]
-    return PlanarDepth(taken, depth[:count], which.ravel()[taken] - 1, coefficients)
+    return PlanarDepth(taken, depth[:count], which.ravel()[taken] - 1, planes)
 
 
 def _planes_of_segments(
@@ -148,7 +125,7 @@ def _planes_of_segments(
     labels: Int32[np.ndarray, "sh sw"],
     sky: Bool[np.ndarray, "h w"] | None,
     rng: np.random.Generator,
-) -> tuple[list[SegmentPlane], Int32[np.ndarray, "sh sw"]]:
+) -> tuple[Float64[np.ndarray, "p 3"], Int32[np.ndarray, "sh sw"]]:
     """Planes, and which of them, from 1 on, the pixels of the segments lie on where that is known
     well; 0 for none.
 
@@ -160,33 +137,40 @@ def _planes_of_segments(
     shape = labels.shape
     depth, confidence = (_resized(m, shape) for m in (found.depth, found.confidence))
     is_sky = np.zeros(shape, bool) if sky is None else _resized(sky.view(np.uint8), shape) > 0
-    sure, unsure = confidence > SURE, confidence <= UNSURE
-    reach = max(1, round(RIM * max(shape)))
+    unsure, sure = confidence <= UNSURE, confidence > SURE
     boxes, counts = (np.empty((int(labels.max(initial=0)), k), np.int64) for k in (4, 3))
     kernels.segment_boxes(labels, unsure, is_sky, boxes, counts)
-    worth_it = (counts[:, 1] >= _LEAST) & (counts[:, 2] <= SKY * counts[:, 0])
-    planes, which = list[SegmentPlane](), np.zeros(shape, np.int32)
-    parts, told = np.zeros((2, *shape), np.int32)
-    for label in np.flatnonzero(worth_it) + 1:
-        top, left, low, right = box = tuple(boxes[label - 1].tolist())
-        known = kernels.rim_pixels(labels, label, box, reach, sure)
-        some = known[:: -(-len(known) // _MOST) or 1]
-        value, weight = (m.ravel()[some].astype(np.float64) for m in (depth, confidence))
-        own = list(segment_planes(_places(shape, some), 1 / value, weight, rng))
-        if not own:
-            continue
-        kernels.told_by_rim(
-            labels, label, box, reach, unsure, sure, depth, np.stack([p.coefficients for p in own]),
-            TOLERANCE, MOSTLY, _LEAST, parts, told,
+    worth_it = np.flatnonzero((counts[:, 1] >= _LEAST) & (counts[:, 2] <= SKY * counts[:, 0]))
+    draws = rng.random((MOST_PLANES * len(worth_it), _TRIES, 3))
+    rules = kernels.PlaneRules(
+        max(1, round(RIM * max(shape))), TOLERANCE, LEAST_SHARE, MOSTLY, ALIKE, _LEAST, _MOST,
+        _ROUNDS,
+    )  # fmt: skip
+    which, parts, told, alone = np.zeros((4, *shape), np.int32)
+    planes, drawn = [np.empty((0, 3))], 0
+    for label, box in zip(worth_it + 1, boxes[worth_it], strict=True):
+        own, covariances, tried, known, of = kernels.planes_of_segment(
+            labels, label, box, unsure, sure, depth, confidence, draws[drawn : drawn + MOST_PLANES],
+            rules, parts, told,
         )  # fmt: skip
-        nearest = _nearest(own, some, shape)[top:low, left:right]
-        for number, plane in enumerate(own):
-            planes.append(plane)
-            kernels.mark_stable(
-                told, label, nearest, number, box, plane.coefficients, plane.covariance, STABLE,
-                len(planes), which,
-            )  # fmt: skip
-    return planes, which
+        drawn += tried
+        nearest = alone if len(own) < 2 else _nearest(len(own), known, of, shape)
+        first = 1 + sum(map(len, planes))
+        kernels.mark_stable(told, label, nearest, box, own, covariances, STABLE, first, which)
+        planes.append(own)
+    return np.concatenate(planes), which
+
+
+def _nearest(
+    count: int, known: Int[np.ndarray, "n"], of: Int32[np.ndarray, "n"], shape: tuple[int, ...]
+) -> Int32[np.ndarray, "h w"]:
+    """On which plane that of the known pixels lies that is nearest to each pixel."""
+    distances = []
+    for number in range(1, count + 1):
+        empty = np.ones(shape, np.uint8)
+        empty.ravel()[known[of == number]] = 0
+        distances.append(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
+    return np.argmin(distances, 0).astype(np.int32)
 
 
 def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -194,69 +178,3 @@ def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if values.shape == shape:
         return values
     return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_NEAREST)
-
-
-def _places(shape: tuple[int, ...], pixels: Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-    """(x, y, 1) of flat indices in an image, x and y over its width and height and from its
-    middle."""
-    height, width = shape
-    v, u = np.divmod(pixels, width)
-    return np.stack([(u + 0.5) / width - 0.5, (v + 0.5) / height - 0.5, np.ones(len(pixels))], -1)
-
-
-def segment_planes(
-    places: Float64[np.ndarray, "n 3"],
-    value: Float64[np.ndarray, "n"],
-    weight: Float64[np.ndarray, "n"],
-    rng: np.random.Generator,
-) -> Iterator[SegmentPlane]:
-    """The planes that explain what is known of a segment, that of most first.
-
-    Args:
-        places: of its pixels (x, y, 1).
-        value: their inverse depth.
-        weight: their confidence.
-        rng: draws samples.
-    """
-    left = np.arange(len(value))
-    for _ in range(MOST_PLANES):
-        if len(left) < _LEAST:
-            return
-        fit = _plane(places[left], value[left], weight[left], rng)
-        if fit is None or weight[left[fit[2]]].sum() < LEAST_SHARE * weight.sum():
-            return
-        coefficients, information, is_on = fit
-        on = np.zeros(len(value), bool)
-        on[left[is_on]] = True
-        yield SegmentPlane(coefficients, information, on, float(value[on].mean()))
-        left = left[~is_on]
-
-
-def _plane(
-    at: Float64[np.ndarray, "n 3"],
-    value: Float64[np.ndarray, "n"],
-    weight: Float64[np.ndarray, "n"],
-    rng: np.random.Generator,
-) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"], Bool[np.ndarray, "n"]] | None:
-    """The plane that most of the weight lies on, by samples of three, and fitted to that."""
-    from geogs.depth.revision.segment_plane_kernels import fit_plane
-
-    plane, information, on = np.empty(3), np.empty((3, 3)), np.empty(len(value), bool)
-    uniform = rng.random((_TRIES, 3))
-    if fit_plane(at, value, weight, uniform, TOLERANCE, _ROUNDS, _LEAST, on, plane, information):
-        return plane, information, on
-    return None
-
-
-def _nearest(
-    planes: Sequence[SegmentPlane], known: Int[np.ndarray, "n"], shape: tuple[int, ...]
-) -> Int[np.ndarray, "h w"]:
-    """On which plane that of the known pixels lies that is nearest to each pixel."""
-    if len(planes) < 2:
-        return np.zeros(shape, np.int64)
-    distances = []
-    for plane in planes:
-        empty = np.ones(shape, np.uint8)
-        empty.ravel()[known[plane.on]] = 0
-        distances.append(cv2.distanceTransform(empty, cv2.DIST_L2, 5))
-    return np.argmin(distances, 0)
