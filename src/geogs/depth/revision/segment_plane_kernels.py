@@ -211,8 +211,7 @@ def planar_pixels(which, planes, depth, confidence, unsure, farthest, pixels, fo
 
 @njit(**_EXACT)
 def solved(sums, damping, x, y, z):
-    """What the symmetric matrix of these six numbers, with more on its diagonal, takes to x, y, z.
-    """
+    """What the symmetric matrix of six numbers, with more on its diagonal, takes to x, y and z."""
     a, b, c, d, e, f = sums
     a, d, f = a + damping, d + damping, f + damping
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
