@@ -96,7 +96,7 @@ def edge_weights(
     lab = cv2.GaussianBlur(sharp, (0, 0), 1.5)
     # Channel by channel: over the last axis NumPy takes many times as long.
     slopes = (cv2.Sobel(c, -1, x, 1 - x, scale=1 / 8) for c in cv2.split(lab) for x in (1, 0))
-    strongest = functools.reduce(cv2.max, (cv2.absdiff(s, 0.0) for s in slopes))
+    strongest = functools.reduce(cv2.max, map(np.abs, slopes))
     edge = cv2.dilate(strongest, np.ones((7, 7), np.uint8))
     rows = np.minimum(OFFSET + STRIDE * np.arange(shape[0]), edge.shape[0] - 1)
     columns = np.minimum(OFFSET + STRIDE * np.arange(shape[1]), edge.shape[1] - 1)
