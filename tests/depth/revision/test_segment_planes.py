@@ -6,12 +6,18 @@ import pytest
 import torch
 
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
+from geogs.depth.revision import segment_plane_kernels as kernels
 from geogs.depth.revision.bare_segments import LEAST, bare_segments
+from geogs.depth.revision.segment_plane_kernels import PlaneRules, segment_planes
 from geogs.depth.revision.segment_planes import (
+    ALIKE,
     CONFIDENCE,
+    LEAST_SHARE,
+    MOST_PLANES,
+    MOSTLY,
+    TOLERANCE,
     on_planes,
     planar_depth,
-    segment_planes,
 )
 from geogs.geometry.camera import Camera
 
@@ -163,11 +169,89 @@ def test_normals_are_those_of_the_plane(slopes):
     assert not planar.normal[0, 0].any()
 
 
+RULES = PlaneRules(2, TOLERANCE, LEAST_SHARE, MOSTLY, ALIKE, 40, 750, 4)
+
+
+def slow_planes(x, y, value, weight, rng):
+    """Each plane by samples drawn with NumPy, all tried at once, and least squares."""
+    places, left, planes = np.stack([x, y, np.ones_like(x)], -1), np.arange(len(x)), []
+    for _ in range(MOST_PLANES):
+        at, v, w = places[left], value[left], weight[left]
+        drawn = rng.choice(len(left), (64, 3), p=w / w.sum())
+        drawn = drawn[np.abs(np.linalg.det(at[drawn])) > 1e-9]
+        tried = np.linalg.solve(at[drawn], v[drawn][..., None])[..., 0]
+        ons = np.abs(tried @ at.T - v) < TOLERANCE * v
+        on = ons[np.argmax((ons * w).sum(1))]
+        for _ in range(RULES.rounds):
+            root = np.sqrt(w[on])
+            plane = np.linalg.lstsq(at[on] * root[:, None], v[on] * root, rcond=None)[0]
+            fitted, on = on, np.abs(at @ plane - v) < TOLERANCE * v
+        if w[on].sum() < LEAST_SHARE * weight.sum():
+            break
+        information = (at[fitted] * w[fitted, None]).T @ at[fitted]
+        deviation = TOLERANCE / 2 * v[on].mean()
+        planes.append((plane, ALIKE * deviation**2 * np.linalg.inv(information), left[on]))
+        left = left[~on]
+    return planes
+
+
+def test_planes_are_those_of_the_slow_fit():
+    """A corner with noise and outliers, weighted unevenly."""
+    random = np.random.default_rng(5)
+    x, y = random.uniform(-0.5, 0.5, (2, 700))
+    value = np.where(x < 0.05, 0.4 + 0.3 * x + 0.05 * y, 0.45 - 0.5 * x)
+    value *= 1 + 0.005 * random.standard_normal(700)
+    value[::29] *= random.uniform(0.5, 2, len(value[::29]))
+    weight = random.uniform(0.7, 1, 700)
+    draws = np.random.default_rng(6).random((MOST_PLANES, 64, 3))
+    planes, covariances, of, tried = segment_planes(x, y, value, weight, draws, RULES)
+    expected = slow_planes(x, y, value, weight, np.random.default_rng(6))
+    assert (len(planes), tried) == (2, 2)
+    assert len(expected) == 2
+    for k, (plane, covariance, on) in enumerate(expected):
+        assert planes[k] == pytest.approx(plane, rel=1e-6)
+        assert covariances[k] == pytest.approx(covariance, rel=1e-4, abs=1e-9)
+        assert np.array_equal(np.flatnonzero(of == k + 1), on)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rims_and_parts_are_those_of_opencv(seed):
+    random = np.random.default_rng(seed)
+    labels = (cv2.blur(random.random((60, 80)), (9, 9)) > 0.5).astype(np.int32)
+    sure, depth = random.random((60, 80)) > 0.4, np.ones((60, 80), np.float32)
+    unsure = ~sure & (cv2.blur(random.random((60, 80)), (5, 5)) > 0.48)
+    boxes, counts = np.empty((1, 4), np.int64), np.empty((1, 3), np.int64)
+    kernels.segment_boxes(labels, unsure, sure, boxes, counts)
+    segment = labels == 1
+    assert counts[0].tolist() == [segment.sum(), (segment & unsure).sum(), (segment & sure).sum()]
+    rim = np.ones((5, 5), np.uint8)
+    near = cv2.dilate(segment.astype(np.uint8), rim) > 0
+    known = kernels.rim_pixels(labels, 1, boxes[0], 2, sure)
+    assert np.array_equal(known, np.flatnonzero(near & sure))
+    depth[:, 40:] = 2  # of which the plane is none
+    planes, rules = np.array([[0.0, 0.0, 1.0]]), RULES._replace(least=12)
+    parts, told = np.zeros((2, 60, 80), np.int32)
+    kernels.told_by_rim(labels, 1, boxes[0], unsure, sure, depth, planes, rules, parts, told)
+    count, numbers = cv2.connectedComponents((segment & unsure).astype(np.uint8))
+    expected = np.zeros((60, 80), bool)
+    for number in range(1, count):
+        part = numbers == number
+        around = (cv2.dilate(part.astype(np.uint8), rim) > 0) & sure
+        if part.sum() >= 12 and (around & (depth == 1)).sum() >= MOSTLY * max(1, around.sum()):
+            expected |= part
+    assert expected.any()
+    assert np.array_equal(told > 0, expected)
+
+
 def test_no_plane_of_too_little():
-    inverse, rng = wall().ravel(), np.random.default_rng(0)
-    places = np.stack([U / 160 - 0.5, V / 120 - 0.5, np.ones_like(U)], -1).reshape(-1, 3)
-    confidence = np.full(len(inverse), 0.9)
-    assert not list(segment_planes(places[:35], inverse[:35], confidence[:35], rng))
-    (plane,) = segment_planes(places, inverse, confidence, rng)
-    assert plane.at(places) == pytest.approx(inverse, rel=1e-6)
-    assert float(plane.deviation(places).max()) < 0.02
+    inverse, random = wall().ravel(), np.random.default_rng(0)
+    x, y = (U / 160 - 0.5).ravel(), (V / 120 - 0.5).ravel()
+    confidence, draws = np.full(len(inverse), 0.9), random.random((MOST_PLANES, 64, 3))
+    few = (m[:35] for m in (x, y, inverse, confidence))
+    assert not len(segment_planes(*few, draws, RULES)[0])
+    (plane,), (covariance,), of, _ = segment_planes(x, y, inverse, confidence, draws, RULES)
+    places = np.stack([x, y, np.ones_like(x)], -1)
+    assert places @ plane == pytest.approx(inverse, rel=1e-6)
+    assert (of == 1).all()
+    variance = np.einsum("ni,ij,nj->n", places, covariance, places)
+    assert float((np.sqrt(variance) / inverse).max()) < 0.02

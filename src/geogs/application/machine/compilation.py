@@ -20,7 +20,7 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-OF_SEARCH, OF_MAP, KERNELS = 12, 29, 46
+OF_SEARCH, OF_MAP, KERNELS = 12, 33, 50
 """How many a rehearsal compiles, those counted that are called from Python: first what depths are
 searched by, up to what a map needs, up to a mesh. With a GPU nearly nothing of it is called."""
 PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, UInt8
 
 from geogs.config import MeshConfig, ReconstructConfig
+from geogs.depth.depth_view import KeyframeDepth
+from geogs.depth.revision.segment_planes import on_planes
 from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
@@ -40,6 +42,16 @@ def _map() -> None:
     points = DEPTH * CAMERA.rays(torch.float64).numpy()[::4, ::4].reshape(-1, 3)
     scene.finish(points)
     list(scene.renders())
+    _bare()
+
+
+def _bare() -> None:
+    """A bare part of the wall, of which only the rim is known; its depth is laid on a plane."""
+    depth = np.full((CAMERA.height, CAMERA.width), DEPTH, np.float32)
+    confidence, labels = np.ones_like(depth), np.zeros(depth.shape, np.int32)
+    confidence[20:50, 20:70] = 0
+    labels[20:50, 20:70] = 1
+    on_planes(KeyframeDepth(depth, confidence), labels, None, 0)
 
 
 def _seen(number: int) -> DepthMapView:

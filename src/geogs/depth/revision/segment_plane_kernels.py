@@ -1,0 +1,313 @@
+"""Compiled loops of the planes of bare segments: the rim of a segment, and the planes through it.
+
+Images are (h, w) and C-contiguous; a box is its first row and column, and those behind its last;
+places are x and y over the image's width and height, from its middle. Every kernel releases the
+interpreter lock.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+_EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
+_FAST = {**_EXACT, "fastmath": {"contract", "nsz", "reassoc"}}
+
+
+class PlaneRules(NamedTuple):
+    """What the planes of a segment are told by; in :mod:`geogs.depth.revision.segment_planes`."""
+
+    reach: int
+    """Pixels around a segment, or a part of it, that are its rim."""
+    tolerance: float
+    least_share: float
+    mostly: float
+    alike: int
+    least: int
+    most: int
+    rounds: int
+
+
+@njit(**_EXACT)
+def segment_boxes(labels, unsure, sky, boxes, counts):
+    """Of the segments from 1 on: their boxes, and how many pixels they have, of those how many that
+    are ``unsure`` and how many of ``sky``; ``boxes`` (n, 4), ``counts`` (n, 3)."""
+    height, width = labels.shape
+    boxes[:, 0], boxes[:, 1] = height, width
+    boxes[:, 2:], counts[:] = 0, 0
+    for v in range(height):
+        for u in range(width):
+            if labels[v, u] > 0:
+                box, count = boxes[labels[v, u] - 1], counts[labels[v, u] - 1]
+                box[0], box[1] = min(box[0], v), min(box[1], u)
+                box[2], box[3] = max(box[2], v + 1), max(box[3], u + 1)
+                count[0] += 1
+                count[1] += unsure[v, u]
+                count[2] += sky[v, u]
+
+
+@njit(**_EXACT)
+def widened(box, reach, shape):
+    """A box with what is within ``reach`` of it in an image."""
+    return (
+        max(0, box[0] - reach), max(0, box[1] - reach),
+        min(shape[0], box[2] + reach), min(shape[1], box[3] + reach),
+    )  # fmt: skip
+
+
+@njit(**_EXACT)
+def near_part(parts, number, box, reach):
+    """Which pixels of a box are at most ``reach`` rows and columns from a part that lies in it, as
+    an array of the size of the box."""
+    top, left, low, right = box
+    height, width = low - top, right - left
+    across, near = np.empty((height, width), np.uint8), np.empty((height, width), np.uint8)
+    for v in range(height):
+        since = reach + 1
+        for u in range(width):
+            since = 0 if parts[top + v, left + u] == number else since + 1
+            across[v, u] = since <= reach
+        since = reach + 1
+        for u in range(width - 1, -1, -1):
+            since = 0 if parts[top + v, left + u] == number else since + 1
+            across[v, u] |= since <= reach
+    count = np.zeros(width, np.int32)
+    for v in range(-reach, height):
+        if v + reach < height:
+            count += across[v + reach]
+        if v > reach:
+            count -= across[v - reach - 1]
+        if v >= 0:
+            near[v] = count > 0
+    return near
+
+
+@njit(**_EXACT)
+def rim_pixels(labels, label, box, reach, sure):
+    """Flat indices of what is ``sure`` within ``reach`` of a segment, row by row."""
+    top, left, low, right = wide = widened(box, reach, labels.shape)
+    near = near_part(labels, label, wide, reach)
+    pixels, count = np.empty(near.size, np.int64), 0
+    for v in range(top, low):
+        for u in range(left, right):
+            pixels[count] = v * labels.shape[1] + u
+            count += near[v - top, u - left] & sure[v, u]
+    return pixels[:count].copy()
+
+
+@njit(**_EXACT)
+def at_pixel(plane, v, u, shape):
+    """Inverse depth of a plane at a pixel, and the place (x, y) of that."""
+    x, y = (u + 0.5) / shape[1] - 0.5, (v + 0.5) / shape[0] - 0.5
+    return plane[0] * x + plane[1] * y + plane[2], x, y
+
+
+@njit(**_EXACT)
+def connected(labels, label, unsure, v0, u0, parts, number, pixels):
+    """Marks what is connected with a pixel, to the eight around, of what is ``unsure`` in a segment
+    by a ``number`` in ``parts``; returns the box of that and how many ``pixels``, flat indices,
+    that are."""
+    height, width = labels.shape
+    parts[v0, u0], pixels[0] = number, v0 * width + u0
+    done, found = 0, 1
+    top, left, low, right = v0, u0, v0, u0
+    while done < found:
+        v, u = pixels[done] // width, pixels[done] % width
+        done += 1
+        top, left, low, right = min(top, v), min(left, u), max(low, v), max(right, u)
+        for y in range(max(v - 1, 0), min(v + 2, height)):
+            for x in range(max(u - 1, 0), min(u + 2, width)):
+                if parts[y, x] == 0 and labels[y, x] == label and unsure[y, x]:
+                    parts[y, x], pixels[found] = number, y * width + x
+                    found += 1
+    return (top, left, low + 1, right + 1), found
+
+
+@njit(**_EXACT)
+def told_by_rim(labels, label, box, unsure, sure, depth, planes, rules, parts, told):
+    """Writes its label into ``told`` at the connected unsure parts of a segment, of ``least``
+    pixels, at whose own rim the part ``mostly`` of what is ``sure`` lies on one of its planes.
+
+    ``parts``, of the segment zero on entry, receives numbers of these that no others have.
+    """
+    pixels, shape = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32), labels.shape
+    for v0 in range(box[0], box[2]):
+        for u0 in range(box[1], box[3]):
+            if parts[v0, u0] != 0 or labels[v0, u0] != label or not unsure[v0, u0]:
+                continue
+            number = 1 + v0 * shape[1] + u0
+            own, count = connected(labels, label, unsure, v0, u0, parts, number, pixels)
+            if count < rules.least:
+                continue
+            wide = widened(own, rules.reach, shape)
+            near = near_part(parts, number, wide, rules.reach)
+            around, on = 0, 0
+            for v in range(wide[0], wide[2]):
+                for u in range(wide[1], wide[3]):
+                    if near[v - wide[0], u - wide[1]] and sure[v, u]:
+                        around += 1
+                        value, is_on = 1 / np.float64(depth[v, u]), False
+                        for plane in planes:
+                            off = abs(at_pixel(plane, v, u, shape)[0] - value)
+                            is_on |= off < rules.tolerance * value
+                        on += is_on
+            if on >= rules.mostly * max(1, around):
+                for k in range(count):
+                    told[pixels[k] // shape[1], pixels[k] % shape[1]] = label
+
+
+@njit(**_EXACT)
+def planes_of_segment(
+    labels, label, box, unsure, sure, depth, confidence, draws, rules, parts, told
+):  # fmt: skip
+    """The planes (p, 3) of a segment, covariances of these, and how many were tried; ``told`` and
+    ``parts`` as in ``told_by_rim``. Also flat indices of some pixels that are known at the segment
+    and its rim, and the number of the plane, from 1 on, that each lies on."""
+    known = rim_pixels(labels, label, box, rules.reach, sure)
+    some = known[:: max(1, -(-len(known) // rules.most))]
+    x, y, value, weight = np.empty((4, len(some)))
+    for i in range(len(some)):
+        v, u = some[i] // labels.shape[1], some[i] % labels.shape[1]
+        x[i], y[i] = (u + 0.5) / labels.shape[1] - 0.5, (v + 0.5) / labels.shape[0] - 0.5
+        value[i], weight[i] = 1 / np.float64(depth[v, u]), confidence[v, u]
+    planes, covariances, of, tried = segment_planes(x, y, value, weight, draws, rules)
+    if len(planes):
+        told_by_rim(labels, label, box, unsure, sure, depth, planes, rules, parts, told)
+    return planes, covariances, tried, some, of
+
+
+@njit(**_EXACT)
+def mark_stable(told, label, nearest, box, planes, covariances, most, first, which):
+    """Writes into ``which`` the numbers, from ``first`` on, of the planes ``nearest`` to the pixels
+    of a segment that are ``told``, where the relative deviation of these is below ``most``."""
+    for v in range(box[0], box[2]):
+        for u in range(box[1], box[3]):
+            if told[v, u] == label:
+                number = nearest[v, u]
+                own, x, y = at_pixel(planes[number], v, u, told.shape)
+                c = covariances[number]
+                mixed = c[0, 1] * x * y + c[0, 2] * x + c[1, 2] * y
+                variance = c[0, 0] * x * x + c[1, 1] * y * y + c[2, 2] + 2 * mixed
+                if np.sqrt(variance) < most * max(own, 1e-9):
+                    which[v, u] = first + number
+
+
+@njit(**_EXACT)
+def planar_pixels(which, planes, depth, confidence, unsure, farthest, pixels, found):
+    """Where the depth that was found is at most ``unsure`` and that of the plane of a pixel not so
+    many times nearer or farther: flat indices, and z of the plane; returns how many."""
+    count, shape = 0, which.shape
+    for v in range(shape[0]):
+        for u in range(shape[1]):
+            if which[v, u] == 0 or not confidence[v, u] <= unsure:
+                continue
+            value = at_pixel(planes[which[v, u] - 1], v, u, shape)[0]
+            own = 1 / depth[v, u]
+            if value > own / farthest and value < farthest * own:
+                pixels[count], found[count] = v * shape[1] + u, 1 / value
+                count += 1
+    return count
+
+
+@njit(**_EXACT)
+def solved(sums, damping, x, y, z):
+    """What the symmetric matrix of six numbers, with more on its diagonal, takes to x, y and z."""
+    a, b, c, d, e, f = sums
+    a, d, f = a + damping, d + damping, f + damping
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    inverse = 1 / (a * A + b * B + c * C)
+    return (
+        (A * x + B * y + C * z) * inverse,
+        (B * x + D * y + E * z) * inverse,
+        (C * x + E * y + F * z) * inverse,
+    )
+
+
+@njit(**_FAST)
+def explained(x, y, value, weight, tolerance, a, b, c):
+    """Weight of what lies on the plane a x + b y + c."""
+    total = 0.0
+    for i in range(len(value)):
+        off = abs(a * x[i] + b * y[i] + c - value[i])
+        total += weight[i] if off < tolerance * value[i] else 0.0
+    return total
+
+
+@njit(**_EXACT)
+def best_sample(x, y, value, weight, uniform, tolerance):
+    """The plane through three of the pixels on which most of the weight lies, and that weight,
+    negative if there is none.
+
+    ``uniform`` (t, 3) draws the pixels, as likely as their weight says.
+    """
+    chance = np.cumsum(weight / weight.sum())
+    chance /= chance[-1]
+    best, most = (0.0, 0.0, 0.0), -1.0
+    for t in range(len(uniform)):
+        i, j, k = np.searchsorted(chance, uniform[t], side="right")
+        x1, y1, v1 = x[j] - x[i], y[j] - y[i], value[j] - value[i]
+        x2, y2, v2 = x[k] - x[i], y[k] - y[i], value[k] - value[i]
+        area = x1 * y2 - x2 * y1
+        if abs(area) <= 1e-9:
+            continue
+        a, b = (v1 * y2 - v2 * y1) / area, (x1 * v2 - x2 * v1) / area
+        c = value[i] - a * x[i] - b * y[i]
+        on = explained(x, y, value, weight, tolerance, a, b, c)
+        if on > most:
+            best, most = (a, b, c), on
+    return best, most
+
+
+@njit(**_EXACT)
+def fit_plane(x, y, value, weight, uniform, rules):
+    """The plane that most of the weight lies on, by samples of three, and fitted to that; what lies
+    on it; and xx, xy, x, yy, y and 1 summed over these by weight. Not one where they are too few.
+    """
+    (a, b, c), most = best_sample(x, y, value, weight, uniform, rules.tolerance)
+    on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
+    sums = np.zeros(6)
+    for _ in range(rules.rounds):
+        if most < 0 or np.count_nonzero(on) < rules.least:
+            on[:] = False
+            break
+        sums[:] = 0.0
+        xv, yv, v = 0.0, 0.0, 0.0
+        for i in np.flatnonzero(on):
+            wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
+            sums[0], sums[1], sums[2] = sums[0] + wx * x[i], sums[1] + wx * y[i], sums[2] + wx
+            sums[3], sums[4], sums[5] = sums[3] + wy * y[i], sums[4] + wy, sums[5] + w
+            xv, yv, v = xv + wx * value[i], yv + wy * value[i], v + w * value[i]
+        a, b, c = solved(sums, 1e-12, xv, yv, v)
+        on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
+    return (a, b, c), on, sums
+
+
+@njit(**_EXACT)
+def segment_planes(x, y, value, weight, draws, rules):
+    """The planes that explain what is known of a segment, that of most first: coefficients of x, y
+    and 1 (p, 3) and covariances of these, the number of the plane, from 1 on, that each pixel lies
+    on, and how many were tried.
+
+    ``draws`` (n, t, 3) draw the samples of the at most n that are tried. What a plane is fitted to
+    deviates by half the tolerance, and of ``alike`` pixels one counts.
+    """
+    planes, covariances = np.empty((len(draws), 3)), np.empty((len(draws), 3, 3))
+    of, left, found, tried = np.zeros(len(x), np.int32), np.arange(len(x)), 0, 0
+    while tried < len(draws) and len(left) >= rules.least:
+        plane, on, sums = fit_plane(
+            x[left], y[left], value[left], weight[left], draws[tried], rules
+        )  # fmt: skip
+        tried += 1
+        mine = left[on]
+        if len(mine) == 0 or weight[mine].sum() < rules.least_share * weight.sum():
+            break
+        variance = rules.alike * (rules.tolerance / 2 * value[mine].mean()) ** 2
+        planes[found, 0], planes[found, 1], planes[found, 2] = plane
+        for k, unit in enumerate(variance * np.eye(3)):
+            row = solved(sums, 1e-9, unit[0], unit[1], unit[2])
+            covariances[found, k, 0], covariances[found, k, 1], covariances[found, k, 2] = row
+        found += 1
+        of[mine] = found
+        left = left[~on]
+    return planes[:found], covariances[:found], of, tried
