@@ -502,3 +502,14 @@ def test_votes_on_points(setting, monkeypatch):
     assert torch.equal(cuda.keep(_to(setting, points), there), kept)
     alone = cuda.keep(_to(setting, points), [])
     assert int(alone.sum()) == len(points) - 2
+    sky = torch.zeros(depths[0].depth.shape, dtype=torch.bool)
+    sky[:, : sky.shape[1] // 2] = True
+    here, there = ([_under(sky, d) for d in posed] for posed in (here, there))
+    through = cpu.keep(torch.from_numpy(points), here)
+    assert float((expected & ~through).float().mean()) > 0.1
+    kept = cuda.keep(_to(setting, points), there)
+    assert float((kept.cpu() == through).float().mean()) > 0.995
+
+
+def _under(sky: torch.Tensor, posed: PosedDepth) -> PosedDepth:
+    return replace(posed, depth=posed.depth.under(sky.to(posed.depth.depth.device)))

@@ -74,7 +74,7 @@ class CpuDepthEngine:
 
         if not 0 < len(depths) <= _FEW_VIEWS:
             # One view after the other, so that not all are in memory at once.
-            views = ((d.T_cw, d.depth.arrays()) for d in depths)
+            views = ((d.T_cw, d.depth.through_sky().arrays()) for d in depths)
             return torch.from_numpy(vote(points.detach().numpy(), views, self.render))
         posed = list(depths)
         poses = torch.from_numpy(np.stack([d.T_cw for d in posed]))
@@ -83,7 +83,7 @@ class CpuDepthEngine:
         kept = torch.ones_like(seen)
         if bool(seen.any()):
             some = points.detach()[seen].numpy()
-            views = ((d.T_cw, d.depth.arrays()) for d in posed)
+            views = ((d.T_cw, d.depth.through_sky().arrays()) for d in posed)
             kept[seen] = torch.from_numpy(vote(some, views, self.render))
         return kept
 

@@ -49,7 +49,8 @@ class DepthEngine(Protocol):
         ...
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """World points that do not stand in the free space of the depths (``vote``)."""
+        """World points that do not stand in the free space of the depths (``vote``), as what is
+        seen in their sky does."""
         ...
 
     def photo_costs(

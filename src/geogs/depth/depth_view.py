@@ -11,6 +11,9 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 
+INFINITY = 1e6
+"""Times a depth."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewPose:
@@ -114,6 +117,13 @@ class DenseDepth:
         if sky is None:
             return self
         return replace(self, confidence=torch.where(sky, 0.0, self.confidence), sky=sky)
+
+    def through_sky(self) -> "DenseDepth":
+        """Its sky as a depth that is sure, and behind everything."""
+        if self.sky is None:
+            return self
+        far = torch.where(self.sky, INFINITY * self.depth, self.depth)
+        return replace(self, depth=far, confidence=torch.where(self.sky, 1.0, self.confidence))
 
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""

@@ -25,8 +25,6 @@ CHECKING_VIEWS = 8
 """Keyframes whose depth checks a new keyframe's depth and whose free space carves around it."""
 SEARCHED_TOGETHER = 32
 """Keyframes whose images and depths are in memory at once where all are searched anew."""
-PLANAR_TOGETHER = 4
-"""Threads that lay depths on planes: more wait for each other, as much of it is Python's own."""
 
 
 class KeyframeDepths:
@@ -115,7 +113,7 @@ class KeyframeDepths:
             return planar_depth(view.bare_segments, depth, camera, view.id)
 
         pairs = zip(views, depths, strict=True)
-        return list(ordered_map(one, pairs, min(PLANAR_TOGETHER, worker_count())))
+        return list(ordered_map(one, pairs, worker_count()))
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
         """The searched depth, joined with what a sensor measured where it did."""

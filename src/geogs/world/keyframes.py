@@ -1,6 +1,7 @@
 """All keyframes of a run, by stable id: what was seen, from where, and how far it is."""
 
 import copy
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, cast
@@ -181,11 +182,17 @@ class Keyframe:
         grid, lens = self.grid, self.table.lens
         fields = torch.stack([self.inverse_depth, self.confident_information], 1)
         if lens is not None:
-            straight = lens.focal * grid.rays[:, :2].double().cpu().numpy()
-            seen = distorted_pixels(straight, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
-            fields = grid.sample_field(fields, torch.from_numpy(seen).to(fields))
+            fields = grid.sample_field(fields, _seen_cells(grid, lens))
         depth, information = fields.mT.reshape(2, grid.height, grid.width).cpu().numpy()
         return depth, information
+
+
+@functools.lru_cache(maxsize=1)
+def _seen_cells(grid: SampleGrid, lens: FoundLens) -> Float32[Tensor, "p 2"]:
+    """Where the cells of a straight image lie in the one that the lens bent."""
+    straight = lens.focal * grid.rays[:, :2].double().cpu().numpy()
+    seen = distorted_pixels(straight, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
+    return torch.from_numpy(seen).to(grid.rays)
 
 
 @dataclass(eq=False)
@@ -408,7 +415,8 @@ class KeyframeSet:
         for keyframe in self:
             image = keyframe.image
             straight = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            straight[image[row, column].max(-1) == 0] = 0
+            black = image[..., 0] | image[..., 1] | image[..., 2]  # one after the other: quicker
+            straight[black[row, column] == 0] = 0
             arrays.put("image", keyframe.id, straight, recent=True)
             arrays.recent("encoded").drop(keyframe.id)
             for name in ("prior normal", "sensor depth"):

@@ -60,11 +60,12 @@ def vote(
         batch = list(depths[start : start + VOTERS_TOGETHER])  # the kernel reads where they lie
         T_cw = np.stack([d.T_cw for d in batch])
         matrices = upload(packed(T_cw[:, :3, :3], T_cw[:, :3, 3]), device)
+        maps, skies = (upload(a, device) for a in (_addresses(batch), _skies(batch)))
         kernels_for(SOURCE, device)["vote_on_points"](
-            -(-len(points) // 128), 128, points, upload(_addresses(batch), device), matrices,
-            len(points), len(batch), *batch[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
-            camera.cy, carve.VOTE_CONFIDENCE, carve.VOTE_SUPPORT, carve.VOTE_VIOLATION,
-            carve.VOTE_FREE_VIEWS, votes, keep,
+            -(-len(points) // 128), 128, points, maps, skies, matrices, len(points), len(batch),
+            *batch[0].depth.depth.shape, camera.fx, camera.fy, camera.cx, camera.cy,
+            carve.VOTE_CONFIDENCE, carve.VOTE_SUPPORT, carve.VOTE_VIOLATION, carve.VOTE_FREE_VIEWS,
+            votes, keep,
         )  # fmt: skip
     return keep
 
@@ -74,6 +75,13 @@ def _addresses(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n 2"]:
     maps = [(d.depth.depth, d.depth.confidence) for d in depths]
     assert all(a.is_contiguous() and b.is_contiguous() for a, b in maps)
     return np.array([(a.data_ptr(), b.data_ptr()) for a, b in maps], np.int64)
+
+
+def _skies(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n"]:
+    """Where each sky lies; 0 where there is none."""
+    skies = [d.depth.sky for d in depths]
+    assert all(s is None or s.is_contiguous() for s in skies)
+    return np.array([0 if s is None else s.data_ptr() for s in skies], np.int64)
 
 
 class CheckSettings(NamedTuple):

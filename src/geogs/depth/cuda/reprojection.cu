@@ -26,16 +26,21 @@ __device__ __forceinline__ Point back_project(Lens lens, int x, int y, float dep
   return {(x - lens.cx) / lens.fx * depth, (y - lens.cy) / lens.fy * depth, depth};
 }
 
+// The pixel that sees a camera-frame point; -1 for none.
+__device__ __forceinline__ int pixel_of(Lens lens, Point p, int h, int w) {
+  if (!(p.z > 1e-4f)) return -1;
+  const float u = floorf(lens.fx * p.x / p.z + lens.cx + 0.5f);
+  const float v = floorf(lens.fy * p.y / p.z + lens.cy + 0.5f);
+  return u >= 0.f && v >= 0.f && u < w && v < h ? (int)v * w + (int)u : -1;
+}
+
 // A camera-frame point's z over the depth at its pixel, and that pixel's confidence; 0, 0 unseen.
 struct Seen { float ratio, sure; };
 
 __device__ __forceinline__ Seen look_up(
     Lens lens, Point p, const float* depth, const float* confidence, int h, int w) {
-  if (!(p.z > 1e-4f)) return {0.f, 0.f};
-  const float u = floorf(lens.fx * p.x / p.z + lens.cx + 0.5f);
-  const float v = floorf(lens.fy * p.y / p.z + lens.cy + 0.5f);
-  if (!(u >= 0.f && v >= 0.f && u < w && v < h)) return {0.f, 0.f};
-  const int pixel = (int)v * w + (int)u;
+  const int pixel = pixel_of(lens, p, h, w);
+  if (pixel < 0) return {0.f, 0.f};
   const float d = depth[pixel];
   if (!(d > 0.f)) return {0.f, 0.f};
   return {p.z / d, confidence[pixel]};
@@ -136,11 +141,13 @@ extern "C" __global__ void check_depth(
 }
 
 // Which world points to keep: those that are finite and that fewer than `free_views` views, or no
-// more than see them on their surface, see in free space. transforms: world to view. votes (n, 2):
-// how many views of earlier launches see each point on their surface and in free space; added to.
+// more than see them on their surface, see in free space; what is seen in the sky is. transforms:
+// world to view. skies (n): addresses of where each view sees the sky (h, w), 0 where it does not.
+// votes (n, 2): how many views of earlier launches see each point on their surface and in free
+// space; added to.
 extern "C" __global__ void vote_on_points(
-    const float* points, const long long* maps, const float* transforms, int count, int views, int h,
-    int w, float fx, float fy, float cx, float cy, float vote_confidence, float vote_support,
+    const float* points, const long long* maps, const long long* skies, const float* transforms,
+    int count, int views, int h, int w, float fx, float fy, float cx, float cy, float vote_confidence, float vote_support,
     float vote_violation, int free_views, int2* votes, bool* keep) {
   const int i = blockIdx.x * blockDim.x + threadIdx.x;
   if (i >= count) return;
@@ -148,8 +155,14 @@ extern "C" __global__ void vote_on_points(
   const Point point = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
   int surface = votes[i].x, open = votes[i].y;
   for (int j = 0; j < views; j++) {
-    const Seen s = look_up(lens, transform(transforms + 12 * j, point), depth_map(maps, j),
-                           confidence_map(maps, j), h, w);
+    const Point there = transform(transforms + 12 * j, point);
+    const bool* sky = (const bool*)skies[j];
+    const int pixel = sky ? pixel_of(lens, there, h, w) : -1;
+    if (pixel >= 0 && sky[pixel]) {
+      open++;
+      continue;
+    }
+    const Seen s = look_up(lens, there, depth_map(maps, j), confidence_map(maps, j), h, w);
     if (!(s.sure > vote_confidence)) continue;
     surface += fabsf(s.ratio - 1.f) < vote_support;
     open += s.ratio < 1.f - vote_violation;

@@ -1,16 +1,14 @@
 """Sky: pixels whose depth no parallax bounds from above."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from geogs.depth.depth_engine import DepthEngine
-from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
+from geogs.depth.depth_view import INFINITY, DenseDepth, DepthView, PosedDepth
 from geogs.depth.revision.revised_search import RevisedSearch
-from geogs.on_demand import OnDemand
 
 FAR = 2.0
 """Times the median depth from which a pixel is asked: a bare wall nearby looks the same at any
@@ -24,8 +22,6 @@ AGREES = 0.3
 """Cost up to which images agree: surfaces that are found right have 0.4, seen at infinity 0.9."""
 _SURE = 0.5
 """Least confidence of depths from which noise and light are learned."""
-_INFINITY = 1e6
-"""Times the median depth."""
 
 
 class SkySearch(RevisedSearch):
@@ -44,20 +40,6 @@ class SkySearch(RevisedSearch):
         checked = self.classical.check(depths, others)
         return [found.under(own.depth.sky) for own, found in zip(depths, checked, strict=True)]
 
-    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """As in the protocol; all that is seen in the sky stands in free space."""
-        return self.classical.keep(points, OnDemand(depths, _with_sky_far_away))
-
-
-def _with_sky_far_away(posed: PosedDepth) -> PosedDepth:
-    """The sky as a depth that is sure, and behind everything."""
-    found = posed.depth
-    if found.sky is None:
-        return posed
-    far = torch.where(found.sky, _INFINITY * found.depth, found.depth)
-    sure = torch.where(found.sky, 1.0, found.confidence)
-    return replace(posed, depth=replace(found, depth=far, confidence=sure))
-
 
 def unbounded(
     view: DepthView, others: Sequence[DepthView], found: DenseDepth, engine: DepthEngine
@@ -75,7 +57,7 @@ def unbounded(
     is_far = found.depth > FAR * typical
     if float(is_far.float().mean()) < _ASKED:
         return None
-    depths = torch.stack([found.depth, (_INFINITY * typical).expand_as(found.depth)])
+    depths = torch.stack([found.depth, (INFINITY * typical).expand_as(found.depth)])
     here, beyond = engine.photo_costs(view, others, depths, sure)
     is_sky = is_far & (beyond < AGREES) & (beyond < here + WORSE)
     return is_sky if bool(is_sky.any()) else None
