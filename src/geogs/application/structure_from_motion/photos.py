@@ -1,7 +1,7 @@
 """Structure from motion of photographs and of videos, as another package registers it."""
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -23,7 +23,8 @@ from geogs.threads import worker_count
 from geogs.types import Frame
 
 GROUP = "geogs.photos"
-"""Entry points: ``open_photographs``, ``place_frames`` and ``Localiser``, as used below."""
+"""Entry points: ``open_photographs``, ``place_frames``, ``place_lost`` and ``Localiser``, as used
+below."""
 
 Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
@@ -71,6 +72,21 @@ class PlacedVideo:
         return np.unique(np.concatenate(self.positions), axis=0)
 
 
+@dataclass(frozen=True, slots=True)
+class FoundFrames:
+    """Frames of a video that were lost and have a pose after all, in time order."""
+
+    numbers: tuple[int, ...]
+    """Which frames of the video they are: the rows of what follows."""
+    T_cw: Float64[np.ndarray, "m 4 4"]
+    """World to camera."""
+    deviation: Float64[np.ndarray, "m"]
+    """Standard deviation of the camera's centre beside the frames that had a pose before; infinite
+    where unknown."""
+    rotation: Float64[np.ndarray, "m"]
+    """The same of its orientation, radians."""
+
+
 def seconds_to_place(chosen: int, length: int) -> dict[str, float]:
     """About how long the stages take that find where the frames of a video were taken, of which so
     many are given to structure from motion."""
@@ -110,6 +126,29 @@ def place_frames(
     place = _registered("place_frames")
     placed: PlacedVideo = place(chosen, camera, is_known, is_found, seed, report)
     return placed
+
+
+def place_lost(
+    frames: Sequence[Frame],
+    T_cw: Sequence[Float64[np.ndarray, "4 4"] | None],
+    camera: Camera,
+    seed: int,
+    report: StageProgress,
+) -> FoundFrames:
+    """Find where frames without a pose were taken by others around them, whose poses stay.
+
+    Args:
+        frames: those, and others that show the same, in time order.
+        T_cw: their poses, world to camera; none of those to be found.
+        camera: that took all.
+        seed: of the random choices.
+        report: follows the work; what it raises ends it.
+
+    Raises:
+        InputError: pycolmap is missing.
+    """
+    found: FoundFrames = _registered("place_lost")(frames, T_cw, camera, seed, report)
+    return found
 
 
 def localiser(video: PlacedVideo, camera: Camera, seed: int) -> Localise:
