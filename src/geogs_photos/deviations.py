@@ -59,7 +59,6 @@ def deviations_beside(
     model: Any,
     images: Sequence[Any],
     T_cw: Float64[np.ndarray, "n 4 4"],
-    error: float,
     known: Container[int],
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """As :func:`pose_deviations`, beside images ``known`` from elsewhere, which count as exact.
@@ -70,7 +69,7 @@ def deviations_beside(
     unknown = np.full(len(images), np.inf)
     if not len(images):
         return unknown, unknown.copy()
-    colmap = load_colmap()
+    colmap, error = load_colmap(), float(model.compute_mean_reprojection_error())
     config = colmap.BundleAdjustmentConfig()
     for image in model.images.values():
         if image.has_pose:

@@ -20,7 +20,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.stopwatch import StageProgress
 from geogs.threads import worker_count
-from geogs.types import Frame
+from geogs.types import FoundFrames, Frame
 
 GROUP = "geogs.photos"
 """Entry points: ``open_photographs``, ``place_frames``, ``place_lost`` and ``Localiser``, as used
@@ -72,21 +72,6 @@ class PlacedVideo:
         return np.unique(np.concatenate(self.positions), axis=0)
 
 
-@dataclass(frozen=True, slots=True)
-class FoundFrames:
-    """Frames of a video that were lost and have a pose after all, in time order."""
-
-    numbers: tuple[int, ...]
-    """Which frames of the video they are: the rows of what follows."""
-    T_cw: Float64[np.ndarray, "m 4 4"]
-    """World to camera."""
-    deviation: Float64[np.ndarray, "m"]
-    """Standard deviation of the camera's centre beside the frames that had a pose before; infinite
-    where unknown."""
-    rotation: Float64[np.ndarray, "m"]
-    """The same of its orientation, radians."""
-
-
 def seconds_to_place(chosen: int, length: int) -> dict[str, float]:
     """About how long the stages take that find where the frames of a video were taken, of which so
     many are given to structure from motion."""
@@ -131,23 +116,23 @@ def place_frames(
 def place_lost(
     frames: Sequence[Frame],
     T_cw: Sequence[Float64[np.ndarray, "4 4"] | None],
-    camera: Camera,
+    seen_by: Calibration,
     seed: int,
-    report: StageProgress,
+    report: Callable[[float], None],
 ) -> FoundFrames:
     """Find where frames without a pose were taken by others around them, whose poses stay.
 
     Args:
         frames: those, and others that show the same, in time order.
         T_cw: their poses, world to camera; none of those to be found.
-        camera: that took all.
+        seen_by: the camera of all, with its distortion where they still bend.
         seed: of the random choices.
-        report: follows the work; what it raises ends it.
+        report: called with the finished part; what it raises ends the work.
 
     Raises:
         InputError: pycolmap is missing.
     """
-    found: FoundFrames = _registered("place_lost")(frames, T_cw, camera, seed, report)
+    found: FoundFrames = _registered("place_lost")(frames, T_cw, seen_by, seed, report)
     return found
 
 
