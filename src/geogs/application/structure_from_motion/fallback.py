@@ -1,6 +1,7 @@
 """A tracked video; where tracking lost much of it, its frames placed by structure from motion."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,9 +96,13 @@ class TrackedOrPlaced(Work):
         """What is to be said of tracking, once lost frames were looked for about what is to be
         relied on: elsewhere all frames are placed otherwise first."""
         result = self._result()
-        if result.verdict is not None and result.verdict.is_reliable:
-            result = self._result() if self._find_lost(driver, result) else result
-        return result.verdict
+        before = result.verdict
+        if before is None or not before.is_reliable or not self._find_lost(driver, result):
+            return before
+        # The world is as well known as it was; what changes is how many frames have a place.
+        after = self._result().verdict
+        assert after is not None
+        return replace(before, lost=after.lost, orientation_only=after.orientation_only)
 
     def _result(self) -> Result:
         return Result(self._tracked.scene, self._tracked.source)
