@@ -28,7 +28,7 @@ from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import TrackResult
-from geogs.types import Frame, MetricScale
+from geogs.types import FoundFrames, Frame, MetricScale
 from geogs.world.grid import SampleGrid
 from geogs.world.world import World, check_world
 
@@ -185,6 +185,13 @@ class Slam(SlamOutput):
             self.adjust(progress)
             self.refine(progress)
         self.to_metres()
+
+    @on_one_torch_thread
+    def place_found(self, found: FoundFrames) -> None:
+        """Place frames that had no place, and were found beside those that have one."""
+        self.segments.place_found(found)
+        if self.world.uncertainty is not None:
+            self.world.uncertainty = self.world.uncertainty.with_found(found)
 
     @on_one_torch_thread
     def rescale(self, scale: MetricScale) -> None:

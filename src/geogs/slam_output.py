@@ -129,10 +129,17 @@ class SlamOutput:
             "lens": None if self.lens is None else asdict(self.lens),
             "moving": round(dynamic_fraction(self.segments.main.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
+            **self._placed_afterwards(),
             "not_started": self.world.segments.why_not or None,
             "loops": len(self.world.loops.loops),
             "loop_closures": self.world.loops.closures,
         }
+
+    def _placed_afterwards(self) -> dict[str, object]:
+        """How many frames were lost and placed after the stream; nothing where none was."""
+        records = self.segments.main.map.recorder.log.records
+        found = sum(record.is_found for record in records)
+        return {"placed_afterwards": found} if found else {}
 
     def _pose_agreement(self) -> dict[str, object] | None:
         """How far poses beside the images fit them; none where there are none."""

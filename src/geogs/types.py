@@ -175,6 +175,37 @@ class Trajectory(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, repr=False)
+class FoundFrames(ShortRepr):
+    """Frames of a video that had no place, and have one after all, in time order."""
+
+    numbers: tuple[int, ...]
+    """Which frames of the video they are: the rows of what follows."""
+    timestamps: Float[np.ndarray, "n"]
+    """Seconds."""
+    T_cw: Float[np.ndarray, "n 4 4"]
+    """World to camera, float64."""
+    position: Float[np.ndarray, "n"]
+    """Standard deviation of the camera's centre beside the frames that had a place before, map
+    units; infinite where that is not known."""
+    rotation: Float[np.ndarray, "n"]
+    """The same of its orientation, radians."""
+
+    @staticmethod
+    def none() -> "FoundFrames":
+        """Of no frame."""
+        return FoundFrames((), np.zeros(0), np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def of(self, kept: Bool[np.ndarray, "n"]) -> "FoundFrames":
+        """Some of them."""
+        numbers = tuple(n for n, is_kept in zip(self.numbers, kept, strict=True) if is_kept)
+        columns = (self.timestamps, self.T_cw, self.position, self.rotation)
+        return FoundFrames(numbers, *(column[kept] for column in columns))
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Uncertainty(ShortRepr):
     """Standard deviations of frames, earliest first; infinite where nothing is known."""
 
@@ -195,6 +226,19 @@ class Uncertainty(ShortRepr):
             return Uncertainty(timestamps, *(np.full(len(timestamps), np.inf) for _ in range(3)))
         known = (self.position, self.rotation, self.depth)
         return Uncertainty(timestamps, *(np.interp(timestamps, self.timestamps, c) for c in known))
+
+    def with_found(self, found: FoundFrames) -> "Uncertainty":
+        """With frames that were found beside these: each is as far off as those around it, and by
+        its own deviations, which are independent."""
+        around = self.at(found.timestamps)
+        order = np.argsort(np.concatenate([self.timestamps, found.timestamps]), kind="stable")
+        columns = (
+            (self.timestamps, found.timestamps),
+            (self.position, np.hypot(around.position, found.position)),
+            (self.rotation, np.hypot(around.rotation, found.rotation)),
+            (self.depth, around.depth),
+        )
+        return Uncertainty(*(np.concatenate(pair)[order] for pair in columns))
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -1,6 +1,6 @@
 """How well structure from motion knows its poses, whatever frame of reference it was solved in."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,45 @@ def pose_deviations(
         return unknown, unknown.copy()
     centre, rotation = without_gauge(joint, T_cw)
     return ALIKE * error * centre, ALIKE * error * rotation
+
+
+def deviations_beside(
+    model: Any,
+    images: Sequence[Any],
+    T_cw: Float64[np.ndarray, "n 4 4"],
+    known: Container[int],
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """As :func:`pose_deviations`, beside images ``known`` from elsewhere, which count as exact.
+
+    Nothing is aligned: the world is theirs. With T = [Exp(w) R, t + dt] the centre moves by
+    R^T (w x t - dt).
+    """
+    unknown = np.full(len(images), np.inf)
+    if not len(images):
+        return unknown, unknown.copy()
+    colmap, error = load_colmap(), float(model.compute_mean_reprojection_error())
+    config = colmap.BundleAdjustmentConfig()
+    for image in model.images.values():
+        if image.has_pose:
+            config.add_image(image.image_id)
+            if image.image_id in known:
+                config.set_constant_rig_from_world_pose(image.frame_id)
+    for number in model.cameras:
+        config.set_constant_cam_intrinsics(number)
+    options = colmap.BundleAdjustmentOptions(print_summary=False)
+    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
+    wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
+    covariance = colmap.estimate_ba_covariance(wanted, model, adjuster)
+    if covariance is None:
+        return unknown, unknown.copy()
+    deviation, rotation = unknown, unknown.copy()
+    for k, (image, T) in enumerate(zip(images, T_cw, strict=True)):
+        own = covariance.get_cam_cov_from_world(image.image_id)
+        if own is not None and own.shape == (6, 6):
+            J = np.concatenate([-_cross(T[:3, 3]), -np.eye(3)], 1)
+            deviation[k] = np.sqrt(np.trace(J @ own @ J.T).clip(0))
+            rotation[k] = np.sqrt(np.trace(own[:3, :3]).clip(0))
+    return ALIKE * error * deviation, ALIKE * error * rotation
 
 
 def without_gauge(

@@ -8,7 +8,7 @@ the largest part, which short parts cannot tell, and mapped incrementally.
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -66,8 +66,10 @@ def rejoined(
     return best
 
 
-def firmly_joined(model: Any) -> Any:
+def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
     """The largest part of a reconstruction whose scale is one; the other pictures lose their poses.
+
+    With pictures ``known`` from elsewhere it is all that hangs together with one of them.
 
     Between two pictures scale is passed on by points that a third one sees as well. Where only a
     few such points join two parts, how large and how far one is as seen from the other is made up.
@@ -83,9 +85,12 @@ def firmly_joined(model: Any) -> Any:
     rows, columns = ([pair[k] for pair in joined] for k in (0, 1))
     graph = coo_array(([1] * len(joined), (rows, columns)), shape=(len(images), len(images)))
     _, part = connected_components(graph, directed=False)
-    largest = Counter(part.tolist()).most_common(1)[0][0] if len(images) else 0
-    for number, own in zip(images, part.tolist(), strict=True):
-        if own != largest:
+    of = dict(zip(images, part.tolist(), strict=True))
+    kept = {of[n] for n in images if n in known}
+    if not kept and images:
+        kept = {Counter(of.values()).most_common(1)[0][0]}
+    for number, own in of.items():
+        if own not in kept:
             model.deregister_frame(model.images[number].frame_id)
     model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
     return model

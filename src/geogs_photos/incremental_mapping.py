@@ -4,6 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float64
+
 from geogs_photos.database import SharedCamera
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -58,6 +61,72 @@ def put_together(
         database, work, work, options=options, next_image_callback=after_image
     )
     return largest_first(models)
+
+
+def continued(
+    database: Path,
+    work: Path,
+    known: Mapping[int, Float64[np.ndarray, "4 4"]],
+    seed: int,
+    threads: int,
+    progress: Callable[[float], None],
+) -> Any | None:
+    """The reconstruction of pictures whose poses are known, and of what joins them; none if these
+    see no point.
+
+    Args:
+        database: with verified matches; its one camera is known.
+        work: folder for what pycolmap writes.
+        known: poses, world to camera, by the numbers of the pictures; they stay.
+        seed: of the random choices.
+        threads: to compute with.
+        progress: called with the finished part; what it raises ends the work.
+    """
+    colmap = load_colmap()
+    options = colmap.IncrementalPipelineOptions(
+        num_threads=threads, random_seed=seed, extract_colors=False, multiple_models=False,
+        fix_existing_frames=True,
+    )  # fmt: skip
+    options.constant_cameras = {1}
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.mapper.abs_pose_min_num_inliers = LEAST_POINTS
+    begun, went_on = work / "begun", work / "on"
+    model, count = _of_poses(colmap, database, known)
+    for folder in (begun, went_on):
+        folder.mkdir(parents=True, exist_ok=True)
+    model = colmap.triangulate_points(model, database, work, begun, options=options)
+    if not model.num_points3D():
+        return None
+    model.write(begun)
+    placed = len(known)
+
+    def after_image() -> None:
+        nonlocal placed
+        placed += 1
+        progress(min(placed / count, 1.0))
+
+    models = colmap.incremental_mapping(
+        database, work, went_on, options=options, input_path=begun,
+        next_image_callback=after_image,
+    )  # fmt: skip
+    return next(iter(largest_first(models)), None)
+
+
+def _of_poses(
+    colmap: Any, database: Path, known: Mapping[int, Float64[np.ndarray, "4 4"]]
+) -> tuple[Any, int]:
+    """A reconstruction without points, and how many pictures the database holds."""
+    model, opened = colmap.Reconstruction(), colmap.Database.open(database)
+    try:
+        for camera in opened.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            if image.image_id in known:
+                pose = colmap.Rigid3d(np.ascontiguousarray(known[image.image_id][:3]))
+                model.add_image_with_trivial_frame(image, pose)
+        return model, opened.num_images()
+    finally:
+        opened.close()
 
 
 def largest_first(models: Mapping[int, Any]) -> list[Any]:

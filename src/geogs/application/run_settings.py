@@ -48,8 +48,9 @@ class RunSettings(Settings):
     """Do not track: place sharp frames by structure from motion (pycolmap) and all others against
     them; for videos that tracking cannot follow."""
     fallback: bool = True
-    """Where the video was tracked but much of it lost, or nothing to be relied on, also place its
-    frames as --offline does (pip install 'geogs[photos]'), and keep what is better."""
+    """Look for lost frames about those that were tracked, and where much was lost, or nothing to be
+    relied on, also place all frames as --offline does, and keep what is better (pip install
+    'geogs[photos]')."""
     online_results: bool = False
     """Also write trajectory and mesh as they are after the stream, to online/, and after the final
     bundle adjustment and the map's update, to adjusted/, where a refinement follows; all appear

@@ -15,7 +15,7 @@ from geogs.priors.monocular_prior import MonocularPrior
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.locate.frame_locator import Recognition
 from geogs.tracking.tracker import Tracker, TrackResult
-from geogs.types import Frame, Trajectory
+from geogs.types import FoundFrames, Frame, Trajectory
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.segments import (
     OrientationTrack,
@@ -127,6 +127,11 @@ class Segments:
             self.table.current = host.segment.number
         self._remove(guest)
         return final
+
+    def place_found(self, found: FoundFrames) -> None:
+        """Place frames in the main map that had no place there."""
+        others = [t.map.recorder for t in self.trackers if t is not self.main]
+        self.main.map.recorder.place_found(found, others)
 
     # --- the stream ------------------------------------------------------------------------
 

@@ -60,6 +60,8 @@ class FrameRecord:
     """Kept until the keyframes around are final and the flow from them is measured."""
     encoded: Any = field(default=None, metadata={"stored": False})
     """The flow operator's form of the image, or None where it has to be computed again."""
+    is_found: bool = False
+    """Whether it was lost, and placed after the stream by frames that were not."""
 
     def observes(self, keyframe: int) -> bool:
         """Whether the flow from that keyframe has been measured."""

@@ -1,6 +1,7 @@
 """A tracked video; where tracking lost much of it, its frames placed by structure from motion."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,15 +15,23 @@ from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
     MAX_POSITION_DEVIATION,
     Verdict,
+    extent_of,
 )
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.agreement import turn_alike
+from geogs.application.structure_from_motion.completion import (
+    STAGE,
+    LostFrames,
+    as_seen,
+    placed_after_all,
+)
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
 from geogs.errors import InputError, TrackingLost
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
+from geogs.types import FoundFrames
 
 if TYPE_CHECKING:
     from geogs.application.structure_from_motion.offline import PlacedOffline
@@ -68,18 +77,58 @@ class TrackedOrPlaced(Work):
         except TrackingLost as error:
             outcome, failure = Outcome.FINISHED, error
         if outcome is Outcome.FINISHED:
-            judged = None if failure else Result(tracked.scene, tracked.source).verdict
+            judged = None if failure else self._judged(driver)
             if is_wanted(judged):
                 placed = self._placed(driver, judged)
                 if placed is not None and self._is_mapped(placed, driver, checkpoint):
                     return Outcome.STOPPED if driver.stop.requested else outcome
                 if self._plan is not None:
                     driver.progress.plan(self._plan)
+                if judged is not None and not judged.is_reliable:
+                    self._find_lost(driver, self._result())
             outcome = Outcome.STOPPED if driver.stop.requested else outcome
         if failure is not None:
             raise failure
         self._take(tracked)  # whose lens is known by now
         return tracked.map(driver, outcome)
+
+    def _judged(self, driver: Driver) -> Verdict | None:
+        """What is to be said of tracking, once lost frames were looked for about what is to be
+        relied on: elsewhere all frames are placed otherwise first."""
+        result = self._result()
+        before = result.verdict
+        if before is None or not before.is_reliable or not self._find_lost(driver, result):
+            return before
+        # The world is as well known as it was; what changes is how many frames have a place.
+        after = self._result().verdict
+        assert after is not None
+        return replace(before, lost=after.lost, orientation_only=after.orientation_only)
+
+    def _result(self) -> Result:
+        return Result(self._tracked.scene, self._tracked.source)
+
+    def _find_lost(self, driver: Driver, result: Result) -> bool:
+        """Place the lost frames that are found about the keyframes; whether there are any."""
+        slam, source, stop = self._tracked.scene, self._tracked.source, driver.stop
+        may = self._tracked.metadata.settings.fallback and not source.is_live and has_pycolmap()
+        keyframes = [slam.world.keyframes[i].frame_index for i in slam.segments.main.segment.free]
+        lost = LostFrames(
+            source, as_seen(slam.camera, slam.lens), result.trajectory, keyframes,
+            MAX_POSITION_DEVIATION * extent_of(result.keyframes), slam.config.seed,
+        )  # fmt: skip
+        if not may or not lost.numbers or stop.requested:
+            return False
+        found = FoundFrames.none()
+
+        def find() -> None:
+            nonlocal found
+            with slam.stopwatch(STAGE):
+                found = placed_after_all(lost, driver.progress.write, driver.report)
+
+        if not stop.lets_finish(find):
+            driver.stop_early("The search for lost frames is stopped")
+        slam.place_found(found)
+        return len(found) > 0
 
     def _take(self, work: "TrackedVideo | PlacedOffline") -> None:
         self.scene, self.source = work.scene, work.source

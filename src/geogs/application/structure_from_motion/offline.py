@@ -9,8 +9,19 @@ from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.results.verdict import Verdict, verdict
+from geogs.application.results.verdict import (
+    MAX_POSITION_DEVIATION,
+    Verdict,
+    extent_of,
+    verdict,
+)
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames, choose_frames
+from geogs.application.structure_from_motion.completion import (
+    STAGE,
+    LostFrames,
+    as_seen,
+    placed_after_all,
+)
 from geogs.application.structure_from_motion.offline_plan import offline_config
 from geogs.application.structure_from_motion.photos import (
     PlacedVideo,
@@ -26,7 +37,7 @@ from geogs.io.sources.frame_source import Source
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
-from geogs.types import Trajectory, Uncertainty
+from geogs.types import FoundFrames, Trajectory, Uncertainty
 
 
 class PlacedOffline(Work):
@@ -111,6 +122,22 @@ class PlacedOffline(Work):
         with self._stopwatch("placing frames"):
             T_cw = _place_all(self.source, scene, placed, config, driver.report)
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
+        self._find_lost(driver, T_cw)
+
+    def _find_lost(self, driver: Driver, T_cw: list[Float64[Tensor, "4 4"] | None]) -> None:
+        """Look for the frames that have no pose among those that have one."""
+        scene, source = self.scene, self.source
+        lost = LostFrames(
+            source, as_seen(source.camera, None), self.trajectory, scene.sharp,
+            MAX_POSITION_DEVIATION * extent_of(scene.keyframe_trajectory()), self._config.seed,
+        )  # fmt: skip
+        if not lost.numbers:
+            return
+        with self._stopwatch(STAGE):
+            scene.found = placed_after_all(lost, driver.progress.write, driver.report)
+        for number, pose in zip(scene.found.numbers, scene.found.T_cw, strict=True):
+            T_cw[number] = torch.from_numpy(pose)
+        self.trajectory = bridged(self.trajectory.timestamps, T_cw, [None] * len(T_cw))
 
     def judged(self) -> Verdict:
         """How far the poses are to be relied on, once there are some."""
@@ -155,6 +182,13 @@ class OfflineScene(Reconstruction):
         """Frames placed against the points of the others."""
         self.instead_of = ""
         """What was said of tracking, where the video was tracked before."""
+        self.found = FoundFrames.none()
+        """Frames that were lost, and found once the others had been placed."""
+
+    @property
+    def sharp(self) -> tuple[int, ...]:
+        """Which frames structure from motion placed."""
+        return self._placed.numbers
 
     def map(self, progress: StageProgress) -> None:
         """Depths of the sharp frames, and the map from them."""
@@ -164,7 +198,8 @@ class OfflineScene(Reconstruction):
         """What the adjustment leaves open."""
         placed = self._placed
         times = placed.timestamps[list(placed.numbers)]
-        return Uncertainty(times, placed.deviation, placed.rotation, placed.depth)
+        known = Uncertainty(times, placed.deviation, placed.rotation, placed.depth)
+        return known.with_found(self.found)
 
     def statistics(self) -> dict[str, object]:
         """That nothing was tracked, and how the poses were found."""
@@ -173,6 +208,7 @@ class OfflineScene(Reconstruction):
                 "sharp_frames": self._placed.sharp_frames,
                 "placed_by_structure": len(self._placed.numbers),
                 "placed_against_the_map": self.localised,
+                "placed_afterwards": len(self.found),
                 "reprojection_error": self._placed.error,
                 "instead_of": self.instead_of or None,
                 "calibration": asdict(self._placed.calibration),

@@ -1,7 +1,7 @@
 """Structure from motion of photographs and of videos, as another package registers it."""
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -20,10 +20,11 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.stopwatch import StageProgress
 from geogs.threads import worker_count
-from geogs.types import Frame
+from geogs.types import FoundFrames, Frame
 
 GROUP = "geogs.photos"
-"""Entry points: ``open_photographs``, ``place_frames`` and ``Localiser``, as used below."""
+"""Entry points: ``open_photographs``, ``place_frames``, ``place_lost`` and ``Localiser``, as used
+below."""
 
 Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
@@ -110,6 +111,29 @@ def place_frames(
     place = _registered("place_frames")
     placed: PlacedVideo = place(chosen, camera, is_known, is_found, seed, report)
     return placed
+
+
+def place_lost(
+    frames: Sequence[Frame],
+    T_cw: Sequence[Float64[np.ndarray, "4 4"] | None],
+    seen_by: Calibration,
+    seed: int,
+    report: Callable[[float], None],
+) -> FoundFrames:
+    """Find where frames without a pose were taken by others around them, whose poses stay.
+
+    Args:
+        frames: those, and others that show the same, in time order.
+        T_cw: their poses, world to camera; none of those to be found.
+        seen_by: the camera of all, with its distortion where they still bend.
+        seed: of the random choices.
+        report: called with the finished part; what it raises ends the work.
+
+    Raises:
+        InputError: pycolmap is missing.
+    """
+    found: FoundFrames = _registered("place_lost")(frames, T_cw, seen_by, seed, report)
+    return found
 
 
 def localiser(video: PlacedVideo, camera: Camera, seed: int) -> Localise:

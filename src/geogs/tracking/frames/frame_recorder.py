@@ -12,7 +12,7 @@ from torch import Tensor
 from geogs.bundle.device_choice import grid_fields
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.types import FlowMatch, Frame
+from geogs.types import FlowMatch, FoundFrames, Frame
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameLog, FrameRecord, Observation, RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -146,6 +146,24 @@ class FrameRecorder:
         record.anchor, record.T_rel, record.scale = anchor, T_rel, self._keyframes[anchor].scale
         record.observations = []
         self._observe([(record, anchor)], match)
+
+    def place_found(self, found: FoundFrames, others: Sequence["FrameRecorder"]) -> None:
+        """Say where frames are that were found beside those that had a place.
+
+        Each hangs on the keyframe nearest in time, with nothing to be solved by; frames in the logs
+        of ``others`` are taken over.
+        """
+        poses = dict(zip(found.numbers, torch.from_numpy(found.T_cw), strict=True))
+        for other in others:
+            theirs = other.log.records
+            self._log.records.extend(r for r in theirs if r.index in poses)
+            theirs[:] = [r for r in theirs if r.index not in poses]
+        self._log.records[:] = _in_order(self._log.records)
+        for record in (r for r in self.log.records if r.index in poses):
+            anchor = min(self._keyframes, key=lambda k: abs(k.frame_index - record.index))
+            record.anchor, record.scale = anchor.id, anchor.scale
+            record.T_rel = poses[record.index] @ se3_inverse(anchor.T_cw)
+            record.observations, record.is_found = [], True
 
     def absorb(self, other: "FrameRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's table."""

@@ -1,0 +1,155 @@
+"""Frames that have no place at the end of the work, tried once more about those that have one."""
+
+import copy
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import closing
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.application.structure_from_motion.photos import SECONDS_PER_FRAME, place_lost
+from geogs.errors import InputError
+from geogs.evaluation.duration import duration
+from geogs.geometry.camera import Camera
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.frame_source import Source
+from geogs.stopwatch import StageProgress
+from geogs.threads import worker_count
+from geogs.types import FoundFrames, FoundLens, Frame, Trajectory, Uncertainty
+
+AROUND = 10
+"""Frames with a place before each lost one, and as many after it, about which it is looked for."""
+MOST = 250
+"""Lost frames that are looked for at once, for time and memory; of more every second one comes
+first, or every third, ..."""
+STAGE = "lost frames"
+
+
+class LostFrames:
+    """Frames of a video that have no place, and what is known of the others."""
+
+    def __init__(
+        self,
+        video: Source,
+        seen_by: Calibration,
+        trajectory: Trajectory,
+        sharp: Iterable[int],
+        most_deviation: float,
+        seed: int,
+    ) -> None:
+        """About what, and how well.
+
+        Args:
+            video: is read once more.
+            seen_by: the camera of its frames, with its distortion where they still bend.
+            trajectory: of all frames.
+            sharp: frames about which the others are looked for, those of them that have a place.
+            most_deviation: of the camera's centre, map units, above which a frame stays lost.
+            seed: of the random choices.
+        """
+        # A copy, as a source knows how far it has been read.
+        self._video, self._seen_by, self._seed = copy.copy(video), seen_by, seed
+        self._most_deviation, self._times = most_deviation, trajectory.timestamps
+        states, T_wc = trajectory.states, trajectory.T_wc
+        self.known = {k: np.linalg.inv(T_wc[k]) for k in sharp if states[k] == "tracked"}
+        """World to camera of the frames about which they are looked for."""
+        self.numbers = [k for k, state in enumerate(states) if state != "tracked"]
+        """Which frames have no place, ascending."""
+
+    @property
+    def seconds(self) -> float:
+        """About how long it takes to look for them."""
+        looked_at = len({*self.numbers, *about(self.numbers, self.known)})
+        return looked_at * sum(SECONDS_PER_FRAME.values()) / worker_count()
+
+    def find(self, report: StageProgress) -> FoundFrames:
+        """Those that have a place after all.
+
+        Raises:
+            InputError: pycolmap is missing.
+            KeyboardInterrupt: it was stopped.
+        """
+        known, rounds = dict(self.known), math.ceil(len(self.numbers) / MOST)
+        at = np.array([self._times[k] for k in sorted(known)])
+        beside = Uncertainty(at, *np.zeros((3, len(at))))
+        poses: dict[int, Float64[np.ndarray, "4 4"]] = {}
+        for k in range(rounds):
+            some = self._find(known, self.numbers[k::rounds], _part_of(report, k, rounds))
+            beside = beside.with_found(some)
+            poses |= dict(zip(some.numbers, some.T_cw, strict=True))
+            known |= poses
+        numbers = tuple(sorted(poses))
+        times = np.array([self._times[k] for k in numbers])
+        own, T_cw = beside.at(times), np.array([poses[k] for k in numbers]).reshape(-1, 4, 4)
+        return FoundFrames(numbers, times, T_cw, own.position, own.rotation)
+
+    def _find(
+        self,
+        known: Mapping[int, Float64[np.ndarray, "4 4"]],
+        wanted: Sequence[int],
+        report: Callable[[float], None],
+    ) -> FoundFrames:
+        """Those of some lost frames that are found about known ones, and known well enough."""
+        near = about(wanted, known)
+        if not near:
+            return FoundFrames.none()
+        frames = _read(self._video, {*wanted, *near})
+        T_cw = [known.get(frame.index) for frame in frames]
+        found = place_lost(frames, T_cw, self._seen_by, self._seed, report)
+        return found.of(found.position <= self._most_deviation)
+
+
+def placed_after_all(
+    lost: LostFrames, say: Callable[[str], None], report: StageProgress
+) -> FoundFrames:
+    """The lost frames that are found, with what is to be said of it; none where that fails.
+
+    Raises KeyboardInterrupt if it was stopped.
+    """
+    if not lost.numbers or not lost.known:
+        return FoundFrames.none()
+    count = len(lost.numbers)
+    say(f"Frames without a place: {count}; looking for it, about {duration(lost.seconds)}.")
+    try:
+        found = lost.find(report)
+    except (InputError, RuntimeError) as error:  # of a library
+        say(f"That failed, they stay lost: {error}")
+        return FoundFrames.none()
+    say(f"Structure from motion finds the place of {len(found)} of them.")
+    return found
+
+
+def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
+    """The known frames that are nearest to any wanted one, before it and after it."""
+    near, ascending = set[int](), sorted(known)
+    for number in wanted:
+        at = bisect_left(ascending, number)
+        near.update(ascending[max(0, at - AROUND) : at + AROUND])
+    return near
+
+
+def as_seen(camera: Camera, lens: FoundLens | None) -> Calibration:
+    """What images are seen by that were taken for those of a pinhole, with what was found since."""
+    focal, bend = (1.0, ()) if lens is None else (lens.focal, (lens.k1, lens.k2, 0.0, 0.0))
+    return Calibration(
+        focal * camera.fx, focal * camera.fy, camera.cx, camera.cy, bend,
+        width=camera.width, height=camera.height,
+    )  # fmt: skip
+
+
+def _read(video: Source, numbers: Collection[int]) -> list[Frame]:
+    """Some frames of a video, in time order."""
+    frames, last = list[Frame](), max(numbers)
+    with closing(iter(video)) as stream:
+        for frame in stream:
+            if frame.index in numbers:
+                frames.append(frame)
+            if frame.index >= last:
+                break
+    return frames
+
+
+def _part_of(report: StageProgress, round: int, rounds: int) -> Callable[[float], None]:
+    return lambda fraction: report(STAGE, (round + fraction) / rounds)
