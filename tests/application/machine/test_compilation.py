@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geogs.application.machine import compilation, rehearsal
-from geogs.application.machine.compilation import OF_MAP, OF_SEARCH, Compilation, compiling
+from geogs.application.machine.compilation import OF_SEARCH, Compilation, compiling
 
 USED = """
 import sys
@@ -15,7 +15,7 @@ from pathlib import Path
 from dataclasses import replace
 from numba.core.dispatcher import Dispatcher
 import geogs
-from geogs.application.machine.compilation import KERNELS, PARTS
+from geogs.application.machine.compilation import KERNELS, ON_GPU, PARTS
 from geogs.application.machine.rehearsal import rehearse
 
 def used():
@@ -23,6 +23,8 @@ def used():
     found = [value for value in named if isinstance(value, Dispatcher)]
     return {(d.py_func.__qualname__, str(s)) for d in found for s in d.signatures}
 
+rehearse("planes")
+assert len({name for name, _ in used()}) == ON_GPU["planes"], used()
 for part in PARTS:
     rehearse(part)
 rehearsed = used()
@@ -43,8 +45,8 @@ def test_a_run_uses_nothing_that_the_rehearsal_did_not_compile(small_room, tmp_p
     assert done.stdout == "set()\n", done.stderr
 
 
-def other(code: str) -> "subprocess.Popen[str]":
-    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+def other(code: str, start=subprocess.Popen) -> "subprocess.Popen[str]":
+    return start([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
 
 
 def test_what_is_not_compiled_yet_is_waited_for_and_said():
@@ -73,12 +75,14 @@ def test_a_part_that_is_needed_later_is_compiled_beside_and_awaited_later():
     assert not kernels.is_working
 
 
-def test_with_a_gpu_nothing_is_compiled_or_waited_for(tmp_path, monkeypatch):
+def test_with_a_gpu_only_what_the_cpu_does_beside_it_is_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
-    with compiling(torch.device("cuda")) as kernels:
-        assert not kernels.is_working
-        for first in (OF_SEARCH, OF_MAP, None):
-            kernels.wait(lambda stage, part: pytest.fail("a GPU has its own"), first)
+    begun = []
+    monkeypatch.setattr(
+        compilation.subprocess, "Popen", lambda command, **_: begun.append(command) or other("")
+    )
+    with compiling(torch.device("cuda")):
+        assert [command[-1] for command in begun] == ["planes"]
 
 
 def test_a_process_that_fails_or_lasts_holds_nobody_up():

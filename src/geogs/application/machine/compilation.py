@@ -22,9 +22,11 @@ from geogs.stopwatch import StageProgress
 
 OF_SEARCH, OF_MAP, KERNELS = 12, 33, 50
 """How many a rehearsal compiles, those counted that are called from Python: first what depths are
-searched by, up to what a map needs, up to a mesh. With a GPU nearly nothing of it is called."""
+searched by, up to what a map needs, up to a mesh."""
 PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
+ON_GPU = {"planes": 4}
+"""Likewise with a GPU, which calls nothing else of it."""
 _POLITELY = 5
 """By which each part is nicer than what goes before it, images first of all."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
@@ -75,17 +77,18 @@ class Compilation:
 
 @contextmanager
 def compiling(device: torch.device) -> Iterator[Compilation]:
-    """Inside, what a command needs on a CPU is compiled beside it, if it is not."""
-    if device.type != "cpu" or is_compiled() or not sys.executable:
+    """Inside, what a command needs of the CPU is compiled beside it, if it is not."""
+    parts = PARTS if device.type == "cpu" else ON_GPU
+    if is_compiled(parts) or not sys.executable:
         yield Compilation()
         return
     none, pipe = subprocess.DEVNULL, subprocess.PIPE
     begun = []
-    for part in PARTS:
+    for part, kernels in parts.items():
         command = [sys.executable, "-m", __name__, part]
         with contextlib.suppress(OSError):  # no memory, no more processes: compiled when it is used
             process = subprocess.Popen(command, stdin=none, stdout=pipe, stderr=none, text=True)
-            begun.append((process, PARTS[part]))
+            begun.append((process, kernels))
     compilation = Compilation(begun)
     try:
         yield compilation
@@ -93,10 +96,10 @@ def compiling(device: torch.device) -> Iterator[Compilation]:
         compilation.stop()
 
 
-def is_compiled() -> bool:
+def is_compiled(parts: Iterable[str] = PARTS) -> bool:
     """Whether the kernels that are there were made by this version for this processor."""
     with contextlib.suppress(OSError):
-        return all(_record(part).read_text() == _made_of() for part in PARTS)
+        return all(_record(part).read_text() == _made_of() for part in parts)
     return False
 
 
@@ -153,8 +156,8 @@ def main(arguments: list[str]) -> None:
     """Compile all, or the parts that are named, with a line for each kernel."""
     parts = arguments or [*PARTS]
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_POLITELY * (1 + [*PARTS].index(parts[0])))
-    if not is_compiled():
+        os.nice(_POLITELY * (1 + [*(ON_GPU | PARTS)].index(parts[0])))
+    if not is_compiled(parts):
         compile_now(parts, lambda name: print(name, flush=True))
 
 

@@ -25,9 +25,12 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """``map`` maps the wall on the CPU, ``mesh`` extracts its mesh; leaves nothing."""
+    """``map`` maps the wall on the CPU, ``planes`` does what of it no GPU does, ``mesh`` extracts
+    its mesh; leaves nothing."""
     if part == "map":
         _map()
+    elif part == "planes":
+        _bare()
     else:
         extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
 
