@@ -77,9 +77,9 @@ def global_bundle(
         images = BentImages.of(store)
         straighten(tracker, lens, images)
         match()
-        # What was found of the readout in images that bend is off by tens of percent.
+        # The readout that was found in images that bend is off by up to a third.
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS)
-        rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, evidence=0.0)
+        rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, again=True)
         if rest is not None:
             images.straighten(both_in_turn(lens, rest))
     for start in range(0, len(free), PRIORS_TOGETHER):

@@ -43,14 +43,15 @@ def correct_lens(
     free_depth: Sequence[int],
     options: BundleOptions,
     ends: bool = False,
-    evidence: float = EVIDENCE,
+    again: bool = False,
 ) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
     What was measured of the frames between the keyframes is corrected, too. The focal length is
-    only where tracking ``ends`` with it: what is matched afterwards would be of another. ``evidence``
-    is the square of the sizes in their deviations from which on they are believed. Not in the world
-    of a saved map, whose keyframes stay as its own adjustment left them.
+    only where tracking ``ends`` with it: what is matched afterwards would be of another. ``again``
+    says that a lens was found and images are straight, so that what matches say then is believed
+    however little it is. Not in the world of a saved map, whose keyframes stay as its own
+    adjustment left them.
     """
     graph, keyframes = tracker.map.graph, tracker.keyframes
     measured = graph.packed
@@ -58,7 +59,7 @@ def correct_lens(
     left = ROUNDS if measured and not tracker.segment.fixed else 0
     while left:
         asked = said_of_lens(tracker, list(free_depth))
-        if asked is None or (said is None and asked.bend.evidence < evidence):
+        if asked is None or (said is None and not again and asked.bend.evidence < EVIDENCE):
             break
         said, left = asked.whole, left - 1
         if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:

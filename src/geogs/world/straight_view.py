@@ -1,4 +1,4 @@
-"""From the pixels that a found lens shows to those of the pinhole that it was taken for, and back."""
+"""Pixels that a found lens shows, and those of the pinhole that it was taken for."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
