@@ -5,8 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
+from geogs.geometry.camera import Camera
 from geogs.tracking.flow.masked import valid_pixels
+from geogs.types import FoundLens
 from geogs.world.keyframes import Keyframe
+from geogs.world.straight_view import StraightView
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,10 +21,21 @@ class SceneMask:
     black_is_masked: bool = False
 
     def of(self, keyframe: Keyframe) -> Bool[np.ndarray, "h w"] | None:
-        """What a keyframe shows of the scene; None where that is all of its image."""
+        """What a keyframe shows of the scene; None where that is all of its image.
+
+        In a straightened image that is none of what the lens did not see.
+        """
+        lens = keyframe.table.lens
+        fixed = self.fixed if lens is None else self._straight(keyframe.table.camera, lens)
         if not self.black_is_masked:
-            return self.fixed
+            return fixed
         valid = valid_pixels(keyframe.image)
-        if self.fixed is not None:
-            valid &= self.fixed
+        if fixed is not None:
+            valid &= fixed
+        return None if valid.all() else valid
+
+    def _straight(self, camera: Camera, lens: FoundLens) -> Bool[np.ndarray, "h w"] | None:
+        """What straight images show; None where that is all."""
+        view = StraightView(camera, lens)
+        valid = view.is_seen if self.fixed is None else view.is_seen & view.nearest(self.fixed)
         return None if valid.all() else valid

@@ -12,10 +12,10 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop import lens_correction
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
+from geogs.loop.straightening import BentImages
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import KeyframeSet
 from geogs.world.segments import TrackState
 from planted_walk import PlantedFlow, true_inverse_depth
 
@@ -39,13 +39,23 @@ class BentFlow(PlantedFlow):
 
     def __init__(self, T: Tensor, bend: tuple[float, float], focal: float = 0.0) -> None:
         """``focal``: by which part of what they are taken for the images' focal length is less."""
-        self.bend = torch.tensor([focal, *bend])
+        self.bend, self.is_straight = torch.tensor([focal, *bend]), False
+        self.left = 0.0, 0.0
+        """What straight images still bend."""
         shown = self._pinhole(GRID.pixels)
         centre, scale = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
         self.rays = torch.cat([(shown - centre) / scale, torch.ones(GRID.size, 1)], 1)
         own = SampleGrid(CAMERA)
         object.__setattr__(own, "rays", self.rays)
         super().__init__(GRID, T, true_inverse_depth(T, own), 0.0)
+
+    def encode(self, image: np.ndarray) -> int:
+        """The number that an image stands for; those that are straight have their full size, and
+        are all that is matched from the first of them on."""
+        if len(image) == CAMERA.height and not self.is_straight:
+            self.is_straight, self.bend = True, torch.tensor([0.0, *self.left])
+            self.rays, self.d = GRID.rays, true_inverse_depth(self.T, GRID)
+        return super().encode(image)
 
     def _pinhole(self, pixels: Tensor) -> Tensor:
         return pixels + torch.einsum("k,k...->...", self.bend, lens_shapes(CAMERA, pixels))
@@ -114,46 +124,65 @@ def test_the_bend_is_told_as_it_is():
     assert (bend.k1, bend.k2) == pytest.approx(BEND, rel=0.1)
 
 
-def test_the_end_of_tracking_straightens_images_once(monkeypatch):
-    tracker, _ = tracker_of(BEND)
+def test_the_end_of_tracking_straightens_images_once():
+    tracker, truth = tracker_of(BEND)
     global_bundle(tracker)
-    assert tracker.keyframes.table.lens is None  # it goes on
-    images = [np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8) for _ in range(COUNT)]
-    for n, image in enumerate(images):
-        image[:] = 5 + np.arange(CAMERA.width, dtype=np.uint8)[None, :, None]
-        tracker.keyframes.table.arrays.put("image", n, image, recent=True)
-    monkeypatch.setattr(BentFlow, "encode", lambda self, image: 0, raising=False)
+    table = tracker.keyframes.table
+    assert table.lens is None  # it goes on
+    to_first_order = error(tracker, truth)
     global_bundle(tracker, ends=True)
-    lens = tracker.keyframes.table.lens
+    lens = table.lens
     assert lens is not None
     assert (lens.k1, lens.k2) == pytest.approx(BEND, rel=0.1)
     assert 0 < lens.deviation_k1 < 0.02
     straight = tracker.keyframes[3].image
-    assert not np.array_equal(straight, images[3])
+    assert straight.shape == (CAMERA.height, CAMERA.width, 3)
+    # Everything is of straight images now.
+    assert error(tracker, truth) < 0.9 * to_first_order
+    wanted = tracker.map.graph.operator.d
+    for keyframe in tracker.keyframes:
+        known = keyframe.has_known_depth
+        factor = (keyframe.inverse_depth / wanted[keyframe.id])[known]
+        assert float((factor / factor.median() - 1).abs().quantile(0.9)) < 0.02
     assert not global_bundle(tracker, ends=True).after
     assert tracker.keyframes[3].image is straight
 
 
+def test_what_straight_images_still_bend_is_part_of_the_lens(monkeypatch):
+    tracker, _ = tracker_of(BEND)
+    tracker.map.graph.operator.left = 0.01, -0.02
+    straightened = []
+    monkeypatch.setattr(
+        BentImages, "straighten", lambda self, lens: straightened.append(lens) or _full(self)
+    )
+    global_bundle(tracker, ends=True)
+    first, last = straightened
+    assert (last.k1 - first.k1, last.k2 - first.k2) == pytest.approx((0.01, -0.02), abs=0.006)
+
+
+def _full(images: BentImages) -> None:
+    """Have images of the size of straight ones."""
+    for id in images.keyframes.ids:
+        image = np.full((CAMERA.height, CAMERA.width, 3), (id, 0, 0), np.uint8)
+        images.keyframes.table.arrays.put("image", id, image, recent=True)
+        images.keyframes.table.arrays.recent("encoded").drop(id)
+
+
 def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatch):
-    monkeypatch.setattr(KeyframeSet, "straighten", lambda self, lens: None)
     tracker, truth = tracker_of(BEND, -0.05)
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", np.inf)
-    global_bundle(tracker, ends=True)
+    global_bundle(tracker)
     bent = error(tracker, truth)
     assert tracker.keyframes.grid.camera == CAMERA
-    monkeypatch.undo()
-    monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 3)
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)  # two dozen keyframes tell little
-    straightened = []
-    monkeypatch.setattr(KeyframeSet, "straighten", lambda self, lens: straightened.append(lens))
     tracker, truth = tracker_of(BEND, -0.05)
     global_bundle(tracker, ends=True)
-    (lens,) = straightened
+    lens = tracker.keyframes.table.lens
+    assert lens is not None
     # Shown at x, the ray is at 1.05 x and what the lens adds, to first order of the matches' own.
     assert lens.focal == pytest.approx(1 / 1.05, abs=0.01)
     assert abs(lens.focal - 1 / 1.05) < 2 * lens.deviation_focal < 0.04
-    assert tracker.keyframes.grid.camera.fx == pytest.approx(CAMERA.fx * lens.focal)
-    assert tracker.keyframes.camera == CAMERA
+    assert tracker.keyframes.grid.camera == tracker.keyframes.camera == CAMERA
     assert error(tracker, truth) < 0.5 * bent
 
 

@@ -107,6 +107,9 @@ class InOrder:
         """Train the map over all keyframes; not in limited time, as there is a map already."""
         if seconds is None and self.mapper.table.mapped and self.mapper.config.final_iterations:
             with self.stopwatch("final mapping"):
+                if self.mapper.keyframes.lens is not None:
+                    ids = list(self.mapper.views)
+                    self.mapper.see_anew({i: self.mask.of(self.mapper.keyframes[i]) for i in ids})
                 self.mapper.refine(progress)
 
     def ask(self, question: Callable[[Mapper], R]) -> R:

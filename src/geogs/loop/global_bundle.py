@@ -1,15 +1,18 @@
 """Bundle adjustment over all keyframes, with flow measured anew from round to round."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from geogs.bundle.protocols import BundleOptions
 from geogs.loop.lens_correction import correct_lens
 from geogs.loop.row_correction import correct_rows
+from geogs.loop.straightening import BentImages, straighten
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 from geogs.world.edges import Pair
+from geogs.world.straight_view import both_in_turn
 
 ROUNDS = 4
 """Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
@@ -51,21 +54,54 @@ def global_bundle(
     graph holds the fresh edges alone: one that goes on tracking needs only those that
     ``FrameGraph.retire`` leaves of them. ``progress`` is called with the fraction done and a
     message. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking and a
-    lens was found, images are straightened by that. A tracker without a map is left alone, and one
-    whose images are straight already.
+    lens was found, everything is straightened by that, matched and adjusted once more, and what
+    matches say of the lens then is taken off them and the images. A tracker without a map is left
+    alone, and one whose images are straight already.
     """
-    config, segment = tracker.config, tracker.segment
-    store, graph, odometry = segment.keyframes, tracker.map.graph, tracker.map.odometry
+    config, segment, store = tracker.config, tracker.segment, tracker.keyframes
     ids = tracker.segment.ids if keyframes is None else list(keyframes)
     before = {k: store[k].T_cw for k in ids}
     if not ids or store.table.lens is not None:
         return PoseCorrection({}, {}, {})
     fixed = set(segment.fixed)
     free = [k for k in ids if k not in fixed]
+    free_poses = free if fixed else ids[1:]
     pairs = global_pairs(tracker, ids)
-    graph.edges.clear()
-    odometry.update_scale_by_all()
-    batch = MATCHED_TOGETHER[store.grid.on_gpu]
+    tracker.map.graph.edges.clear()
+    tracker.map.odometry.update_scale_by_all()
+    match = partial(_match, tracker, pairs, free_poses, free, progress)
+    match()
+    correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
+    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends)
+    if lens is not None and ends:
+        images = BentImages.of(store)
+        straighten(tracker, lens, images)
+        match()
+        # The readout that was found in images that bend is off by up to a third.
+        correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS)
+        rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, again=True)
+        if rest is not None:
+            images.straighten(both_in_turn(lens, rest))
+    for start in range(0, len(free), PRIORS_TOGETHER):
+        tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
+    if progress is not None:
+        progress(1.0, "all keyframes adjusted")
+    after = {k: store[k].T_cw for k in ids}
+    correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
+    store.correct(correction)
+    return correction
+
+
+def _match(
+    tracker: Tracker,
+    pairs: Sequence[Pair],
+    free_pose: Sequence[int],
+    free_depth: Sequence[int],
+    progress: Callable[[float, str], None] | None,
+) -> None:
+    """Measure pairs and adjust everything, from round to round those that have moved."""
+    config, graph, odometry = tracker.config, tracker.map.graph, tracker.map.odometry
+    batch = MATCHED_TOGETHER[tracker.keyframes.grid.on_gpu]
     for n in range(ROUNDS if pairs else 0):
         # Pairs of the same keyframe one after the other: images of old ones are read from a file.
         stale = sorted(graph.stale(pairs, REMEASURE))
@@ -77,22 +113,9 @@ def global_bundle(
             if progress is not None:
                 done = (n + start / len(stale)) / ROUNDS
                 progress(done, "matching all keyframes")
-        graph.adjust(list(graph.edges), free if fixed else ids[1:], free, GLOBAL_OPTIONS)
-        graph.update_dynamic(set(free), config.moving)
+        graph.adjust(list(graph.edges), free_pose, free_depth, GLOBAL_OPTIONS)
+        graph.update_dynamic(set(free_depth), config.moving)
         odometry.update_scale_by_all()
-    free_poses = free if fixed else ids[1:]
-    correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
-    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends)
-    if lens is not None and ends:
-        store.straighten(lens)
-    for start in range(0, len(free), PRIORS_TOGETHER):
-        tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
-    if progress is not None:
-        progress(1.0, "all keyframes adjusted")
-    after = {k: store[k].T_cw for k in ids}
-    correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
-    store.correct(correction)
-    return correction
 
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:

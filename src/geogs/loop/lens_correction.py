@@ -43,29 +43,32 @@ def correct_lens(
     free_depth: Sequence[int],
     options: BundleOptions,
     ends: bool = False,
+    again: bool = False,
 ) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
     What was measured of the frames between the keyframes is corrected, too. The focal length is
-    only where tracking ``ends`` with it: what is matched afterwards would be of another. Not in the
-    world of a saved map, whose keyframes stay as its own adjustment left them.
+    only where tracking ``ends`` with it: what is matched afterwards would be of another. ``again``
+    says that a lens was found and images are straight, so that what matches say then is believed
+    however little it is. Not in the world of a saved map, whose keyframes stay as its own
+    adjustment left them.
     """
     graph, keyframes = tracker.map.graph, tracker.keyframes
     measured = graph.packed
     bend, said, focal, is_asked = LensBend(), None, 0.0, False
     left = ROUNDS if measured and not tracker.segment.fixed else 0
     while left:
-        evidence = said_of_lens(tracker, list(free_depth))
-        if evidence is None or (said is None and evidence.bend.evidence < EVIDENCE):
+        asked = said_of_lens(tracker, list(free_depth))
+        if asked is None or (said is None and not again and asked.bend.evidence < EVIDENCE):
             break
-        said, left = evidence.whole, left - 1
+        said, left = asked.whole, left - 1
         if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:
             is_asked, left = True, ROUNDS
         if is_asked:
             focal += float(said.size[0])
             graph.refocus(math.exp(focal))
         else:
-            said = evidence.bend
+            said = asked.bend
         if bool((said.size.abs() < CONVERGED * said.deviation).all()):
             left = 0
         bend = bend.plus(said.size[-2:])

@@ -123,6 +123,15 @@ class Mapper:
         view = self.views.add(keyframe_id, mask)
         self.depths.engine.observe(view.depth_view)
 
+    def see_anew(self, masks: Mapping[int, Bool[np.ndarray, "h w"] | None]) -> None:
+        """Take the images of all keyframes as they are now, and the masks that they have."""
+        for id, mask in masks.items():
+            if mask is not None:
+                self.views.arrays.put_mask(id, mask)
+        self.views.arrays.forget_images()
+        for view in self._searched():
+            self.depths.engine.observe(view.depth_view)
+
     def take_over(
         self, disks: MapSnapshot, masks: Mapping[int, Bool[np.ndarray, "h w"]], ids: Sequence[int]
     ) -> None:
@@ -220,12 +229,8 @@ class Mapper:
 
     def refine(self, progress: Progress = silent) -> None:
         """Train over all mapped keyframes, which there must be, with the final poses, after
-        searching their depths again, and by images that were straightened meanwhile."""
+        searching their depths again."""
         searched, start = self._searched(), SEARCHED if self.config.final_depth else 0.0
-        if self.keyframes.lens is not None:
-            self.views.arrays.forget_images()
-            for view in searched:
-                self.depths.engine.observe(view.depth_view)
         if self.config.final_depth and searched:
             self.depths.estimate(searched, lambda fraction: progress(SEARCHED * fraction))
             self.check_depths()

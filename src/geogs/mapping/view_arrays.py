@@ -98,6 +98,7 @@ class ViewArrays:
         size = (self.cameras.render.width, self.cameras.render.height)
         ratio = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         self.table.arrays.put("mask", id, ratio > 0.5)
+        self.table.arrays.recent("mask there").drop(id)
 
     def read_ahead(self, ids: Iterable[int]) -> None:
         """Let threads bring some views back that will soon be asked for, and forget the views of

@@ -1,12 +1,10 @@
 """All keyframes of a run, by stable id: what was seen, from where, and how far it is."""
 
 import copy
-import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, cast
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
@@ -15,7 +13,6 @@ from torch import Tensor
 from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import distorted_pixels, lens_maps
 from geogs.geometry.lie import scaled, se3_inverse, sim3_scale
 from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
 from geogs.types import FoundLens, MeasuredPose, PoseCorrection
@@ -175,24 +172,11 @@ class Keyframe:
     def depth_field(
         self,
     ) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
-        """Inverse depth and its ``confident_information`` as images of cells, on the CPU.
-
-        Of the cells of the image as it is now; matches are of cells that bend with the lens.
-        """
-        grid, lens = self.grid, self.table.lens
-        fields = torch.stack([self.inverse_depth, self.confident_information], 1)
-        if lens is not None:
-            fields = grid.sample_field(fields, _seen_cells(grid, lens))
-        depth, information = fields.mT.reshape(2, grid.height, grid.width).cpu().numpy()
+        """Inverse depth and its ``confident_information`` as images of cells, on the CPU."""
+        grid = self.grid
+        fields = torch.stack([self.inverse_depth, self.confident_information])
+        depth, information = fields.reshape(2, grid.height, grid.width).cpu().numpy()
         return depth, information
-
-
-@functools.lru_cache(maxsize=1)
-def _seen_cells(grid: SampleGrid, lens: FoundLens) -> Float32[Tensor, "p 2"]:
-    """Where the cells of a straight image lie in the one that the lens bent."""
-    straight = lens.focal * grid.rays[:, :2].double().cpu().numpy()
-    seen = distorted_pixels(straight, grid.camera, (lens.k1, lens.k2, 0.0, 0.0))
-    return torch.from_numpy(seen).to(grid.rays)
 
 
 @dataclass(eq=False)
@@ -208,12 +192,13 @@ class KeyframeTable:
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     lens: FoundLens | None = None
-    """By which images were straightened after the last adjustment; none where they are as they
-    were tracked."""
+    """By which images and depths were straightened at the end; none where they are as they were
+    tracked."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
     """Of matches and depths, with the camera that saw what they are of."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
-    """The pinhole that the images are of, or will be once they are straight."""
+    """The pinhole that the images are of, or will be once they are straight. That of the grid is
+    another only while the lens is being found."""
     encode: Encode | None = field(init=False, repr=False, metadata=NOT_STORED)
     """The flow operator's; images are encoded again by it when needed."""
     set_of: dict[int, "KeyframeSet"] = field(init=False, repr=False, metadata=NOT_STORED)
@@ -234,8 +219,6 @@ class KeyframeTable:
         """The table with what belongs to the process: where depth is kept, how images are encoded,
         and how many of the large arrays of a name stay in memory."""
         self.grid, self.camera, self.encode, self.set_of = grid, grid.camera, encode, {}
-        if self.lens is not None:
-            self.refocus(self.lens.focal)
         self.arrays.resident = resident
         for keyframe in self.keyframes.values():
             keyframe.table = self
@@ -396,34 +379,6 @@ class KeyframeSet:
             keyframe.T_cw = T.to(keyframe.T_cw)
             keyframe.rescale(1 / correction.scale.get(id, 1.0))
         self._corrections.append(correction)
-
-    def straighten(self, lens: FoundLens) -> None:
-        """Have all images as the table's pinhole sees them, which a lens bent, or another focal
-        length saw (:meth:`KeyframeTable.refocus`); once, and when nothing is tracked on them any
-        more.
-
-        What is beyond the border gets its colour; what was masked out stays black. Poses, and
-        depths as the adjustment has them, stay.
-        """
-        self.table.refocus(lens.focal)
-        camera, arrays = self.table.camera, self.table.arrays
-        maps = lens_maps(camera, self.grid.camera, (lens.k1, lens.k2, 0.0, 0.0), "polynomial")
-        column, row = (
-            np.rint(m).astype(int).clip(0, size - 1)
-            for m, size in zip(maps, (camera.width, camera.height), strict=True)
-        )
-        for keyframe in self:
-            image = keyframe.image
-            straight = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            black = image[..., 0] | image[..., 1] | image[..., 2]  # one after the other: quicker
-            straight[black[row, column] == 0] = 0
-            arrays.put("image", keyframe.id, straight, recent=True)
-            arrays.recent("encoded").drop(keyframe.id)
-            for name in ("prior normal", "sensor depth"):
-                values = arrays.get(name, keyframe.id)
-                if values is not None:
-                    arrays.put(name, keyframe.id, values[row, column])
-        self.table.lens = lens
 
     def take_corrections(self) -> list[PoseCorrection]:
         """Corrections made since the last call, earliest first."""

@@ -72,7 +72,7 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
     """Correct what was found of frames by the errors of their rows and their keyframes'."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
-    for part, ids in _seen_by(frames, keyframes):
+    for part, ids in seen_by_keyframes(frames, keyframes):
         T = errors.poses([r.index for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
         shifts = errors.of_matches(
             [keyframes[k].frame_index for k in ids], [r.index for r, _ in part], T,
@@ -88,7 +88,7 @@ def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None
     """Correct what was found of frames by what the lens bends, beside the errors of their rows."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
-    for part, ids in _seen_by(frames, keyframes):
+    for part, ids in seen_by_keyframes(frames, keyframes):
         seen = torch.stack([pose_of(r, keyframes) for r, _ in part])
         T, depth = seen @ se3_inverse(keyframes.poses(ids)), keyframes.inverse_depths(ids)
         shifts = bend.of_matches(grid.camera, grid.rays[cells], T, depth[:, cells])
@@ -98,7 +98,7 @@ def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None
             observation.shift = shift if rows is None else rows + shift
 
 
-def _seen_by(
+def seen_by_keyframes(
     frames: FrameLog, keyframes: KeyframeSet
 ) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int]]]:
     """What was found of frames in keyframes, and the ids of these; some at a time."""

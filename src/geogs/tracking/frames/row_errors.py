@@ -151,7 +151,7 @@ class RowErrors:
             for numbers in (known, [order[frames[n]] for n in known])
         )
         shown, d = pixels[at], inverse_depth[at]
-        offset, seconds = _seen([f.rows for f in rectified], which, shown)
+        offset, seconds = seen_rows([f.rows for f in rectified], which, shown)
         seconds = self._factor * seconds
         T = torch.stack([f.motions for f in rectified]).to(shown)[which]
         times = torch.stack([f.times for f in rectified]).to(shown)[which]
@@ -222,7 +222,7 @@ def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
     return nodes
 
 
-def _seen(
+def seen_rows(
     rows: Sequence[SeenRows], which: Int[Tensor, "e"], pixels: Float[Tensor, "e p 2"]
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
     """Offsets and seconds at pixels, each in ``which`` of the rows, bilinear between the nodes as

@@ -1,0 +1,162 @@
+"""What was seen through a lens that was found, as a pinhole sees it, once tracking has ended.
+
+Images, depths, and what was found of the frames between keyframes go together, so that everything
+can be matched and adjusted once more. Matches between keyframes do not: they are measured anew.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.bundle.projection import project
+from geogs.geometry.lie import se3_inverse
+from geogs.shutter.rows import CELL
+from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
+from geogs.tracking.frames.pose_filling import seen_by_keyframes
+from geogs.tracking.frames.row_errors import seen_rows
+from geogs.tracking.tracker import Tracker
+from geogs.types import FoundLens, SeenRows
+from geogs.world.archive import Archived
+from geogs.world.edges import pack_matches, unpacked_positions
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import KeyframeSet
+from geogs.world.straight_view import StraightView
+
+FARTHEST = 0.1
+"""Fraction of the long edge; what seems to lie farther off straight has no match."""
+
+
+@dataclass(frozen=True)
+class BentImages:
+    """Images of keyframes as they were tracked, with a prior's normals and a sensor's depths.
+
+    They stay in the file of the table as long as this is kept.
+    """
+
+    keyframes: KeyframeSet
+    pieces: Mapping[str, Mapping[int, Archived]]
+
+    @staticmethod
+    def of(keyframes: KeyframeSet) -> "BentImages":
+        """Those that there are now."""
+        names = "image", "prior normal", "sensor depth"
+        pieces = keyframes.table.arrays.pieces
+        return BentImages(keyframes, {name: dict(pieces.get(name, {})) for name in names})
+
+    def straighten(self, lens: FoundLens) -> None:
+        """Have the keyframes' images as the table's pinhole sees them, always made of those that
+        were tracked; normals and depths go along pixel by pixel."""
+        arrays, view = self.keyframes.table.arrays, StraightView(self.keyframes.camera, lens)
+        for id in self.keyframes.ids:
+            image = view.image(self.pieces["image"][id].load())
+            arrays.put("image", id, image, recent=True)
+            arrays.recent("encoded").drop(id)
+            for name in ("prior normal", "sensor depth"):
+                if id in self.pieces[name]:
+                    arrays.put(name, id, view.nearest(self.pieces[name][id].load()))
+        self.keyframes.table.lens = lens
+
+
+def straighten(tracker: Tracker, lens: FoundLens, images: BentImages) -> None:
+    """Have all that a tracker knows as the pinhole sees it that its images were taken for.
+
+    Its graph has no edges then, as their matches are those of images that bend.
+    """
+    keyframes, graph = tracker.keyframes, tracker.map.graph
+    view = StraightView(keyframes.camera, lens)
+    images.straighten(lens)
+    graph.edges.clear()
+    graph.refocus(1.0)
+    straighten_cells(keyframes, view)
+    straighten_frames(tracker.map.recorder.log, keyframes, view)
+
+
+def straighten_cells(keyframes: KeyframeSet, view: StraightView) -> None:
+    """Have what keyframes know of cells where straight images show it.
+
+    Depths are interpolated; what a sensor or a prior says of them, and what moves, is that of the
+    nearest cell.
+    """
+    grid = keyframes.grid
+    seen = view.bent(grid.pixels)
+    nearest, is_cell = grid.cells_of(seen)
+    for keyframe in keyframes:
+        fields = torch.stack([keyframe.inverse_depth, keyframe.information], 1)
+        depth, information = grid.sample_field(fields, seen).unbind(1)
+        keyframe.inverse_depth, keyframe.information = depth.clone(), information.clone()
+        if keyframe.moving is not None:
+            keyframe.moving = keyframe.moving[nearest] & is_cell
+        if (prior := keyframe.prior) is not None:
+            prior.values, prior.inverse_depth = prior.values[nearest], prior.inverse_depth[nearest]
+            prior.information = torch.where(is_cell, prior.information[nearest], 0.0)
+        if (measured := keyframe.measured) is not None:
+            measured.inverse_depth = measured.inverse_depth[nearest]
+            measured.information = torch.where(is_cell, measured.information[nearest], 0.0)
+
+
+def straighten_frames(log: FrameLog, keyframes: KeyframeSet, view: StraightView) -> None:
+    """Have what was found of the frames between straight keyframes where straight frames show it.
+
+    Frames' images are no longer there. What a cell of a bent keyframe shows lies off it in the
+    straight one; where it was found is straightened, and what lies on the cell is that far from it
+    as the depths of both say at the frame's pose. Rows are those that straight pixels were seen in.
+    """
+    grid = keyframes.grid
+    cells = sparse_cells(grid)
+    shown = view.straight(grid.pixels[cells])
+    is_shown = shown.isfinite().all(-1)
+    shown = torch.where(is_shown[:, None], shown, grid.pixels[cells])
+    camera = grid.camera
+    plane = (shown - shown.new_tensor([camera.cx, camera.cy])) / shown.new_tensor(
+        [camera.fx, camera.fy]
+    )
+    rays = torch.cat([plane, torch.ones_like(plane[:, :1])], 1)
+    for part, ids in seen_by_keyframes(log, keyframes):
+        T = torch.stack([pose_of(r, keyframes) for r, _ in part]) @ se3_inverse(
+            keyframes.poses(ids)
+        )
+        depth = keyframes.inverse_depths(ids)
+        found = view.straight(unpacked_positions(grid, torch.stack([o.position for _, o in part])))
+        of_shown = project(camera, rays, T, grid.sample_field(depth.mT, shown).mT)
+        of_cell = project(camera, grid.rays[cells], T, depth[:, cells])
+        pixels = found + (of_cell.pixels - of_shown.pixels)
+        good = is_shown & of_shown.valid & of_cell.valid & _is_near(pixels, found, camera.long_edge)
+        weight = torch.stack([o.half_weight for _, o in part]).float()
+        weight = torch.where(good[..., None], weight, 0.0)
+        position, half_weight = pack_matches(grid, pixels.nan_to_num(), weight)
+        for n, (_, observation) in enumerate(part):
+            observation.position, observation.half_weight = position[n], half_weight[n]
+            observation.shift = None
+    for index, rows in log.rows.items():
+        log.rows[index] = straight_rows(rows, view)
+
+
+def straight_rows(rows: SeenRows, view: StraightView) -> SeenRows:
+    """Where and when the pixels of a straight image were seen, given that of the bent one."""
+    lines, columns = rows.seconds.shape
+    v, u = torch.meshgrid(_nodes(lines), _nodes(columns), indexing="ij")
+    nodes = torch.stack([u, v], -1).reshape(-1, 2)
+    bent = view.bent(nodes)
+    offset, seconds = (x[0] for x in seen_rows([rows], torch.tensor([0]), bent[None]))
+    straight = view.straight(bent + offset) - nodes
+    offset = torch.where(straight.isfinite(), straight, offset)
+    shape = lines, columns
+    return SeenRows(
+        offset.reshape(*shape, 2).to(rows.offset), seconds.reshape(shape).to(rows.seconds),
+        rows.doubt,
+    )  # fmt: skip
+
+
+def _nodes(count: int) -> Float[Tensor, "n"]:
+    """Pixels of the nodes along one side."""
+    return (torch.arange(count) - 1) * CELL + (CELL - 1) / 2
+
+
+def _is_near(
+    pixels: Float[Tensor, "e p 2"], found: Float[Tensor, "e p 2"], long_edge: float
+) -> Bool[Tensor, "e p"]:
+    """Whether both are known, and not far from each other."""
+    return (pixels - found).norm(dim=-1) < FARTHEST * long_edge

@@ -1,0 +1,108 @@
+"""Pixels that a found lens shows, and those of the pinhole that it was taken for."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.distortion import distorted_pixels, lens_maps, undistorted_rays
+from geogs.types import FoundLens
+
+EXACT = 0.02
+"""Pixels; where the way there and back misses by more, the lens shows nothing of the pinhole's."""
+_RADII = np.linspace(0.0, 1.0, 65)[1:]
+"""Rays, x/z of which two lenses in turn are put into one."""
+
+
+@dataclass(frozen=True)
+class StraightView:
+    """A pinhole, and the lens that saw in its place."""
+
+    camera: Camera
+    """The pinhole."""
+    lens: FoundLens
+
+    @property
+    def seen_by(self) -> Camera:
+        """The lens without its distortion."""
+        focal = self.lens.focal
+        return replace(self.camera, fx=focal * self.camera.fx, fy=focal * self.camera.fy)
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float]:
+        """OpenCV's k1, k2, p1, p2."""
+        return self.lens.k1, self.lens.k2, 0.0, 0.0
+
+    # --- points ----------------------------------------------------------------------------
+
+    def bent(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Where the lens shows what the pinhole shows at some pixels."""
+        camera = self.camera
+        flat = pixels.reshape(-1, 2).double().cpu().numpy()
+        rays = (flat - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        seen = distorted_pixels(rays, self.seen_by, self.distortion)
+        return torch.from_numpy(seen).to(pixels).reshape(pixels.shape)
+
+    def straight(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Where the pinhole shows what the lens shows at some pixels; NaN where it shows nothing,
+        as beyond where a polynomial turns back."""
+        camera = self.camera
+        flat = pixels.reshape(-1, 2).double().cpu().numpy()
+        rays = undistorted_rays(flat, self.seen_by, self.distortion)
+        again = distorted_pixels(rays, self.seen_by, self.distortion)
+        rays[~(np.abs(again - flat).max(1) < EXACT)] = np.nan
+        shown = rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        return torch.from_numpy(shown).to(pixels).reshape(pixels.shape)
+
+    # --- images ----------------------------------------------------------------------------
+
+    def image(self, bent: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """As the pinhole sees it. What is beyond the border gets its colour; what was masked out
+        stays black."""
+        straight = cv2.remap(bent, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        black = bent[..., 0] | bent[..., 1] | bent[..., 2]  # one after the other: quicker
+        straight[self.nearest(black) == 0] = 0
+        return straight
+
+    def nearest(self, bent: Shaped[np.ndarray, "h w *c"]) -> Shaped[np.ndarray, "h w *c"]:
+        """Values of the pixels that the lens saw, the nearest ones beyond its border."""
+        row, column = self._nearest
+        return bent[row, column]
+
+    @cached_property
+    def is_seen(self) -> Bool[np.ndarray, "h w"]:
+        """Which pixels of the pinhole the lens saw."""
+        u, v = self._maps
+        width, height = self.camera.width, self.camera.height
+        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+
+    @cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        return lens_maps(self.camera, self.seen_by, self.distortion, "polynomial")
+
+    @cached_property
+    def _nearest(self) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
+        u, v = (np.rint(m).astype(int) for m in self._maps)
+        return v.clip(0, self.camera.height - 1), u.clip(0, self.camera.width - 1)
+
+
+def both_in_turn(first: FoundLens, then: FoundLens) -> FoundLens:
+    """The lens of images that, straightened by the first, still bend by the other.
+
+    k1 and k2 by least squares over the rays of a wide image. Deviations are those of what was found
+    last, and both of the focal length.
+    """
+    bent = then.focal * _RADII * (1 + then.k1 * _RADII**2 + then.k2 * _RADII**4)
+    seen = first.focal * bent * (1 + first.k1 * bent**2 + first.k2 * bent**4)
+    focal = first.focal * then.focal
+    columns = np.stack([_RADII**3, _RADII**5], 1)
+    (k1, k2), *_ = np.linalg.lstsq(columns, seen / focal - _RADII, rcond=None)
+    deviation = float(np.hypot(first.deviation_focal, then.deviation_focal))
+    return FoundLens(
+        float(k1), float(k2), then.deviation_k1, then.deviation_k2, focal, deviation
+    )  # fmt: skip

@@ -1,0 +1,121 @@
+"""A found lens and its pinhole: images of a room, points there and back, two lenses in turn."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.bundle.uncertainty.lens_error import lens_shapes
+from geogs.geometry.camera import Camera
+from geogs.types import FoundLens
+from geogs.world.straight_view import StraightView, both_in_turn
+from geogs_synth.camera.radial_camera import RadialCamera
+from lit_rooms import lit_room
+
+CAMERA = Camera(fx=110.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
+LENS = FoundLens(0.1, -0.2, 0.001, 0.002)
+PLACES = [(60, 80), (20, 30), (100, 130), (60, 12)]
+"""Row and column."""
+
+
+def seen(row: float, column: float, lens: FoundLens) -> tuple[float, float]:
+    """Column and row where the lens shows what the pinhole does, one by one."""
+    x, y = (column - 79.5) / 110, (row - 59.5) / 110
+    square = x * x + y * y
+    factor = lens.focal * (1 + lens.k1 * square + lens.k2 * square**2)
+    return 79.5 + 110 * x * factor, 59.5 + 110 * y * factor
+
+
+def test_a_room_through_the_lens_becomes_that_of_the_pinhole():
+    room = lit_room(0)
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    T_wc[:3, 3] = 2, 2, 1.4
+    wanted, strong = room.render(CAMERA, T_wc).image, FoundLens(0.15, 0.1, 0.001, 0.001)
+    bent = room.render(RadialCamera(CAMERA, strong.k1, strong.k2), T_wc).image
+    window = cv2.createHanningWindow((48, 40), cv2.CV_32F)
+
+    def grey(image: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(image.astype(np.float32).mean(-1), (0, 0), 1.0)
+
+    def farthest(image: np.ndarray) -> float:
+        """Most pixels by which a part of the image lies off that of the pinhole."""
+        return max(
+            float(np.hypot(*cv2.phaseCorrelate(grey(wanted)[part], grey(image)[part], window)[0]))
+            for part in (np.s_[y : y + 40, x : x + 48] for y in (8, 40, 72) for x in (8, 56, 104))
+        )
+
+    assert farthest(bent) > 1.5
+    assert farthest(StraightView(CAMERA, strong).image(bent)) < 0.25
+
+
+@pytest.mark.parametrize("focal", [1.0, 0.95])
+def test_what_a_pixel_shows_is_taken_where_the_lens_shows_it(focal):
+    lens = replace(LENS, focal=focal)
+    view = StraightView(CAMERA, lens)
+    u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    straight = view.image(np.stack([u, v, 0.5 * (u + v)], -1).astype(np.uint8))
+    nearest = view.nearest(np.stack([u, v], -1))
+    for row, column in PLACES:
+        wanted = seen(row, column, lens)
+        np.testing.assert_allclose(straight[row, column, :2], wanted, atol=1.0)
+        np.testing.assert_allclose(nearest[row, column], wanted, atol=0.51)
+        (bent,) = view.bent(torch.tensor([[float(column), float(row)]])).numpy()
+        np.testing.assert_allclose(bent, wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("focal", [1.0, 0.95])
+def test_points_come_back_from_the_lens(focal):
+    view = StraightView(CAMERA, replace(LENS, focal=focal))
+    pixels = torch.tensor([[c, r] for r, c in PLACES], dtype=torch.float64)[None]
+    np.testing.assert_allclose(view.straight(view.bent(pixels)), pixels, atol=1e-3)
+
+
+def test_where_a_polynomial_turns_back_nothing_is_shown():
+    view = StraightView(CAMERA, FoundLens(0.0, -0.6, 0.001, 0.001))  # farthest at r = 0.76
+    shown = view.straight(torch.tensor([[159.0, 59.5], [100.0, 59.5]], dtype=torch.float64))
+    assert shown.isfinite().all(-1).tolist() == [False, True]
+
+
+def test_black_stays_black():
+    image = np.full((120, 160, 3), 200, np.uint8)
+    image[:, :40] = 0
+    straight = StraightView(CAMERA, LENS).image(image)
+    for row in (10, 60, 110):
+        black = [round(seen(row, column, LENS)[0]) < 40 for column in range(160)]
+        assert (straight[row].max(-1) == 0).tolist() == black
+
+
+def test_what_the_lens_did_not_see_is_known():
+    wide = FoundLens(0.1, 0.1, 0.001, 0.001)  # shows the rim farther out than the pinhole has it
+    is_seen = StraightView(CAMERA, wide).is_seen
+    for row in (0, 30, 60, 119):
+        for column in (0, 3, 80, 150, 159):
+            u, v = seen(row, column, wide)
+            assert is_seen[row, column] == (-0.5 <= u <= 159.5 and -0.5 <= v <= 119.5)
+    assert 0.7 < is_seen.mean() < 0.99
+    assert StraightView(CAMERA, FoundLens(-0.1, 0.0, 0.001, 0.001)).is_seen.all()
+
+
+def test_two_lenses_in_turn_are_one():
+    first, then = FoundLens(0.09, -0.18, 0.01, 0.01, 0.95, 0.03), FoundLens(0.006, -0.01, 0.1, 0.2)
+    both = both_in_turn(first, then)
+    assert (both.deviation_k1, both.deviation_k2, both.deviation_focal) == (0.1, 0.2, 0.03)
+    pixels = torch.tensor([[c, r] for r, c in PLACES], dtype=torch.float64)
+    inner = StraightView(CAMERA, then).bent(pixels)
+    wanted = StraightView(CAMERA, first).bent(inner)
+    np.testing.assert_allclose(StraightView(CAMERA, both).bent(pixels), wanted, atol=0.02)
+    assert float((StraightView(CAMERA, first).bent(pixels) - wanted).abs().max()) > 0.1
+
+
+def test_the_lens_is_that_of_the_matches():
+    """To first order: a pinhole's pixel less the one that is seen, as the adjustment has it."""
+    lens = FoundLens(1e-3, -2e-3, 0.001, 0.001)
+    column, row = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    pixels = torch.from_numpy(np.stack([column, row], -1))
+    shapes = lens_shapes(CAMERA, pixels)
+    wanted = lens.k1 * shapes[1] + lens.k2 * shapes[2]
+    bent = StraightView(CAMERA, lens).bent(pixels)
+    np.testing.assert_allclose(pixels - bent, wanted, atol=1e-4)
