@@ -14,14 +14,17 @@ from geogs.loop import lens_correction
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.straightening import BentImages
 from geogs.tracking.tracker import Tracker, lone_tracker
-from geogs.types import FlowMatch
+from geogs.types import FlowMatch, FoundLens
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
+from geogs.world.straight_view import StraightView
 from planted_walk import PlantedFlow, true_inverse_depth
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
 GRID, COUNT = SampleGrid(CAMERA), 24
 BEND = 0.06, -0.1
+NOISE = np.random.default_rng(0).integers(1, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)
+"""By which images that are straight are told."""
 
 
 def forward(turn: float = 0.08) -> Tensor:
@@ -39,23 +42,27 @@ class BentFlow(PlantedFlow):
 
     def __init__(self, T: Tensor, bend: tuple[float, float], focal: float = 0.0) -> None:
         """``focal``: by which part of what they are taken for the images' focal length is less."""
-        self.bend, self.is_straight = torch.tensor([focal, *bend]), False
-        self.left = 0.0, 0.0
-        """What straight images still bend."""
-        shown = self._pinhole(GRID.pixels)
-        centre, scale = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
-        self.rays = torch.cat([(shown - centre) / scale, torch.ones(GRID.size, 1)], 1)
-        own = SampleGrid(CAMERA)
-        object.__setattr__(own, "rays", self.rays)
-        super().__init__(GRID, T, true_inverse_depth(T, own), 0.0)
+        super().__init__(GRID, T, torch.empty(0), 0.0)
+        self.is_straight, self.left = False, (0.0, 0.0)
+        """``left``: what straight images still bend."""
+        self._see(torch.tensor([focal, *bend]))
 
     def encode(self, image: np.ndarray) -> int:
-        """The number that an image stands for; those that are straight have their full size, and
-        are all that is matched from the first of them on."""
-        if len(image) == CAMERA.height and not self.is_straight:
-            self.is_straight, self.bend = True, torch.tensor([0.0, *self.left])
-            self.rays, self.d = GRID.rays, true_inverse_depth(self.T, GRID)
+        """The number that an image stands for; from the first on that is straightened, all are."""
+        if not self.is_straight and not np.array_equal(image[..., 2], NOISE):
+            self.is_straight = True
+            self._see(torch.tensor([0.0, *self.left]))
         return super().encode(image)
+
+    def _see(self, bend: Tensor) -> None:
+        """What the cells show, and how deep that is."""
+        self.bend = bend
+        centre, scale = torch.tensor([CAMERA.cx, CAMERA.cy]), torch.tensor([CAMERA.fx, CAMERA.fy])
+        shown = (self._pinhole(GRID.pixels) - centre) / scale
+        own = SampleGrid(CAMERA)
+        self.rays = torch.cat([shown, torch.ones(GRID.size, 1)], 1)
+        object.__setattr__(own, "rays", self.rays)
+        self.d = true_inverse_depth(self.T, own)
 
     def _pinhole(self, pixels: Tensor) -> Tensor:
         return pixels + torch.einsum("k,k...->...", self.bend, lens_shapes(CAMERA, pixels))
@@ -74,13 +81,16 @@ class BentFlow(PlantedFlow):
         return FlowMatch(pixels, weight)
 
 
+def image_of(number: int) -> np.ndarray:
+    return np.dstack([np.full_like(NOISE, number), np.zeros_like(NOISE), NOISE])
+
+
 def tracker_of(bend: tuple[float, float], focal: float = 0.0) -> tuple[Tracker, Tensor]:
     T = forward(0.3 if focal else 0.08)  # what tells a focal length is rotation
     flow = BentFlow(T, bend, focal)
     tracker = lone_tracker(CAMERA, operator=flow)
     for n in range(COUNT):
-        image = np.full((4, 4, 3), (n, 0, 0), np.uint8)
-        state = tracker.keyframes.add(n, n / 10, image, n, T[n].clone())
+        state = tracker.keyframes.add(n, n / 10, image_of(n), n, T[n].clone())
         state.inverse_depth, state.information = flow.d[n].clone(), torch.full_like(flow.d[n], 1e4)
         tracker.map.recorder.add_keyframe(state)
     tracker.segment.status.state = TrackState.TRACKING
@@ -136,7 +146,7 @@ def test_the_end_of_tracking_straightens_images_once():
     assert (lens.k1, lens.k2) == pytest.approx(BEND, rel=0.1)
     assert 0 < lens.deviation_k1 < 0.02
     straight = tracker.keyframes[3].image
-    assert straight.shape == (CAMERA.height, CAMERA.width, 3)
+    assert np.array_equal(straight, StraightView(CAMERA, lens).image(image_of(3)))
     # Everything is of straight images now.
     assert error(tracker, truth) < 0.9 * to_first_order
     wanted = tracker.map.graph.operator.d
@@ -151,21 +161,17 @@ def test_the_end_of_tracking_straightens_images_once():
 def test_what_straight_images_still_bend_is_part_of_the_lens(monkeypatch):
     tracker, _ = tracker_of(BEND)
     tracker.map.graph.operator.left = 0.01, -0.02
-    straightened = []
-    monkeypatch.setattr(
-        BentImages, "straighten", lambda self, lens: straightened.append(lens) or _full(self)
-    )
+    straightened, straighten = [], BentImages.straighten
+
+    def noted(images: BentImages, lens: FoundLens) -> None:
+        straightened.append(lens)
+        straighten(images, lens)
+
+    monkeypatch.setattr(BentImages, "straighten", noted)
     global_bundle(tracker, ends=True)
     first, last = straightened
     assert (last.k1 - first.k1, last.k2 - first.k2) == pytest.approx((0.01, -0.02), abs=0.006)
-
-
-def _full(images: BentImages) -> None:
-    """Have images of the size of straight ones."""
-    for id in images.keyframes.ids:
-        image = np.full((CAMERA.height, CAMERA.width, 3), (id, 0, 0), np.uint8)
-        images.keyframes.table.arrays.put("image", id, image, recent=True)
-        images.keyframes.table.arrays.recent("encoded").drop(id)
+    assert tracker.keyframes.table.lens == last
 
 
 def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatch):

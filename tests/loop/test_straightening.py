@@ -67,7 +67,7 @@ def test_cells_are_those_of_the_straight_image():
     inner = is_cell & (VIEW.bent(GRID.pixels) > 4).all(-1)
     inner &= (VIEW.bent(GRID.pixels) < torch.tensor([155.0, 115.0])).all(-1)
     wanted = inverse_depth(GRID.pixels)
-    np.testing.assert_allclose(keyframe.inverse_depth[inner], wanted[inner], rtol=2e-3)
+    np.testing.assert_allclose(keyframe.inverse_depth[inner], wanted[inner], rtol=4e-3)
     assert torch.equal(keyframe.moving[is_cell], nearest[is_cell] % 2 == 0)
     for found in (keyframe.measured.inverse_depth, keyframe.prior.inverse_depth):
         assert torch.equal(found[is_cell], nearest[is_cell].float())
@@ -89,7 +89,10 @@ def test_what_was_found_of_frames_is_as_if_the_pinhole_had_seen_both():
     assert int(kept.sum()) > 0.95 * int(inside.sum()) > 20
     wanted = carried(GRID.pixels[cells], T.float())
     off = (unpacked_positions(GRID, found.position) - wanted)[kept]
-    assert float(off.norm(dim=-1).max()) < 0.05
+    shown = VIEW.straight(GRID.pixels[cells])[kept]
+    is_inner = ((shown >= 4) & (shown <= torch.tensor([156.0, 116.0]))).all(-1)
+    assert float(off[is_inner].norm(dim=-1).max()) < 0.05
+    assert float(off.norm(dim=-1).max()) < 0.4  # depths are repeated beyond the outer cells
     assert float((bent - wanted)[kept].norm(dim=-1).max()) > 1.0
 
 
@@ -99,7 +102,7 @@ def test_rows_are_those_that_straight_pixels_were_seen_in():
         *((torch.arange(n) - 1) * CELL + (CELL - 1) / 2 for n in count), indexing="ij"
     )
     offset = torch.stack([1.0 + 0.01 * u, -2.0 + 0.02 * v], -1)
-    rows = SeenRows(offset, 1e-3 * v, 0.1)
+    rows = SeenRows(offset.half(), (1e-3 * v).half(), 0.1)
     straight = straight_rows(rows, VIEW)
     assert straight.doubt == rows.doubt
     for row, column in [(3, 4), (8, 10), (12, 17)]:
@@ -107,8 +110,10 @@ def test_rows_are_those_that_straight_pixels_were_seen_in():
         bent = VIEW.bent(node)
         moved = torch.stack([1.0 + 0.01 * bent[:, 0], -2.0 + 0.02 * bent[:, 1]], -1)
         wanted = (VIEW.straight(bent + moved) - node)[0]
-        np.testing.assert_allclose(straight.offset[row, column], wanted, atol=1e-3)
-        assert float(straight.seconds[row, column]) == pytest.approx(1e-3 * float(bent[0, 1]))
+        np.testing.assert_allclose(straight.offset[row, column], wanted, atol=4e-3)
+        assert float(straight.seconds[row, column]) == pytest.approx(
+            1e-3 * float(bent[0, 1]), rel=2e-3
+        )
 
 
 def test_images_are_always_made_of_those_that_were_tracked():

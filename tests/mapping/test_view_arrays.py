@@ -112,3 +112,17 @@ def test_few_depths_stay_on_a_gpu_beside_their_file(monkeypatch):
     rows[1].depth = replace(rows[1].depth, typical=5.0)  # written anew meanwhile
     arrays.depth(1)
     assert read == [0, 2, 1]
+
+
+def test_a_mask_takes_the_place_of_the_one_before():
+    image = np.zeros((64, 80, 3), np.uint8)
+    keyframe = segment_of([Sample(0, image, torch.eye(4, dtype=torch.float64))], CAMERA)[0]
+    config = replace(Config().mapping, render_long_edge=40)
+    pool = views_of(keyframe.table, MapCameras.of(CAMERA, config), config.loss)
+    mask = np.ones((64, 80), bool)
+    mask[:, :20] = False
+    pool.add(0, mask)
+    assert pool[0].mask is not None and int(pool[0].mask.sum()) == 32 * 30
+    mask[:, 60:] = False
+    pool.arrays.put_mask(0, mask)
+    assert pool[0].mask is not None and int(pool[0].mask.sum()) == 32 * 20

@@ -10,7 +10,7 @@ import torch
 from geogs.bundle.uncertainty.lens_error import lens_shapes
 from geogs.geometry.camera import Camera
 from geogs.types import FoundLens
-from geogs.world.straight_view import StraightView, both_in_turn
+from geogs.world.straight_view import StraightView
 from geogs_synth.camera.radial_camera import RadialCamera
 from lit_rooms import lit_room
 
@@ -100,8 +100,8 @@ def test_what_the_lens_did_not_see_is_known():
 
 
 def test_two_lenses_in_turn_are_one():
-    first, then = FoundLens(0.09, -0.18, 0.01, 0.01, 0.95, 0.03), FoundLens(0.006, -0.01, 0.1, 0.2)
-    both = both_in_turn(first, then)
+    first, then = FoundLens(0.09, -0.18, 0.01, 0.01, 0.95, 0.03), FoundLens(0.03, -0.04, 0.1, 0.2)
+    both = StraightView(CAMERA, first).followed_by(then)
     assert (both.deviation_k1, both.deviation_k2, both.deviation_focal) == (0.1, 0.2, 0.03)
     pixels = torch.tensor([[c, r] for r, c in PLACES], dtype=torch.float64)
     inner = StraightView(CAMERA, then).bent(pixels)

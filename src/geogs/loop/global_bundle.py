@@ -12,7 +12,7 @@ from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 from geogs.world.edges import Pair
-from geogs.world.straight_view import both_in_turn
+from geogs.world.straight_view import StraightView
 
 ROUNDS = 4
 """Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
@@ -81,7 +81,7 @@ def global_bundle(
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS)
         rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, again=True)
         if rest is not None:
-            images.straighten(both_in_turn(lens, rest))
+            images.straighten(StraightView(store.camera, lens).followed_by(rest))
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:

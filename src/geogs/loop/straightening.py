@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
@@ -123,7 +123,8 @@ def straighten_frames(log: FrameLog, keyframes: KeyframeSet, view: StraightView)
         of_shown = project(camera, rays, T, grid.sample_field(depth.mT, shown).mT)
         of_cell = project(camera, grid.rays[cells], T, depth[:, cells])
         pixels = found + (of_cell.pixels - of_shown.pixels)
-        good = is_shown & of_shown.valid & of_cell.valid & _is_near(pixels, found, camera.long_edge)
+        is_near = (pixels - found).norm(dim=-1) < FARTHEST * camera.long_edge
+        good = is_shown & of_shown.valid & of_cell.valid & is_near
         weight = torch.stack([o.half_weight for _, o in part]).float()
         weight = torch.where(good[..., None], weight, 0.0)
         position, half_weight = pack_matches(grid, pixels.nan_to_num(), weight)
@@ -151,12 +152,5 @@ def straight_rows(rows: SeenRows, view: StraightView) -> SeenRows:
 
 
 def _nodes(count: int) -> Float[Tensor, "n"]:
-    """Pixels of the nodes along one side."""
+    """Pixels of so many nodes along one side."""
     return (torch.arange(count) - 1) * CELL + (CELL - 1) / 2
-
-
-def _is_near(
-    pixels: Float[Tensor, "e p 2"], found: Float[Tensor, "e p 2"], long_edge: float
-) -> Bool[Tensor, "e p"]:
-    """Whether both are known, and not far from each other."""
-    return (pixels - found).norm(dim=-1) < FARTHEST * long_edge

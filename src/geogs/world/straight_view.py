@@ -15,8 +15,8 @@ from geogs.types import FoundLens
 
 EXACT = 0.02
 """Pixels; where the way there and back misses by more, the lens shows nothing of the pinhole's."""
-_RADII = np.linspace(0.0, 1.0, 65)[1:]
-"""Rays, x/z of which two lenses in turn are put into one."""
+RADII = 64
+"""Rays by which two lenses in turn become one."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,24 @@ class StraightView:
     def distortion(self) -> tuple[float, float, float, float]:
         """OpenCV's k1, k2, p1, p2."""
         return self.lens.k1, self.lens.k2, 0.0, 0.0
+
+    def followed_by(self, other: FoundLens) -> FoundLens:
+        """The lens of images that still bend by the other one when they are straightened by this.
+
+        k1 and k2 by least squares over the image. Deviations are those of the other, which was
+        found last, and of both focal lengths.
+        """
+        camera, lens = self.camera, self.lens
+        x = max(camera.cx, camera.width - 1 - camera.cx) / camera.fx
+        y = max(camera.cy, camera.height - 1 - camera.cy) / camera.fy
+        r = np.linspace(0.0, np.hypot(x, y), RADII)
+        bent = other.focal * r * (1 + other.k1 * r**2 + other.k2 * r**4)
+        seen = lens.focal * bent * (1 + lens.k1 * bent**2 + lens.k2 * bent**4)
+        focal = lens.focal * other.focal
+        (k1, k2), *_ = np.linalg.lstsq(np.stack([r**3, r**5], 1), seen / focal - r, rcond=None)
+        deviation = float(np.hypot(lens.deviation_focal, other.deviation_focal))
+        own = other.deviation_k1, other.deviation_k2
+        return FoundLens(float(k1), float(k2), *own, focal, deviation)
 
     # --- points ----------------------------------------------------------------------------
 
@@ -89,20 +107,3 @@ class StraightView:
     def _nearest(self) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
         u, v = (np.rint(m).astype(int) for m in self._maps)
         return v.clip(0, self.camera.height - 1), u.clip(0, self.camera.width - 1)
-
-
-def both_in_turn(first: FoundLens, then: FoundLens) -> FoundLens:
-    """The lens of images that, straightened by the first, still bend by the other.
-
-    k1 and k2 by least squares over the rays of a wide image. Deviations are those of what was found
-    last, and both of the focal length.
-    """
-    bent = then.focal * _RADII * (1 + then.k1 * _RADII**2 + then.k2 * _RADII**4)
-    seen = first.focal * bent * (1 + first.k1 * bent**2 + first.k2 * bent**4)
-    focal = first.focal * then.focal
-    columns = np.stack([_RADII**3, _RADII**5], 1)
-    (k1, k2), *_ = np.linalg.lstsq(columns, seen / focal - _RADII, rcond=None)
-    deviation = float(np.hypot(first.deviation_focal, then.deviation_focal))
-    return FoundLens(
-        float(k1), float(k2), then.deviation_k1, then.deviation_k2, focal, deviation
-    )  # fmt: skip
