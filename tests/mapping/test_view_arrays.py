@@ -122,7 +122,9 @@ def test_a_mask_takes_the_place_of_the_one_before():
     mask = np.ones((64, 80), bool)
     mask[:, :20] = False
     pool.add(0, mask)
-    assert pool[0].mask is not None and int(pool[0].mask.sum()) == 32 * 30
+    assert pool[0].mask is not None
+    assert int(pool[0].mask.sum()) == 32 * 30
     mask[:, 60:] = False
     pool.arrays.put_mask(0, mask)
-    assert pool[0].mask is not None and int(pool[0].mask.sum()) == 32 * 20
+    assert pool[0].mask is not None
+    assert int(pool[0].mask.sum()) == 32 * 20
