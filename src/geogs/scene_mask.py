@@ -1,5 +1,6 @@
 """Which pixels may show the scene."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,12 @@ from geogs.tracking.flow.masked import valid_pixels
 from geogs.types import FoundLens
 from geogs.world.keyframes import Keyframe
 from geogs.world.straight_view import StraightView
+
+
+@functools.lru_cache(maxsize=1)
+def _view(camera: Camera, lens: FoundLens) -> StraightView:
+    """The same for all keyframes, with what it has computed."""
+    return StraightView(camera, lens)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +43,6 @@ class SceneMask:
 
     def _straight(self, camera: Camera, lens: FoundLens) -> Bool[np.ndarray, "h w"] | None:
         """What straight images show; None where that is all."""
-        view = StraightView(camera, lens)
+        view = _view(camera, lens)
         valid = view.is_seen if self.fixed is None else view.is_seen & view.nearest(self.fixed)
         return None if valid.all() else valid

@@ -44,9 +44,7 @@ def pose_deviations(
         for number in model.cameras:
             config.set_constant_cam_intrinsics(number)
     config.fix_gauge(colmap.BundleAdjustmentGauge.THREE_POINTS)
-    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
-    wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
-    covariance = colmap.estimate_ba_covariance(wanted, model, adjuster)
+    covariance = _covariance(model, config, options)
     joint = None if covariance is None else _joint(covariance, [i.image_id for i in images])
     if joint is None:
         unknown = np.full(len(images), np.inf)
@@ -79,9 +77,7 @@ def deviations_beside(
     for number in model.cameras:
         config.set_constant_cam_intrinsics(number)
     options = colmap.BundleAdjustmentOptions(print_summary=False)
-    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
-    wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
-    covariance = colmap.estimate_ba_covariance(wanted, model, adjuster)
+    covariance = _covariance(model, config, options)
     if covariance is None:
         return unknown, unknown.copy()
     deviation, rotation = unknown, unknown.copy()
@@ -127,6 +123,14 @@ def _left(
     free = J - gauge @ (np.linalg.pinv(gauge) @ J)
     variance = np.einsum("ij,jk,ik->i", free, joint, free, optimize=True)
     return np.sqrt(variance.reshape(-1, 3).sum(1).clip(0))
+
+
+def _covariance(model: Any, config: Any, options: Any) -> Any | None:
+    """pycolmap's covariance of the poses of an adjustment; none where it cannot be computed."""
+    colmap = load_colmap()
+    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
+    wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
+    return colmap.estimate_ba_covariance(wanted, model, adjuster)
 
 
 def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"] | None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.geometry.epipolar import epipolar_distance, homogeneous
 from geogs_photos.pycolmap_library import load_colmap
 
 MAX_ERROR = 4.0
@@ -28,14 +29,12 @@ def agreement(model: Any, database: Path, pictures: Collection[int]) -> dict[int
             if one not in rays or other not in rays:
                 continue
             matches = opened.read_two_view_geometry(one, other).inlier_matches
-            T = (model.images[n].cam_from_world() for n in (one, other))
-            first, second = (pose.matrix() for pose in T)
-            R = second[:, :3] @ first[:, :3].T
-            t = second[:, 3] - R @ first[:, 3]
+            first, second = (_pose(model, n) for n in (one, other))
             focal = model.cameras[model.images[one].camera_id].mean_focal_length()
             off = focal * epipolar_distance(
-                rays[one][matches[:, 0]], rays[other][matches[:, 1]], R, t
-            )
+                second @ np.linalg.inv(first), np.eye(3),
+                rays[one][matches[:, 0]], rays[other][matches[:, 1]],
+            )  # fmt: skip
             for n in (one, other):
                 kept[n] += len(matches)
                 agreeing[n] += int((off <= MAX_ERROR).sum())
@@ -44,30 +43,15 @@ def agreement(model: Any, database: Path, pictures: Collection[int]) -> dict[int
     return {n: agreeing[n] / max(kept[n], 1) for n in pictures}
 
 
-def epipolar_distance(
-    first: Float64[np.ndarray, "n 2"],
-    second: Float64[np.ndarray, "n 2"],
-    R: Float64[np.ndarray, "3 3"],
-    t: Float64[np.ndarray, "3"],
-) -> Float64[np.ndarray, "n"]:
-    """Sampson's distance of matches from the epipolar geometry of two cameras, focal length 1.
-
-    Where the cameras are in one place, the distance of the second point from where the rotation
-    takes the first.
-    """
-    x, y = (np.column_stack([p, np.ones(len(p))]) for p in (first, second))
-    turned = x @ R.T
-    if np.linalg.norm(t) < 1e-12:
-        return np.linalg.norm(second - turned[:, :2] / turned[:, 2:], axis=1)
-    E = np.cross(np.eye(3), t) @ R
-    line, back = x @ E.T, y @ E
-    length = np.hypot(np.linalg.norm(line[:, :2], axis=1), np.linalg.norm(back[:, :2], axis=1))
-    return np.abs((y * line).sum(1)) / np.maximum(length, 1e-12 * np.linalg.norm(t))
+def _pose(model: Any, number: int) -> Float64[np.ndarray, "4 4"]:
+    """World to camera of a picture."""
+    T = np.eye(4)
+    T[:3] = model.images[number].cam_from_world().matrix()
+    return T
 
 
-def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 2"]:
+def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:
     """Keypoints of a picture through the camera's lens, at depth 1."""
     camera = model.cameras[model.images[number].camera_id]
     pixels = np.asarray(opened.read_keypoints(number), np.float64)[:, :2]
-    rays = camera.cam_from_img(pixels)
-    return np.asarray(rays, np.float64)[:, :2]
+    return homogeneous(np.asarray(camera.cam_from_img(pixels), np.float64)[:, :2])

@@ -1,5 +1,6 @@
 """Poses, cameras and points of matched photographs, by pycolmap's incremental mapping."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -43,22 +44,10 @@ def put_together(
         threads: to compute with.
         progress: called with the finished part; what it raises ends the work.
     """
-    colmap = load_colmap()
-    options = colmap.IncrementalPipelineOptions(
-        num_threads=threads, random_seed=seed, min_model_size=LEAST_IMAGES, extract_colors=False
-    )
-    options.constant_cameras = set(known)
-    options.mapper.random_seed = options.triangulation.random_seed = seed
-    placed = 2
-
-    def after_image() -> None:
-        nonlocal placed
-        placed += 1
-        progress(min(placed / count, 1.0))
-
+    options = _options(known, seed, threads, min_model_size=LEAST_IMAGES)
     work.mkdir(parents=True, exist_ok=True)
-    models = colmap.incremental_mapping(
-        database, work, work, options=options, next_image_callback=after_image
+    models = load_colmap().incremental_mapping(
+        database, work, work, options=options, next_image_callback=_counting(2, count, progress)
     )
     return largest_first(models)
 
@@ -83,12 +72,7 @@ def continued(
         progress: called with the finished part; what it raises ends the work.
     """
     colmap = load_colmap()
-    options = colmap.IncrementalPipelineOptions(
-        num_threads=threads, random_seed=seed, extract_colors=False, multiple_models=False,
-        fix_existing_frames=True,
-    )  # fmt: skip
-    options.constant_cameras = {1}
-    options.mapper.random_seed = options.triangulation.random_seed = seed
+    options = _options([1], seed, threads, multiple_models=False, fix_existing_frames=True)
     options.mapper.abs_pose_min_num_inliers = LEAST_POINTS
     begun, went_on = work / "begun", work / "on"
     model, count = _of_poses(colmap, database, known)
@@ -98,18 +82,27 @@ def continued(
     if not model.num_points3D():
         return None
     model.write(begun)
-    placed = len(known)
-
-    def after_image() -> None:
-        nonlocal placed
-        placed += 1
-        progress(min(placed / count, 1.0))
-
     models = colmap.incremental_mapping(
         database, work, went_on, options=options, input_path=begun,
-        next_image_callback=after_image,
+        next_image_callback=_counting(len(known), count, progress),
     )  # fmt: skip
     return next(iter(largest_first(models)), None)
+
+
+def _options(known: Sequence[int], seed: int, threads: int, **more: Any) -> Any:
+    """pycolmap's, with the cameras that stay as they are."""
+    options = load_colmap().IncrementalPipelineOptions(
+        num_threads=threads, random_seed=seed, extract_colors=False, **more
+    )
+    options.constant_cameras = set(known)
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    return options
+
+
+def _counting(placed: int, count: int, progress: Callable[[float], None]) -> Callable[[], None]:
+    """What is to be called after each picture, so many of ``count`` being placed before."""
+    numbers = itertools.count(placed + 1)
+    return lambda: progress(min(next(numbers) / count, 1.0))
 
 
 def _of_poses(

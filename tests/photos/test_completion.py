@@ -2,42 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from geogs.application.structure_from_motion.completion import about, as_seen
 from geogs.types import FoundFrames, FoundLens, Frame, Uncertainty
 from geogs_photos.completion import place_lost
-from geogs_photos.epipolar_agreement import epipolar_distance
 from geogs_synth.motion.handheld import handheld_trajectory
 from lit_rooms import lit_room
 from posed_layouts import render_room
-
-
-def test_the_distance_of_matches_is_to_first_order_how_far_they_move():
-    """Against the least move of both points of a match, by Newton's method on the constraint."""
-    random = np.random.default_rng(0)
-    R, t = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), np.array([0.3, 0.1, -0.2])
-    points = random.uniform([-1, -1, 2], [1, 1, 5], (20, 3))
-    moved = points @ R.T + t
-    first = points[:, :2] / points[:, 2:]
-    second = moved[:, :2] / moved[:, 2:] + random.normal(scale=1e-3, size=(20, 2))
-    E = np.cross(np.eye(3), t).T @ R
-    for x, y, found in zip(first, second, epipolar_distance(first, second, R, t), strict=True):
-        four = np.concatenate([x, y])
-        for _ in range(20):
-            a, b = np.append(four[:2], 1), np.append(four[2:], 1)
-            slope = np.concatenate([(E.T @ b)[:2], (E @ a)[:2]])
-            off = b @ E @ a + slope @ (np.concatenate([x, y]) - four)
-            four = np.concatenate([x, y]) - off * slope / (slope @ slope)
-        assert found == pytest.approx(np.linalg.norm(four - np.concatenate([x, y])), rel=0.02)
-
-
-def test_cameras_in_one_place_are_told_by_the_rotation():
-    R = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
-    ray = R @ np.array([0.1, 0.2, 1.0])
-    second = ray[:2] / ray[2] + np.array([0.01, 0.0])
-    off = epipolar_distance(np.array([[0.1, 0.2]]), second[None], R, np.zeros(3))
-    assert off == pytest.approx(0.01)
 
 
 def test_the_nearest_known_frames_on_both_sides():

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -80,7 +81,7 @@ class TrackedVideo:
             self._write_preview(driver)
         outcome = _finished(driver, outcome, lambda: self._refine(driver))
         if was_cut or outcome is Outcome.STOPPED:
-            briefly = lambda: slam.refine(driver.progress.stage, BRIEFLY)  # noqa: E731
+            briefly = partial(slam.refine, driver.progress.stage, BRIEFLY)
             _finished(driver, Outcome.FINISHED, briefly)
         scale = scale_source(self.metadata.settings.scale_from)
         make_metric(slam, self.source, scale, driver.progress)

@@ -6,6 +6,7 @@ can be matched and adjusted once more. Matches between keyframes do not: they ar
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
+from geogs.threads import thread_map
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.pose_filling import seen_by_keyframes
 from geogs.tracking.frames.row_errors import seen_rows
@@ -131,8 +133,8 @@ def straighten_frames(log: FrameLog, keyframes: KeyframeSet, view: StraightView)
         for n, (_, observation) in enumerate(part):
             observation.position, observation.half_weight = position[n], half_weight[n]
             observation.shift = None
-    for index, rows in log.rows.items():
-        log.rows[index] = straight_rows(rows, view)
+    rows = thread_map(partial(straight_rows, view=view), list(log.rows.values()))
+    log.rows.update(zip(log.rows, rows, strict=True))
 
 
 def straight_rows(rows: SeenRows, view: StraightView) -> SeenRows:

@@ -111,12 +111,14 @@ class TrackedOrPlaced(Work):
         """Place the lost frames that are found about the keyframes; whether there are any."""
         slam, source, stop = self._tracked.scene, self._tracked.source, driver.stop
         may = self._tracked.metadata.settings.fallback and not source.is_live and has_pycolmap()
+        if not may or stop.requested:
+            return False
         keyframes = [slam.world.keyframes[i].frame_index for i in slam.segments.main.segment.free]
         lost = LostFrames(
             source, as_seen(slam.camera, slam.lens), result.trajectory, keyframes,
             MAX_POSITION_DEVIATION * extent_of(result.keyframes), slam.config.seed,
         )  # fmt: skip
-        if not may or not lost.numbers or stop.requested:
+        if not lost.numbers:
             return False
         found = FoundFrames.none()
 

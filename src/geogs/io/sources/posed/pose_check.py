@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.epipolar import epipolar_distance, homogeneous
 from geogs.io.sources.posed.conventions import Poses, conventions_for
 from geogs.io.sources.posed.matching import MatchedPair, Matcher
 from geogs.io.sources.posed.posed_source import PosedSource
@@ -107,38 +108,11 @@ def fit_of(T_cw: Poses, pairs: list[MatchedPair], camera: Camera) -> Fit:
     errors, in_front = [], []
     for pair in pairs:
         T = T_cw[pair.second] @ np.linalg.inv(T_cw[pair.first])
-        one, two = (_homogeneous(p) for p in (pair.pixels_first, pair.pixels_second))
-        errors.append(np.median(_sampson(T, K_inverse, one, two)))
+        one, two = (homogeneous(p) for p in (pair.pixels_first, pair.pixels_second))
+        errors.append(np.median(epipolar_distance(T, K_inverse, one, two)))
         in_front.append(_part_in_front(T, one @ K_inverse.T, two @ K_inverse.T))
     long_edge = max(camera.width, camera.height)
     return Fit(float(np.median(errors)) / long_edge, float(np.median(in_front)))
-
-
-def _homogeneous(pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
-    return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-
-
-def _sampson(
-    T: Float64[np.ndarray, "4 4"],
-    K_inverse: Float64[np.ndarray, "3 3"],
-    one: Float64[np.ndarray, "n 3"],
-    two: Float64[np.ndarray, "n 3"],
-) -> Float64[np.ndarray, "n"]:
-    """First-order distance in pixels to x2^T F x1 = 0 (Hartley and Zisserman, eq. 11.9).
-
-    Without any translation between the images: the distance from where the rotation takes x1.
-    """
-    t = T[:3, 3]
-    length = np.linalg.norm(t)
-    if length < 1e-12:
-        moved = one @ (np.linalg.inv(K_inverse) @ T[:3, :3] @ K_inverse).T
-        return np.linalg.norm(moved[:, :2] / moved[:, 2:] - two[:, :2], axis=1)
-    cross = np.cross(np.eye(3), t / length)
-    F = K_inverse.T @ -cross @ T[:3, :3] @ K_inverse
-    line_two, line_one = one @ F.T, two @ F
-    value = (two * line_two).sum(axis=1)
-    slope = (line_two[:, :2] ** 2).sum(axis=1) + (line_one[:, :2] ** 2).sum(axis=1)
-    return np.abs(value) / np.sqrt(slope.clip(1e-24))
 
 
 def _part_in_front(

@@ -1,0 +1,38 @@
+"""How far matches lie from the epipolar geometry of two views whose poses are known."""
+
+import numpy as np
+from jaxtyping import Float64
+
+
+def epipolar_distance(
+    T: Float64[np.ndarray, "4 4"],
+    K_inverse: Float64[np.ndarray, "3 3"],
+    one: Float64[np.ndarray, "n 3"],
+    two: Float64[np.ndarray, "n 3"],
+) -> Float64[np.ndarray, "n"]:
+    """Sampson's first-order distance to x2^T F x1 = 0 (Hartley and Zisserman, eq. 11.9).
+
+    Without any translation between the views: the distance from where the rotation takes x1.
+
+    Args:
+        T: from the first camera to the second.
+        K_inverse: from points (x, y, 1) of both to rays; the identity where they are rays.
+        one: points of the first view.
+        two: where they were found in the second, in whose unit the distance is.
+    """
+    t = T[:3, 3]
+    length = np.linalg.norm(t)
+    if length < 1e-12:
+        moved = one @ (np.linalg.inv(K_inverse) @ T[:3, :3] @ K_inverse).T
+        return np.linalg.norm(moved[:, :2] / moved[:, 2:] - two[:, :2], axis=1)
+    cross = np.cross(np.eye(3), t / length)
+    F = K_inverse.T @ -cross @ T[:3, :3] @ K_inverse
+    line_two, line_one = one @ F.T, two @ F
+    value = (two * line_two).sum(axis=1)
+    slope = (line_two[:, :2] ** 2).sum(axis=1) + (line_one[:, :2] ** 2).sum(axis=1)
+    return np.abs(value) / np.sqrt(slope.clip(1e-24))
+
+
+def homogeneous(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    """(x, y, 1)."""
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
