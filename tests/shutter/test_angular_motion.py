@@ -4,7 +4,9 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import so3_exp
+from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between, rotated
+from geogs.shutter.turning_kernels import nearest_turn
 
 
 def test_vectors_are_rotated_as_by_the_matrix_exponential():
@@ -13,6 +15,20 @@ def test_vectors_are_rotated_as_by_the_matrix_exponential():
     by[0], by[1] = 0.0, 1e-9
     expected = [so3_exp(torch.tensor(b)).numpy() @ v for v, b in zip(vectors, by, strict=True)]
     np.testing.assert_allclose(rotated(vectors, by), expected, atol=1e-12)
+
+
+def test_the_nearest_rotation_is_that_of_the_singular_vectors():
+    """Moments whose singular values span three orders, as of a narrow cone; no mirror images."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        frame, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        moment = 500 * rng.normal(size=(3, 3)) @ np.diag([1, 0.1, 1e-3]) @ frame
+        moment *= np.sign(np.linalg.det(moment))
+        expected = nearest_rotation(moment)
+        assert nearest_turn(moment)
+        np.testing.assert_allclose(moment, expected, atol=1e-9)
+    assert not nearest_turn(np.zeros((3, 3)))
+    assert not nearest_turn(np.diag([1.0, 1.0, -1.0]))
 
 
 def test_a_linear_rate_is_found_from_its_means():

@@ -1,6 +1,5 @@
 """The angular velocity of a camera between two images of a video, from their flow."""
 
-import math
 import threading
 from dataclasses import dataclass, replace
 
@@ -8,8 +7,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs.geometry.robust import cauchy_weight
 from geogs.shutter.angular_motion import rotated
 from geogs.shutter.rolling_camera import RollingCamera
 
@@ -96,10 +93,10 @@ def angular_velocity(
     """Mean radians per second between the middle rows of two images, in axes of the camera.
 
     The rotation that most cells agree on, by iteratively reweighted least squares (Cauchy's
-    weights, Procrustes' rotation). Each round has a closed solution, so that nothing is linearised
-    and the least-squares loop has no part in it. A point is seen in other rows of the two images,
-    hence after more or less than the interval: its rays are moved to the times of the middle rows
-    by the velocity itself.
+    weights, Procrustes' rotation), compiled. Each round has a closed solution, so that nothing is
+    linearised and the least-squares loop has no part in it. A point is seen in other rows of the
+    two images, hence after more or less than the interval: its rays are moved to the times of the
+    middle rows by the velocity itself.
 
     Args:
         flow: from the first image to the second.
@@ -111,16 +108,13 @@ def angular_velocity(
     """
     if interval <= 0:
         return None
-    rate, weight = np.zeros(3), flow.inside.astype(np.float64)
-    for _ in range(ROUNDS):
-        first, second = flow.first, flow.second
-        if readout:
-            first = rotated(first, -readout * flow.first_time[:, None] * rate)
-            second = rotated(second, -readout * flow.second_time[:, None] * rate)
-        rotation = nearest_rotation((second * weight[:, None]).T @ first)
-        rate = _rotation_vector(rotation) / interval
-        error = np.linalg.norm(second - first @ rotation.T, axis=1)
-        weight = flow.inside * cauchy_weight((error / TOLERANCE) ** 2)
+    from geogs.shutter.turning_kernels import turning_between
+
+    first_time, second_time = readout * flow.first_time, readout * flow.second_time
+    rate, error = turning_between(
+        flow.first, flow.second, first_time, second_time, flow.inside.astype(np.float64),
+        interval, TOLERANCE, ROUNDS,
+    )  # fmt: skip
     agreeing = (flow.inside & (error < 2 * TOLERANCE)).mean()
     return rate if agreeing >= AGREEING else None
 
@@ -170,12 +164,3 @@ def _spread(
     laid = (np.bincount(cells, part, count).reshape(shape) for part in values)
     weight, *sums = (cv2.GaussianBlur(part, (0, 0), SMOOTH) for part in laid)
     return np.dstack(sums) / np.maximum(weight, 1e-3)[..., None]
-
-
-def _rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """The logarithm of a rotation, for angles well below a half turn."""
-    skew = 0.5 * (rotation - rotation.T)
-    axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (float(np.trace(rotation)) - 1)
-    angle = math.atan2(sine, cosine)
-    return axis * (angle / sine if sine > 1e-12 else 1.0)

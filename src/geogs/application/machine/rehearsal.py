@@ -13,6 +13,9 @@ from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.reconstruction import Reconstruction
+from geogs.shutter.angular_motion import rotated
+from geogs.shutter.rates import FlowMeter, angular_velocity
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.threads import on_one_torch_thread
 
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
@@ -25,14 +28,24 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """``map`` maps the wall on the CPU, ``planes`` does what of it no GPU does, ``mesh`` extracts
-    its mesh; leaves nothing."""
+    """``map`` follows and maps the wall on a CPU, ``planes`` does what of it no GPU does, ``mesh``
+    extracts its mesh; leaves nothing."""
     if part == "map":
+        _turn()
         _map()
     elif part == "planes":
+        _turn()
         _bare()
     else:
         extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
+
+
+def _turn() -> None:
+    """The turning between two pictures, as for the rows of a rolling shutter."""
+    meter = FlowMeter(RollingCamera(CAMERA))
+    first, second, *_ = map(meter.small, _pictures())
+    angular_velocity(meter.measure(first, second), 1.0, 0.1)
+    rotated(np.zeros((1, 3)), np.zeros((1, 3)))
 
 
 def _map() -> None:
