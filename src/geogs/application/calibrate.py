@@ -135,7 +135,7 @@ def with_shutter_found(
     found = _found_in(
         source.clips(), "shutter", progress, stop,
         lambda clips, report: find_readout(
-            clips, source.rolling_camera, report, lens_is_known=not source.calibration.is_unknown_lens
+            clips, source.rolling_camera, report, not source.calibration.is_unknown_lens
         ),
     )  # fmt: skip
     if found is None:

@@ -75,7 +75,10 @@ def correct_lens(
             is_asked, left = True, ROUNDS
         if is_asked:
             focal += float(said.size[0])
-            graph.refocus(math.exp(focal))
+            if before:  # cells stay where straight images show them
+                bend = replace(bend, focal=focal)
+            else:
+                graph.refocus(math.exp(focal))
         else:
             said = asked.bend if rows is None else said.without(0)
         if rows is not None:

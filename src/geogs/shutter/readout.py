@@ -211,9 +211,7 @@ def _global_shutter_step(
     return Step(equation.stepped(at, np.zeros(1)))
 
 
-def _verdict(
-    clips: list[_Adjusted], focal: float, lens_is_known: bool = True
-) -> FoundReadout:
+def _verdict(clips: list[_Adjusted], focal: float, lens_is_known: bool = True) -> FoundReadout:
     """The readout that fits all clips best, and whether it is believed."""
     state = _AdjustedClips(clips, np.zeros(1 if lens_is_known else 1 + len(LENS)))
     for tolerance, steps in TOLERANCES:

@@ -37,7 +37,7 @@ length, and OpenCV's k1 and k2."""
 Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
 """What is to be added to where cells of a problem's edges were found for a readout that is longer
 by a part of it: one shape more."""
-LEAST = 0.0005, 0.0005, 0.001, 0.005
+LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001), 0.005
 """No size is known better, however many matches agree: half of what they say of lenses that have no
 error (docs/tracking.md)."""
 PRIOR = 0.03, 0.05, 0.1
@@ -76,10 +76,12 @@ class LensBend:
 
     k1: float = 0.0
     k2: float = 0.0
+    focal: float = 0.0
+    """Logarithm of the focal length over what it is taken for."""
 
     def plus(self, size: Float[Tensor, "2"]) -> "LensBend":
         """With k1 and k2 added to."""
-        return LensBend(self.k1 + float(size[0]), self.k2 + float(size[1]))
+        return LensBend(self.k1 + float(size[0]), self.k2 + float(size[1]), self.focal)
 
     def of_matches(
         self,
@@ -90,7 +92,7 @@ class LensBend:
     ) -> Float[Tensor, "e p 2"]:
         """What is to be added to where cells were found, as if a pinhole had seen both views."""
         shift = shape_shifts(camera, rays, T_ji, project(camera, rays, T_ji, inverse_depth))
-        return self.k1 * shift[1] + self.k2 * shift[2]
+        return self.focal * shift[0] + self.k1 * shift[1] + self.k2 * shift[2]
 
 
 @dataclass(frozen=True)
@@ -116,12 +118,14 @@ class LensEvidence:
     def bend(self) -> "LensEstimate":
         """Of k1 and k2, the focal length being right."""
         k = slice(1, SHAPES)
-        return _estimate(self.information[:, k, k], self.gradient[:, k], LEAST[k])
+        return _estimate(self.information[:, k, k], self.gradient[:, k], LEAST[1:])
 
     @property
     def whole(self) -> "LensEstimate":
         """Of all sizes together."""
-        return _estimate(self.information, self.gradient, LEAST[: self.gradient.shape[1]])
+        return _estimate(
+            self.information, self.gradient, (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
+        )
 
     def considered(self, focal: float = 0.0) -> Float[Tensor, "m m"]:
         """Second moment of the moves of all poses by the error that the lens has.

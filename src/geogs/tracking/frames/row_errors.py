@@ -94,9 +94,7 @@ class RowErrors:
         other._factor = factor
         return other
 
-    def slope(
-        self, shift: "Callable[[RowErrors], Float[Tensor, '*b']]"
-    ) -> Float[Tensor, "*b"]:
+    def slope(self, shift: "Callable[[RowErrors], Float[Tensor, '*b']]") -> Float[Tensor, "*b"]:
         """Derivative of what is made of these by the factor on the readout."""
         low, high = (self.with_readout(self._factor + by) for by in (-SMALL, SMALL))
         return (shift(high) - shift(low)) / (2 * SMALL)
