@@ -40,7 +40,7 @@ def folder(tmp_path) -> Path:
 
 
 def finding(monkeypatch, found: FoundReadout) -> None:
-    monkeypatch.setattr(readout, "find_readout", lambda clips, camera, report: found)
+    monkeypatch.setattr(readout, "find_readout", lambda clips, camera, report, lens_is_known: found)
 
 
 def test_a_readout_that_is_found_is_said_and_written(folder, tmp_path, monkeypatch):
@@ -86,7 +86,7 @@ def test_several_videos_share_what_the_first_shows(folder, monkeypatch):
 
 
 def test_ctrl_c_goes_on_with_a_global_shutter(folder, monkeypatch):
-    def interrupted(clips, camera, report):
+    def interrupted(clips, camera, report, lens_is_known):
         signal.raise_signal(signal.SIGINT)
         report(0.1)
         pytest.fail("the request was not heard")

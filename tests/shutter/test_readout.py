@@ -1,6 +1,7 @@
 """The readout found from clips: of points seen row by row, and of a rendered video."""
 
 import functools
+from dataclasses import replace
 
 import pytest
 
@@ -36,6 +37,20 @@ def test_points_seen_at_once_tell_a_global_shutter():
     assert not found.is_believed
     assert found.readout == 0.0
     assert abs(found.best) < 0.001
+
+
+def test_a_lens_that_nobody_told_is_not_taken_for_rows():
+    def bent(clip):
+        square = (clip.plane**2).sum(-1, keepdims=True)
+        return replace(clip, plane=clip.plane * (1 + 0.1 * square - 0.2 * square**2))
+
+    clips = [bent(a.tracks) for a in clips_of_points(TRUE)]
+    starts = [first_reconstruction(clip, 1.2 / FOCAL) for clip in clips]
+    seen = [_Adjusted(c, s) for c, s in zip(clips, starts, strict=True) if s is not None]
+    found, taken = (_verdict(seen, FOCAL, is_known) for is_known in (False, True))
+    print(found, taken)
+    assert found.readout == pytest.approx(TRUE, rel=0.06)
+    assert abs(found.best - TRUE) < 0.5 * abs(taken.best - TRUE)
 
 
 def test_a_steady_motion_tells_nothing():

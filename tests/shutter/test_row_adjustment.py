@@ -78,19 +78,19 @@ def test_the_equation_is_that_of_least_squares_over_everything(tracks, start, mo
     J = np.stack([(root * c).ravel() for c in columns], axis=1)
     right = (root * here).ravel()
     free_slope = of_readout - J @ np.linalg.lstsq(J, of_readout, rcond=1e-9)[0]
-    found = readout_equation(tracks, start, READOUT, TOLERANCE)
-    assert found.curvature == pytest.approx(free_slope @ free_slope, rel=0.01)
+    found = readout_equation(tracks, start, np.array([READOUT]), TOLERANCE)
+    assert found.curvature[0, 0] == pytest.approx(free_slope @ free_slope, rel=0.01)
     free_right = right - J @ np.linalg.lstsq(J, right, rcond=1e-9)[0]
-    assert found.gradient == pytest.approx(-free_slope @ free_right, rel=0.02)
+    assert found.gradient[0] == pytest.approx(-free_slope @ free_right, rel=0.02)
     assert found.square == pytest.approx((right**2).sum())
 
 
 def test_steps_lower_the_cost_and_end_where_the_readout_is_right(tracks, start):
-    here, readout, costs = start, 0.0, []
+    here, readout, costs = start, np.zeros(1), []
     for _ in range(12):
         part = readout_equation(tracks, here, readout, 3 * TOLERANCE)
-        step = float(np.clip(part.gradient / part.curvature, -0.01, 0.01))
+        step = np.clip(part.gradient / part.curvature[0], -0.01, 0.01)
         here, readout = part.stepped(here, step), readout + step
         costs.append(part.square)
-    assert readout == pytest.approx(READOUT, abs=0.004)
+    assert readout[0] == pytest.approx(READOUT, abs=0.004)
     assert costs[-1] < 0.5 * costs[0]

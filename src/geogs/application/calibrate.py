@@ -134,7 +134,9 @@ def with_shutter_found(
 
     found = _found_in(
         source.clips(), "shutter", progress, stop,
-        lambda clips, report: find_readout(clips, source.rolling_camera, report),
+        lambda clips, report: find_readout(
+            clips, source.rolling_camera, report, not source.calibration.is_unknown_lens
+        ),
     )  # fmt: skip
     if found is None:
         progress.write(

@@ -71,15 +71,16 @@ def global_bundle(
     tracker.map.odometry.update_scale_by_all()
     match = partial(_match, tracker, pairs, free_poses, free, progress)
     match()
-    correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment)
-    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends)
+    readout = correct_rows(
+        tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment
+    )
+    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, readout=readout)
     if lens is not None and ends:
         images = BentImages.of(store)
         straighten(tracker, lens, images)
         match()
-        # The readout that was found in images that bend is off by up to a third.
-        correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS)
-        rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, again=True)
+        correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
+        rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=lens)
         if rest is not None:
             images.straighten(StraightView(store.camera, lens).followed_by(rest))
     for start in range(0, len(free), PRIORS_TOGETHER):

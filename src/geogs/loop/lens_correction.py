@@ -10,16 +10,19 @@ lens was taken for a pinhole is off by several percent (docs/tracking.md).
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import methodcaller
 
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.lens_error import LensBend
-from geogs.tracking.frames.pose_filling import shift_lens
-from geogs.tracking.frames.row_errors import TOGETHER
+from geogs.bundle.uncertainty.lens_error import SHAPES, LensBend
+from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
+from geogs.tracking.frames.row_errors import TOGETHER, RowErrors
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import said_of_lens
 from geogs.tracking.tracker import Tracker
 from geogs.types import FoundLens
-from geogs.world.edges import PackedEdge, Pair
+from geogs.world.edges import PackedEdge, Pair, edge_matches
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import KeyframeSet
 
 ROUNDS = 8
 """At most. Each is to first order and leaves a fifth to a half of what the one before it left."""
@@ -43,41 +46,56 @@ def correct_lens(
     free_depth: Sequence[int],
     options: BundleOptions,
     ends: bool = False,
-    again: bool = False,
+    before: FoundLens | None = None,
+    readout: float = 1.0,
 ) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
     What was measured of the frames between the keyframes is corrected, too. The focal length is
-    only where tracking ``ends`` with it: what is matched afterwards would be of another. ``again``
-    says that a lens was found and images are straight, so that what matches say then is believed
-    however little it is. Not in the world of a saved map, whose keyframes stay as its own
+    only where tracking ``ends`` with it: what is matched afterwards would be of another; so is the
+    readout, where it was found in the video: matches were corrected for rows that took so many
+    times it. ``before`` was found already, and images are straight, so that what matches say is
+    believed however little it is. Not in the world of a saved map, whose keyframes stay as its own
     adjustment left them.
     """
-    graph, keyframes = tracker.map.graph, tracker.keyframes
+    graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = graph.packed
-    bend, said, focal, is_asked = LensBend(), None, 0.0, False
+    bend, said, focal, longer = LensBend(), None, 0.0, 0.0
     left = ROUNDS if measured and not tracker.segment.fixed else 0
+    is_asked = before is not None and before.focal != 1
+    rows = _rows_in_doubt(log, keyframes, readout) if ends and left else None
     while left:
-        asked = said_of_lens(tracker, list(free_depth))
-        if asked is None or (said is None and not again and asked.bend.evidence < EVIDENCE):
+        asked = said_of_lens(tracker, list(free_depth), rows)
+        if asked is None or (said is None and not before and asked.bend.evidence < EVIDENCE):
             break
         said, left = asked.whole, left - 1
+        if rows is not None:
+            said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
         if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:
             is_asked, left = True, ROUNDS
         if is_asked:
             focal += float(said.size[0])
-            graph.refocus(math.exp(focal))
+            if before:  # cells stay where straight images show them
+                bend = replace(bend, focal=focal)
+            else:
+                graph.refocus(math.exp(focal))
         else:
-            said = asked.bend
+            said = asked.bend if rows is None else said.without(0)
+        if rows is not None:
+            longer += float(said.size[-1])
         if bool((said.size.abs() < CONVERGED * said.deviation).all()):
             left = 0
-        bend = bend.plus(said.size[-2:])
-        _shift(graph, measured, bend)
+        bend = bend.plus(said.size[-2 - (rows is not None) :])
+        _shift(graph, measured, bend, rows, longer)
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
     if said is None:
         return None
-    shift_lens(tracker.map.recorder.log, keyframes, bend)
-    *of_focal, k1, k2 = said.deviation.tolist()
+    deviation = said.deviation.tolist()
+    if rows is not None:
+        shift_rows(log, keyframes, rows.with_readout(readout + longer))
+        log.set_readout(readout + longer, deviation.pop())
+    shift_lens(log, keyframes, bend)
+    *of_focal, k1, k2 = deviation
     found = FoundLens(bend.k1, bend.k2, k1, k2)
     if not is_asked:
         return found
@@ -85,13 +103,32 @@ def correct_lens(
     return replace(found, focal=math.exp(focal), deviation_focal=open_focal)
 
 
-def _shift(graph: FrameGraph, measured: dict[Pair, PackedEdge], bend: LensBend) -> None:
-    """Have the measured edges with their matches where a pinhole would have them."""
+def _rows_in_doubt(log: FrameLog, keyframes: KeyframeSet, readout: float) -> RowErrors | None:
+    """Those that were rectified by a readout that was found in the video, where there are any."""
+    rows = row_errors(log, keyframes)
+    return None if rows is None or rows.doubt == 0 else rows.with_readout(readout)
+
+
+def _shift(
+    graph: FrameGraph,
+    measured: dict[Pair, PackedEdge],
+    bend: LensBend,
+    rows: RowErrors | None,
+    longer: float,
+) -> None:
+    """Have the measured edges with their matches where a pinhole would have them, whose rows were
+    seen over a readout that is longer by a part of it."""
     grid, keyframes, pairs = graph.keyframes.grid, graph.keyframes, sorted(measured)
     size = TOGETHER[grid.on_gpu]
     for start in range(0, len(pairs), size):
         part = pairs[start : start + size]
         T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         shifts = bend.of_matches(grid.camera, grid.rays, T_ji, depth)
+        if rows is not None and longer != 0:
+            i, j = ([keyframes[pair[k]].frame_index for pair in part] for k in (0, 1))
+            pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
+            shifts = shifts + longer * rows.slope(
+                methodcaller("of_matches", i, j, T_ji, grid.rays, depth, pixels)
+            )
         for pair, shift in zip(part, shifts, strict=True):
             graph.edges[pair] = measured[pair].moved(grid.camera, shift)

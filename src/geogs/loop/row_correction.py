@@ -43,11 +43,12 @@ def correct_rows(
     free_depth: Sequence[int],
     options: BundleOptions,
     finds_readout: bool = True,
-) -> None:
+) -> float:
     """Correct all matches for their rows and adjust again; nothing where no rows were rectified.
 
     What was measured of the frames between the keyframes is corrected, too. ``finds_readout`` says
-    whether the readout is found once more, where it was found in the video.
+    whether the readout is found once more, where it was found in the video. Returns how many times
+    the readout it is.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = graph.packed
@@ -56,7 +57,7 @@ def correct_rows(
     for n in range(1 + READOUTS):
         errors = row_errors(log, keyframes) if measured else None
         if errors is None:
-            return
+            break
         searches = finds_readout and errors.doubt > 0
         if searches:
             last = READOUTS
@@ -73,7 +74,8 @@ def correct_rows(
         graph.adjust(list(graph.edges), free_pose, free_depth, options if n == last else between)
         shift_rows(log, keyframes, present)
         if n == last:
-            return
+            break
+    return search.factor
 
 
 class _Search:

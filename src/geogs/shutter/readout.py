@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.shutter.clip_reconstruction import ClipReconstruction
@@ -38,6 +39,8 @@ EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
 """Pixels of error at which a measurement counts for a quarter: of each step of the fit of a clip
 alone, as if its shutter were global, and of the stages of the fit of all together with the readout,
 with the number of their steps."""
+LENS = 0.1, 0.2
+"""Deviations of the k1 and k2 of a lens of which nothing is known."""
 LARGEST_STEP = 0.015
 """Seconds."""
 CONVERGED = 5e-5
@@ -90,11 +93,11 @@ class _Adjusted:
 
 @dataclass(frozen=True)
 class _AdjustedClips:
-    """What is adjusted: several clips and the readout that they have in common."""
+    """What is adjusted: several clips, and the readout and lens that they have in common."""
 
     clips: list[_Adjusted]
-    readout: float = 0.0
-    """Seconds."""
+    shared: Float[np.ndarray, "s"]
+    """Seconds of the readout; then k1 and k2, where they are not known."""
     equations: list[ReadoutEquation] = field(default_factory=list)
     """One of each of these clips, where it was linearised last."""
 
@@ -115,13 +118,13 @@ class _CommonReadout:
         """The clips that one readout may explain, with their equations; none if too few."""
         clips = state.finite
         if len(clips) < LEAST_CLIPS:
-            return _AdjustedClips([])
-        equations = thread_map(functools.partial(self._equation, state.readout), clips)
+            return _AdjustedClips([], state.shared)
+        equations = thread_map(functools.partial(self._equation, state.shared), clips)
         clips, equations = _fitting(clips, equations)
-        return _AdjustedClips(clips, state.readout, equations)
+        return _AdjustedClips(clips, state.shared, equations)
 
-    def _equation(self, readout: float, clip: _Adjusted) -> ReadoutEquation:
-        return readout_equation(clip.tracks, clip.reconstruction, readout, self.tolerance)
+    def _equation(self, shared: Float[np.ndarray, "s"], clip: _Adjusted) -> ReadoutEquation:
+        return readout_equation(clip.tracks, clip.reconstruction, shared, self.tolerance)
 
     def step(
         self, state: _AdjustedClips, linear: _AdjustedClips, damping: float
@@ -129,21 +132,24 @@ class _CommonReadout:
         """All clips after the step of the readout, which is limited."""
         if not linear.clips:
             return None
-        parts, readout = linear.equations, state.readout
-        step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
-        step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
-        step = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST)) - readout
+        parts, shared = linear.equations, state.shared
+        known = _known_of_lens(shared)
+        gradient = sum(p.gradient for p in parts) - known @ shared
+        step = np.linalg.solve(_curvature(parts) + known, gradient)
+        readout = float(np.clip(step[0], -LARGEST_STEP, LARGEST_STEP)) + shared[0]
+        step[0] = float(np.clip(readout, -1.5 * LONGEST, 1.5 * LONGEST)) - shared[0]
         moved = [
             _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
             for c, part in zip(linear.clips, parts, strict=True)
         ]
-        return Step(_AdjustedClips(moved, readout + step, parts), abs(step))
+        return Step(_AdjustedClips(moved, shared + step, parts), abs(float(step[0])))
 
 
 def find_readout(
     clips: Iterable[Sequence[Image]],
     camera: RollingCamera,
     report: Report = lambda fraction: None,
+    lens_is_known: bool = True,
 ) -> FoundReadout:
     """Find the readout with which clips of a video fit best; 0 unless it is clearly better.
 
@@ -152,6 +158,7 @@ def find_readout(
             points of several are followed at a time.
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
+        lens_is_known: else its k1 and k2 are estimated, too; they would be taken for rows.
     """
     adjusted, found = list[_Adjusted](), FoundReadout()
     focal, left, seen = camera.camera.fx, iter(clips), 0
@@ -164,11 +171,11 @@ def find_readout(
         if seen < enough:
             break
         if enough in ENOUGH_CLIPS:
-            found = _verdict(adjusted, focal)
+            found = _verdict(adjusted, focal, lens_is_known)
             if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
                 break
     report(1.0)
-    return found if found.clips == len(adjusted) else _verdict(adjusted, focal)
+    return found if found.clips == len(adjusted) else _verdict(adjusted, focal, lens_is_known)
 
 
 def _reported(report: Report, before: int, group: int, fraction: float) -> None:
@@ -192,7 +199,7 @@ def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
         if not start.is_finite:
             return None
         equation = functools.partial(
-            readout_equation, tracks, readout=0.0, tolerance=tolerance / focal
+            readout_equation, tracks, shared=np.zeros(1), tolerance=tolerance / focal
         )
         start = minimise(start, equation, _global_shutter_step, Policy(1)).state
     return _Adjusted(tracks, start)
@@ -201,12 +208,12 @@ def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
 def _global_shutter_step(
     at: ClipReconstruction, equation: ReadoutEquation, damping: float
 ) -> Step[ClipReconstruction]:
-    return Step(equation.stepped(at, 0.0))
+    return Step(equation.stepped(at, np.zeros(1)))
 
 
-def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
+def _verdict(clips: list[_Adjusted], focal: float, lens_is_known: bool = True) -> FoundReadout:
     """The readout that fits all clips best, and whether it is believed."""
-    state = _AdjustedClips(clips)
+    state = _AdjustedClips(clips, np.zeros(1 if lens_is_known else 1 + len(LENS)))
     for tolerance, steps in TOLERANCES:
         is_last = tolerance == TOLERANCES[-1][0]
         policy = Policy(steps, tolerance=CONVERGED if is_last else 0.0)
@@ -215,10 +222,10 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
         state = solution.state
         if not solution.finite:
             return FoundReadout(clips=len(state.finite))
-    readout, parts = state.readout, state.equations
+    readout, parts = float(state.shared[0]), state.equations
     if len(parts) < LEAST_CLIPS:
         return FoundReadout(clips=len(parts))
-    error = float(np.hypot(_standard_error(parts), TREMOR * readout))
+    error = float(np.hypot(_standard_error(parts, state.shared), TREMOR * readout))
     confident = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = confident and SHORTEST <= readout <= LONGEST
     return FoundReadout(readout if believed else 0.0, readout, error, len(state.clips))
@@ -233,12 +240,23 @@ def _fitting(
     return [clips[k] for k in keep], [parts[k] for k in keep]
 
 
-def _standard_error(parts: Sequence[ReadoutEquation]) -> float:
+def _curvature(parts: Sequence[ReadoutEquation]) -> Float[np.ndarray, "s s"]:
+    """Of several clips together."""
+    total: Float[np.ndarray, "s s"] = np.sum([part.curvature for part in parts], 0)
+    return total + 1e-12 * np.eye(len(total))
+
+
+def _known_of_lens(shared: Float[np.ndarray, "s"]) -> Float[np.ndarray, "s s"]:
+    """Information on its k1 and k2 before any clip is asked."""
+    return np.diag([0.0, *(1 / np.square(LENS[: len(shared) - 1]))])
+
+
+def _standard_error(parts: Sequence[ReadoutEquation], shared: Float[np.ndarray, "s"]) -> float:
     """Seconds of the readout by what clips disagree, and what their matches have in common."""
-    curvature = sum(part.curvature for part in parts) + 1e-12
-    gradients = np.array([part.gradient for part in parts])
+    of_readout = np.linalg.inv(_curvature(parts) + _known_of_lens(shared))[0]
+    moves = np.array([part.gradient @ of_readout for part in parts])
     count = len(parts)
-    spread = np.sqrt((gradients**2).sum() * count / (count - 1)) / curvature
+    spread = np.sqrt((moves**2).sum() * count / (count - 1))
     # A readout's effect on a match against the error of one, root mean squares.
-    common = COMMON * np.sqrt(sum(part.square for part in parts) / curvature)
+    common = COMMON * np.sqrt(sum(part.square for part in parts) * of_readout[0])
     return float(np.hypot(spread, common))

@@ -15,6 +15,8 @@ from geogs.geometry.robust import geman_mcclure_weight
 from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import ClipTracks
 
+POWERS = 2, 4
+"""Of the distance from the axis, times which a point seems off it by OpenCV's k1 and k2."""
 NODES = 5
 """Images whose poses say where a point is between them. Fewer make little of quick tremor and the
 readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
@@ -25,43 +27,56 @@ DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class ReadoutEquation:
-    """What a clip says of the readout, whatever its poses and points."""
+    """What a clip says of the readout, whatever its poses and points.
 
-    curvature: float
-    """Curvature of the cost in the readout, 1 / s^2, poses and points being what is then best."""
-    gradient: float
-    """By how much the cost falls at first, 1 / s."""
+    Of the readout in seconds and, where they are not known, k1 and k2 of the lens.
+    """
+
+    curvature: Float[np.ndarray, "s s"]
+    """Curvature of the cost in these, poses and points being what is then best."""
+    gradient: Float[np.ndarray, "s"]
+    """By how much the cost falls at first."""
     weight: float
     """Sum over all that was measured, in the unit of the curvature's error^2."""
     square: float
     """Weighted sum of squared errors."""
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
-    """Steps of poses and points, the readout being fixed."""
-    by_readout: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
-    """By how much more they step for each second that the readout grows."""
+    """Steps of poses and points, the readout and the lens being fixed."""
+    by_shared: list[tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]]
+    """By how much more they step for each second that the readout grows, and each size."""
 
-    def stepped(self, reconstruction: ClipReconstruction, readout: float) -> ClipReconstruction:
-        """Where poses and points go as the readout takes its own step."""
-        poses, points = (a + readout * b for a, b in zip(self.still, self.by_readout, strict=True))
+    def stepped(
+        self, reconstruction: ClipReconstruction, shared: Float[np.ndarray, "s"]
+    ) -> ClipReconstruction:
+        """Where poses and points go as the readout and the lens take their own step."""
+        poses, points = self.still
+        for step, (by_pose, by_point) in zip(shared, self.by_shared, strict=True):
+            poses, points = poses + step * by_pose, points + step * by_point
         return reconstruction.stepped(poses, points)
 
 
 def readout_equation(
-    tracks: ClipTracks, at: ClipReconstruction, readout: float, tolerance: float
+    tracks: ClipTracks, at: ClipReconstruction, shared: Float[np.ndarray, "s"], tolerance: float
 ) -> ReadoutEquation:
     """Linearised, what is measured weighted by Geman and McClure's loss.
 
     Args:
         tracks: what is seen.
         at: poses and points.
-        readout: seconds.
+        shared: the readout, seconds; then k1 and k2, where they are not known.
         tolerance: error at which a measurement counts for a quarter, fraction of the focal length.
     """
     count = len(tracks.times)
     nodes = _nodes(count)
+    readout, *sizes = shared
     blend, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
     around = at.projected()[nodes]
-    error = tracks.plane - _blended(blend, around)
+    pinhole = _blended(blend, around)
+    radius = np.linalg.norm(pinhole, axis=-1, keepdims=True)
+    shapes = [radius**power * pinhole for power, _ in zip(POWERS, sizes, strict=False)]
+    error = tracks.plane - pinhole
+    for size, shape in zip(sizes, shapes, strict=True):
+        error = error - size * shape
     square = (error**2).sum(axis=-1)
     weight = tracks.seen * geman_mcclure_weight(square / tolerance**2) / tolerance**2
     root = np.sqrt(weight)
@@ -72,7 +87,7 @@ def readout_equation(
         part = (root * blend[..., j])[..., None, None]
         np.multiply(part, by_own_pose[node], out=by_poses[..., j, :])
         by_point += part * by_own_point[node]
-    other = root[..., None, None] * np.stack([error, _blended(slope, around)], axis=-1)
+    other = root[..., None, None] * np.stack([error, _blended(slope, around), *shapes], axis=-1)
     joined = np.concatenate([by_poses.reshape(*tracks.seen.shape, 2, -1), other], axis=-1)
     # The middle pose stays where it is.
     free = np.arange(count) != tracks.middle
@@ -90,7 +105,7 @@ def _eliminated(
 
     Args:
         joined: derivatives of the predictions by the poses of an image's nodes; then errors, and
-            derivatives of the predictions by the readout.
+            derivatives of the predictions by the readout and the lens.
         by_point: by the point.
         free: of all images, whether their pose is free.
         weight: of the result.
@@ -103,30 +118,32 @@ def _eliminated(
     normal += (DAMPING / 3 * trace + 1e-9) * np.eye(3)
     root = np.linalg.cholesky(np.linalg.inv(normal))
     # What an image sees concerns the poses around it alone, so each adds to few columns.
-    size = 6 * count + 2
+    others = joined.shape[-1] - 6 * NODES
+    size = 6 * count + others
     H, by_points = np.zeros((size, size)), np.zeros((n, 3, size))
     for own, point, nodes in zip(joined, by_point @ root, _nodes(count), strict=True):
-        columns = np.r_[6 * nodes[0] : 6 * nodes[-1] + 6, size - 2 : size]
+        columns = np.r_[6 * nodes[0] : 6 * nodes[-1] + 6, size - others : size]
         flat = own.reshape(2 * n, -1)
         H[columns[:, None], columns] += flat.T @ flat
         by_points[..., columns] += np.swapaxes(point, 1, 2) @ own
-    kept = np.append(np.repeat(free, 6), [True, True])
+    kept = np.append(np.repeat(free, 6), np.ones(others, bool))
     by_points = by_points[..., kept]
     flat = by_points.reshape(3 * n, -1)
     H = H[np.ix_(kept, kept)] - flat.T @ flat
-    poses = H[:-2, :-2] + np.diag(DAMPING * H.diagonal()[:-2] + 1e-7 * H.diagonal()[:-2].mean())
-    for_error, for_readout = np.linalg.solve(poses, H[:-2, -2:]).T
+    own = len(H) - others
+    diagonal = H.diagonal()[:own]
+    poses = H[:own, :own] + np.diag(DAMPING * diagonal + 1e-7 * diagonal.mean())
+    following = np.linalg.solve(poses, H[:own, own:])
     steps = []
-    for step, column in ((for_error, -2), (for_readout, -1)):
-        left = by_points[..., column] - by_points[..., :-2] @ step
+    for column, step in enumerate(following.T, own):
+        left = by_points[..., column] - by_points[..., :own] @ step
         points = (root @ left[..., None])[..., 0]
         all_poses = np.zeros((count, 6))
         all_poses[free] = step.reshape(-1, 6)
         steps.append((all_poses, points))
-    by_readout = (-steps[1][0], -steps[1][1])
-    curvature = float(H[-1, -1] - H[-1, :-2] @ for_readout)
-    gradient = float(H[-2, -1] - H[-2, :-2] @ for_readout)
-    return ReadoutEquation(curvature, gradient, weight, square, steps[0], by_readout)
+    left = H[own:, own:] - H[own:, :own] @ following
+    by_shared = [(-poses, -points) for poses, points in steps[1:]]
+    return ReadoutEquation(left[1:, 1:], left[0, 1:], weight, square, steps[0], by_shared)
 
 
 def _blended(

@@ -1,20 +1,26 @@
 """How well a tracker knows its keyframes, by what all its matches leave open."""
 
 from dataclasses import dataclass
+from functools import partial
+from operator import methodcaller
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
+from torch import Tensor
 
-from geogs.bundle.problem import StreamedProblem
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.projection import CellProjection, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.gauge import deviations_after_alignment
 from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence
 from geogs.bundle.uncertainty.marginals import Marginals, common_covariance, marginals
+from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
 from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeSet
 
 CELLS = 512
 """Most cells of a keyframe whose matches stand for all."""
@@ -92,12 +98,17 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
     return KeyframeUncertainty(tuple(ids), position, rotation, depth, residual)
 
 
-def said_of_lens(tracker: Tracker, ids: list[int]) -> LensEvidence | None:
-    """What edges between some keyframes, earliest first, say of the lens beside what is known."""
+def said_of_lens(
+    tracker: Tracker, ids: list[int], rows: RowErrors | None = None
+) -> LensEvidence | None:
+    """What edges between some keyframes, earliest first, say of the lens beside what is known.
+
+    And of the readout by which ``rows`` err, where there are any.
+    """
     found = None
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
-        part = None if matches is None else matches.lens()
+        part = None if matches is None else matches.lens(rows)
         if part is not None:
             found = part if found is None else found.joined(part)
     return found
@@ -107,7 +118,7 @@ def said_of_lens(tracker: Tracker, ids: list[int]) -> LensEvidence | None:
 class _Matches:
     """Some keyframes' poses and depths as they are, and the edges between them."""
 
-    grid: SampleGrid
+    keyframes: KeyframeSet
     problem: StreamedProblem
     frames: list[int]
 
@@ -120,11 +131,29 @@ class _Matches:
         if not edges:
             return None
         problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
-        return _Matches(tracker.keyframes.grid, problem, frames)
+        return _Matches(tracker.keyframes, problem, frames)
 
-    def lens(self) -> LensEvidence | None:
-        """What they say of the lens; nothing where they do not tell of all poses."""
-        return lens_evidence(self.grid, self.problem, OPTIONS, CELLS)
+    @property
+    def grid(self) -> SampleGrid:
+        """Of their cells."""
+        return self.keyframes.grid
+
+    def lens(self, rows: RowErrors | None = None) -> LensEvidence | None:
+        """What they say of the lens, and of the readout that ``rows`` are for; nothing where they
+        do not tell of all poses."""
+        slope = None if rows is None else partial(self._slope, rows)
+        return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope)
+
+    def _slope(
+        self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
+    ) -> Float[Tensor, "e p 2"]:
+        """By how much matches, where cells fall, change with a readout longer by a part of it."""
+        i, j = ([self.keyframes[self.frames[n]].frame_index for n in x] for x in (
+            part.source.tolist(), part.target.tolist()
+        ))  # fmt: skip
+        T_ji = relative_motion(part.T_cw, part.source, part.target)
+        depth = part.inverse_depth[part.source]
+        return rows.slope(methodcaller("of_matches", i, j, T_ji, rays, depth, at.pixels))
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:

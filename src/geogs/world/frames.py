@@ -1,6 +1,6 @@
 """Frames of a video: what is kept of each to place it once the keyframes around it are final."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -83,3 +83,9 @@ class FrameLog:
     records: list[FrameRecord] = field(default_factory=list)
     rows: dict[Number, SeenRows] = field(default_factory=dict)
     """Rectified rows of a rolling shutter, by the indices of the frames."""
+
+    def set_readout(self, factor: float, doubt: float) -> None:
+        """Have rows seen over a readout that is so many times what they were rectified by, with its
+        standard error as a part of it."""
+        for index, rows in self.rows.items():
+            self.rows[index] = replace(rows, seconds=factor * rows.seconds, doubt=doubt)

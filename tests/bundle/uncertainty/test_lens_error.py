@@ -88,6 +88,33 @@ def test_a_focal_length_that_is_off_is_told_beside_the_bend():
     )
 
 
+def test_a_readout_that_is_off_is_told_beside_the_lens():
+    """Rows shift matches by what differs from edge to edge, as the camera's velocity does."""
+
+    def rows(part, rays, at):
+        sway = torch.sin(2.0 * part.target + part.source)[:, None, None]
+        return (at.pixels[..., 1:] - CAMERA.cy) * sway * torch.tensor([0.5, 0.1])
+
+    grid, problem = walk((0.004, 0.01, -0.02))
+    T_ji = relative_motion(problem.T_cw, problem.source, problem.target)
+    at = project(CAMERA, grid.rays, T_ji, problem.inverse_depth[problem.source])
+    pixels = problem.pixels - 0.03 * rows(problem, grid.rays, at)
+    found = lens_evidence(grid, replace(problem, pixels=pixels), EXACT, grid.size, rows)
+    assert found is not None
+    said = found.whole
+    wanted = torch.tensor([0.004, 0.01, -0.02, 0.03]).double()
+    torch.testing.assert_close(said.size, wanted, atol=1e-3, rtol=0.06)
+    # A size that was known before: against the sum of both normal equations.
+    told = said.told(3, 0.02, 0.01)
+    information = torch.linalg.inv(said.covariance)
+    right = information @ said.size
+    information[3, 3] += 1e4
+    right[3] += 1e4 * 0.02
+    torch.testing.assert_close(told.size, torch.linalg.solve(information, right))
+    torch.testing.assert_close(told.covariance, torch.linalg.inv(information))
+    torch.testing.assert_close(said.without(0).size, said.told(0, 0.0, 1e-12).size[1:])
+
+
 def test_noise_alone_is_no_evidence():
     grid, problem = walk()
     for seed in range(4):

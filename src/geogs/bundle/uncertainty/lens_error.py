@@ -8,7 +8,7 @@ They are estimated, and what is left open of them is considered in what is said 
 Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bierman 1977).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,7 +34,10 @@ from geogs.world.grid import SampleGrid
 SHAPES = 3
 """Of the error of a pixel x off the axis: x, x |x|^2, x |x|^4, for the logarithm of the focal
 length, and OpenCV's k1 and k2."""
-LEAST = 0.0005, 0.0005, 0.001
+Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
+"""What is to be added to where cells of a problem's edges were found for a readout that is longer
+by a part of it: one shape more."""
+LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001), 0.005
 """No size is known better, however many matches agree: half of what they say of lenses that have no
 error (docs/tracking.md)."""
 PRIOR = 0.03, 0.05, 0.1
@@ -73,10 +76,12 @@ class LensBend:
 
     k1: float = 0.0
     k2: float = 0.0
+    focal: float = 0.0
+    """Logarithm of the focal length over what it is taken for."""
 
     def plus(self, size: Float[Tensor, "2"]) -> "LensBend":
         """With k1 and k2 added to."""
-        return LensBend(self.k1 + float(size[0]), self.k2 + float(size[1]))
+        return LensBend(self.k1 + float(size[0]), self.k2 + float(size[1]), self.focal)
 
     def of_matches(
         self,
@@ -87,7 +92,7 @@ class LensBend:
     ) -> Float[Tensor, "e p 2"]:
         """What is to be added to where cells were found, as if a pinhole had seen both views."""
         shift = shape_shifts(camera, rays, T_ji, project(camera, rays, T_ji, inverse_depth))
-        return self.k1 * shift[1] + self.k2 * shift[2]
+        return self.focal * shift[0] + self.k1 * shift[1] + self.k2 * shift[2]
 
 
 @dataclass(frozen=True)
@@ -112,12 +117,15 @@ class LensEvidence:
     @property
     def bend(self) -> "LensEstimate":
         """Of k1 and k2, the focal length being right."""
-        return _estimate(self.information[:, 1:, 1:], self.gradient[:, 1:], LEAST[1:])
+        k = slice(1, SHAPES)
+        return _estimate(self.information[:, k, k], self.gradient[:, k], LEAST[1:])
 
     @property
     def whole(self) -> "LensEstimate":
         """Of all sizes together."""
-        return _estimate(self.information, self.gradient, LEAST)
+        return _estimate(
+            self.information, self.gradient, (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
+        )
 
     def considered(self, focal: float = 0.0) -> Float[Tensor, "m m"]:
         """Second moment of the moves of all poses by the error that the lens has.
@@ -146,6 +154,18 @@ class LensEstimate(NamedTuple):
         """Standard deviation of each size."""
         return self.covariance.diagonal().sqrt()
 
+    def without(self, size: int) -> "LensEstimate":
+        """The others where one is held at zero: all where it is told to be exactly that."""
+        told, left = self.told(size, 0.0, 0.0), torch.arange(len(self.size)) != size
+        return LensEstimate(told.size[left], told.covariance[left][:, left])
+
+    def told(self, size: int, value: float, deviation: float) -> "LensEstimate":
+        """With what was known of one size before."""
+        column = self.covariance[:, size]
+        gain = column / (column[size] + deviation**2)
+        moved = self.size + gain * (value - self.size[size])
+        return LensEstimate(moved, self.covariance - gain[:, None] * column)
+
     @property
     def evidence(self) -> float:
         """Square of the sizes in their deviations."""
@@ -171,7 +191,11 @@ def _estimate(
 
 
 def lens_evidence(
-    grid: SampleGrid, problem: AnyProblem, options: BundleOptions, cells: int = 1024
+    grid: SampleGrid,
+    problem: AnyProblem,
+    options: BundleOptions,
+    cells: int = 1024,
+    rows: Rows | None = None,
 ) -> LensEvidence | None:
     """What the matches of a problem at its solution say of the error of the lens.
 
@@ -182,12 +206,13 @@ def lens_evidence(
         problem: as of :func:`~geogs.bundle.uncertainty.marginals.marginals`; it is linearised once.
         options: Huber's limit and the damping of depths.
         cells: most cells of a frame that are asked; the others are taken to say the same.
+        rows: shape of an error of the readout, which is the last size then.
     """
     thinned = ThinnedProblem(grid, problem, cells)
     scale = 1 / thinned.fraction
-    size = 6 * len(problem.T_cw)
-    poses, pull = (torch.zeros(size, width, dtype=torch.float64) for width in (size, SHAPES))
-    each = list(_reduced(thinned, options))
+    size, shapes = 6 * len(problem.T_cw), SHAPES + (rows is not None)
+    poses, pull = (torch.zeros(size, width, dtype=torch.float64) for width in (size, shapes))
+    each = list(_reduced(thinned, options, rows))
     for s in each:
         poses[s.rows[:, None], s.rows] += scale * s.poses
         pull[s.rows] += scale * s.pull
@@ -214,10 +239,12 @@ class _Reduced(NamedTuple):
     """Direction of descent of the sizes, poses being held."""
 
 
-def _reduced(thinned: ThinnedProblem, options: BundleOptions) -> Iterator[_Reduced]:
+def _reduced(
+    thinned: ThinnedProblem, options: BundleOptions, rows: Rows | None
+) -> Iterator[_Reduced]:
     """Each source in order."""
     for part in thinned.parts(options):
-        matches = _weighed(thinned, part, options)
+        matches = _weighed(thinned, part, options, rows)
         sources = linearised_sources(thinned.flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(part.source), strict=True):
             depth, chain = source.edges.depth, source.edges.chain
@@ -252,11 +279,15 @@ class _Weighed(NamedTuple):
     """The weight times the derivative by the inverse depth."""
 
 
-def _weighed(thinned: ThinnedProblem, part: BundleProblem, options: BundleOptions) -> _Weighed:
+def _weighed(
+    thinned: ThinnedProblem, part: BundleProblem, options: BundleOptions, rows: Rows | None
+) -> _Weighed:
     camera, rays = thinned.flow.camera, thinned.flow.rays
     T_ji = relative_motion(part.T_cw, part.source, part.target)
     p = linearise(camera, rays, T_ji, part.inverse_depth[part.source])
     r, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
     shift = shape_shifts(camera, rays, T_ji, p)
+    if rows is not None:
+        shift = torch.cat([shift, rows(part, rays, p)[None]])
     on_pose, on_depth = p.pose_jacobian * w.mT[:, None], (w * p.depth_jacobian).mT
     return _Weighed(shift.mT, r.mT, w.mT, on_pose, on_depth)

@@ -89,6 +89,11 @@ class Calibration:
         """Whether there is any distortion to remove."""
         return self.lens == "fisheye" or any(number != 0 for number in self.distortion)
 
+    @property
+    def is_unknown_lens(self) -> bool:
+        """Whether nobody said how the lens bends, and what is said is but from the video."""
+        return self.is_guess or (self.refinement is not None and not self.is_distorted)
+
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
         return Camera(self.fx, self.fy, self.cx, self.cy, *self._size())

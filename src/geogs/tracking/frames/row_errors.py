@@ -33,6 +33,10 @@ LARGEST = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
 
 
+SMALL = 0.02
+"""Part of the readout over which a derivative is taken."""
+
+
 @dataclass(frozen=True)
 class _RectifiedFrame:
     """The rows of a frame, and how the camera moved around it."""
@@ -89,6 +93,11 @@ class RowErrors:
         other = copy.copy(self)
         other._factor = factor
         return other
+
+    def slope(self, shift: "Callable[[RowErrors], Float[Tensor, '*b']]") -> Float[Tensor, "*b"]:
+        """Derivative of what is made of these by the factor on the readout."""
+        low, high = (self.with_readout(self._factor + by) for by in (-SMALL, SMALL))
+        return (shift(high) - shift(low)) / (2 * SMALL)
 
     def poses(self, frames: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera of frames in the trajectory, float64."""
