@@ -16,6 +16,7 @@ from typing import Any
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from geogs_photos.contradictions import undisputed
 from geogs_photos.database import SharedCamera
 from geogs_photos.incremental_mapping import (
     LEAST_POINTS,
@@ -51,18 +52,18 @@ def rejoined(
         threads: to compute with.
         progress: called with a stage and its finished part; what it raises ends the work.
     """
-    best = [firmly_joined(part) for part in parts]
+    best = _believed(parts, database)
     is_known = all(camera.is_known for camera in cameras)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
         once = _globally(database, is_known, seed, threads)
-        best = max(best, [firmly_joined(part) for part in once], key=_placed)
+        best = max(best, _believed(once, database), key=_placed)
         progress("finding poses globally", 1.0)
     if best and _placed(best) < WHOLE * count and not is_known:
         again = _with_camera_of(
             best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
         )
-        best = max(best, [firmly_joined(part) for part in again], key=_placed)
+        best = max(best, _believed(again, database), key=_placed)
     return best
 
 
@@ -94,6 +95,12 @@ def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
             model.deregister_frame(model.images[number].frame_id)
     model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
     return model
+
+
+def _believed(parts: Sequence[Any], database: Path) -> list[Any]:
+    """What hangs together of each, and contradicts no matches; the largest first."""
+    believed = [firmly_joined(undisputed(part, database)) for part in parts]
+    return sorted(believed, key=lambda part: -len(placed_images(part)))
 
 
 def _placed(parts: Sequence[Any]) -> int:

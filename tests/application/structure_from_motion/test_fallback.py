@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 from geogs.application import remedy
+from geogs.application.results.result import Result
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion import fallback, offline_plan
+from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.fallback import impossible, is_better, is_wanted
 from geogs.application.structure_from_motion.offline import PlacedOffline
 from geogs.cli.main import main
 from geogs.config import Config, preset, preset_of
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.frame_source import Source
+from geogs.types import FoundFrames
 from io_samples import write_image
 from posed_layouts import Room, render_room
 from posed_scene import SMALL
@@ -159,6 +162,30 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     assert summary["verdict"] == plain["verdict"]
     one, other = (tmp_path / name / "trajectory.tum" for name in ("plain", "out"))
     assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.system
+def test_frames_that_are_found_about_the_keyframes_have_a_place(video, tmp_path, monkeypatch):
+    write_image(video[0] / "009.png", np.zeros_like(filmed().images[9]))
+    asked, judged = list[LostFrames](), Result.verdict.func
+
+    def relied_on(self: Result) -> Verdict:
+        return replace(judged(self), is_reliable=True)
+
+    def finds(lost: LostFrames, *_: object) -> FoundFrames:
+        asked.append(lost)
+        count = len(lost.numbers)
+        poses = np.tile(next(iter(lost.known.values())), (count, 1, 1))
+        times = np.array([lost._times[k] for k in lost.numbers])
+        return FoundFrames(tuple(lost.numbers), times, poses, *np.full((2, count), 1e-3))
+
+    monkeypatch.setattr(fallback, "placed_after_all", finds)
+    monkeypatch.setattr(fallback, "is_wanted", lambda _: False)
+    monkeypatch.setattr(Result, "verdict", property(relied_on))
+    summary = run(video, tmp_path / "out")
+    assert 9 in asked[0].numbers
+    assert summary["verdict"]["lost"] == 0
+    assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == FRAMES
 
 
 @pytest.mark.system

@@ -10,6 +10,8 @@ from geogs.application.structure_from_motion import chosen_frames, offline_plan
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
+from geogs.types import Frame
+from geogs_photos.localise import Localiser
 from io_samples import write_image
 from posed_layouts import render_room
 from posed_scene import SMALL
@@ -23,6 +25,13 @@ def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, ca
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(chosen_frames, "FEWEST", FRAMES // 2)
     monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
+    place, others = Localiser.place, list[int]()
+
+    def place_but_one(self: Localiser, frame: Frame) -> np.ndarray | None:
+        others.append(frame.index)
+        return None if len(others) == 2 else place(self, frame)
+
+    monkeypatch.setattr(Localiser, "place", place_but_one)
     room = render_room(FRAMES, 3, 240, 180)
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)
@@ -36,7 +45,8 @@ def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, ca
     summary = json.loads((output / "summary.json").read_text())
     assert summary["frames"] == FRAMES
     assert summary["keyframes"] == FRAMES // 2
-    assert summary["offline"]["placed_against_the_map"] == FRAMES // 2
+    assert summary["offline"]["placed_against_the_map"] == FRAMES // 2 - 1
+    assert summary["offline"]["placed_afterwards"] == 1
     assert summary["verdict"]["lost"] == 0
     assert (output / "mesh.ply").is_file()
     places = read_tum_trajectory(output / "trajectory.tum").T_wc[:, :3, 3].copy()

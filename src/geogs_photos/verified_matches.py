@@ -1,0 +1,67 @@
+"""Verified matches of the pictures of a reconstruction, with their poses."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.geometry.epipolar import epipolar_distance, homogeneous
+from geogs_photos.pycolmap_library import load_colmap
+
+
+@dataclass(frozen=True, slots=True)
+class PairMatches:
+    """Matches of two pictures that one motion of the camera explains, found without any pose."""
+
+    one: int
+    other: int
+    """Their numbers."""
+    T: Float64[np.ndarray, "4 4"]
+    """From the first camera to the second, by their poses."""
+    rays: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+    """Through the lens, at depth 1."""
+    focal: float
+    """Pixels."""
+
+    def epipolar(self) -> Float64[np.ndarray, "n"]:
+        """Distances of the matches from the epipolar geometry of the poses, pixels."""
+        return self.focal * epipolar_distance(self.T, np.eye(3), *self.rays)
+
+
+def verified_matches(
+    model: Any, database: Path, pictures: Collection[int]
+) -> Iterator[PairMatches]:
+    """Those of all pairs of some pictures that have a pose."""
+    colmap = load_colmap()
+    opened = colmap.Database.open(database)
+    try:
+        ids, _ = opened.read_two_view_geometry_num_inliers()
+        rays = {n: _rays(model, opened, n) for n in pictures}
+        for one, other in (colmap.pair_id_to_image_pair(i) for i in ids):
+            if one not in rays or other not in rays:
+                continue
+            matches = opened.read_two_view_geometry(one, other).inlier_matches
+            first, second = (_pose(model, n) for n in (one, other))
+            yield PairMatches(
+                one, other, second @ np.linalg.inv(first),
+                (rays[one][matches[:, 0]], rays[other][matches[:, 1]]),
+                float(model.cameras[model.images[one].camera_id].mean_focal_length()),
+            )  # fmt: skip
+    finally:
+        opened.close()
+
+
+def _pose(model: Any, number: int) -> Float64[np.ndarray, "4 4"]:
+    """World to camera of a picture."""
+    T = np.eye(4)
+    T[:3] = model.images[number].cam_from_world().matrix()
+    return T
+
+
+def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:
+    camera = model.cameras[model.images[number].camera_id]
+    pixels = np.asarray(opened.read_keypoints(number), np.float64)[:, :2]
+    return homogeneous(np.asarray(camera.cam_from_img(pixels), np.float64)[:, :2])
