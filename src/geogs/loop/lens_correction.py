@@ -35,6 +35,9 @@ keyframes err alike, too: where the lens was known it is 1 to 10, where it was n
 FOCAL_EVIDENCE = 4.0
 """Deviations from which on the focal length is believed to be off, too, where k1 and k2 are. Where
 it was given it is 0 to 2.2 (docs/tracking.md)."""
+READOUT_DOUBT = 0.05
+"""Part of the readout that its deviation has to be for matches to be asked for it, too: what they
+say of it comes out 2 to 6 % short itself (docs/tracking.md)."""
 FOCAL_LEFT = 0.2
 """What the focal length is off by after its correction, of the correction: a tenth and a quarter of
 it in two rendered rooms, whatever matches say."""
@@ -104,9 +107,9 @@ def correct_lens(
 
 
 def _rows_in_doubt(log: FrameLog, keyframes: KeyframeSet, readout: float) -> RowErrors | None:
-    """Those that were rectified by a readout that was found in the video, where there are any."""
+    """Those that were rectified by a readout that the video told badly, where there are any."""
     rows = row_errors(log, keyframes)
-    return None if rows is None or rows.doubt == 0 else rows.with_readout(readout)
+    return None if rows is None or rows.doubt < READOUT_DOUBT else rows.with_readout(readout)
 
 
 def _shift(
