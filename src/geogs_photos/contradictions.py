@@ -15,10 +15,9 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from geogs.evaluation.rotation_errors import rotation_angle
-from geogs_photos.verified_matches import PairMatches, verified_matches
+from geogs.geometry.nearest_rotation import nearest_rotation
+from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
-MAX_ERROR = 4.0
-"""Pixels that a match may be off what explains it."""
 MOST = 0.5
 """Part of a pair's matches that has to be explained, by the poses or by a turn alone."""
 TURN = 20.0
@@ -64,8 +63,7 @@ def turn_alone(
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (one, two))
     weight = np.ones(len(a))
     for _ in range(_ROUNDS):
-        U, _, Vt = np.linalg.svd((b * weight[:, None]).T @ a)
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = nearest_rotation((b * weight[:, None]).T @ a)
         off = np.linalg.norm(b - a @ R.T, axis=1)
         weight = 1 / off.clip(1e-3)
     return R, off

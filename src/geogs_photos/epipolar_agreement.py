@@ -4,10 +4,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from geogs_photos.verified_matches import verified_matches
-
-MAX_ERROR = 4.0
-"""Pixels that a match may be from its epipolar line."""
+from geogs_photos.verified_matches import MAX_ERROR, verified_matches
 
 
 def agreement(model: Any, database: Path, pictures: Collection[int]) -> dict[int, float]:

@@ -11,6 +11,9 @@ from jaxtyping import Float64
 from geogs.geometry.epipolar import epipolar_distance, homogeneous
 from geogs_photos.pycolmap_library import load_colmap
 
+MAX_ERROR = 4.0
+"""Pixels that a match may be off what explains it, as from its epipolar line."""
+
 
 @dataclass(frozen=True, slots=True)
 class PairMatches:

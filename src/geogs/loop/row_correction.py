@@ -17,7 +17,7 @@ from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
-from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
+from geogs.tracking.frames.row_errors import SMALL, RowErrors, edge_shifts
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.tracker import Tracker
@@ -107,8 +107,8 @@ def _readout_gradient(
     options: BundleOptions,
 ) -> float:
     """Half the derivative of the cost by the factor on the readout, and of what was known of it."""
-    small, total = 0.02, (factor - 1) / errors.doubt**2
-    low, high = (errors.with_readout(factor + by) for by in (-small, small))
+    total = (factor - 1) / errors.doubt**2
+    low, high = (errors.with_readout(factor + by) for by in (-SMALL, SMALL))
     grid, keyframes = graph.keyframes.grid, graph.keyframes
     both = zip(_shifts(graph, measured, low), _shifts(graph, measured, high), strict=True)
     for (part, before), (_, after) in both:
@@ -118,7 +118,7 @@ def _readout_gradient(
         p = project(grid.camera, grid.rays, T, depth)
         middle = pixels + (before + after) / 2
         residual, weight = weighed_residuals(p, middle, weight, options.huber)
-        slope = (after - before) / (2 * small)
+        slope = (after - before) / (2 * SMALL)
         total += EVIDENCE * float((weight * residual * slope).double().sum())
     return total
 
