@@ -14,6 +14,7 @@ from geogs.errors import InputError
 from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
 from geogs.mesh.decimation.decimate import merged
+from geogs.mesh.denoise import denoised
 from geogs.mesh.device.clean import device_cleaned
 from geogs.mesh.device.surface import device_surface
 from geogs.mesh.device.tensor_mesh import TensorMesh
@@ -108,7 +109,7 @@ def extract_mesh(
     config: MeshConfig | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Mesh:
-    """Fuse depth maps; their surface, cleaned, coloured from the views' images and decimated.
+    """Fuse depth maps; their surface, cleaned, coloured from the images, decimated, smoothed.
 
     ``views`` is gone through up to four times (plan, count, fuse, colour) in order, so a lazy
     sequence may render on demand. Where a sample of the pixels says that the volume may come near
@@ -143,7 +144,7 @@ def extract_mesh(
         seen = seen_colours(surface.vertices, surface.normals, views, 2 * plan.voxel, report)
     if progress:
         progress("merge", 0, 1)
-    mesh = _merged_mesh(surface, seen, config.detail * plan.voxel)
+    mesh = _merged_mesh(surface, seen, config, plan.voxel)
     if progress:
         progress("merge", 1, 1)
     return mesh
@@ -177,15 +178,19 @@ def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
     return _Surface(*map(torch.from_numpy, (mesh.vertices, mesh.faces, mesh.normals)))
 
 
-def _merged_mesh(surface: _Surface, seen: tuple[Tensor, Tensor] | None, tolerance: float) -> Mesh:
-    """A surface on the host, decimated, with the colours of those of its vertices that were seen.
+def _merged_mesh(
+    surface: _Surface, seen: tuple[Tensor, Tensor] | None, config: MeshConfig, voxel: float
+) -> Mesh:
+    """A surface on the host, decimated and smoothed, with the colours of those of its vertices that
+    were seen.
 
     Others take theirs only now, when there are few.
     """
     vertices, faces = surface.vertices, surface.faces
-    few = merged(vertices, faces, tolerance)
+    few = merged(vertices, faces, config.detail * voxel)
     if few is not None:
-        vertices, faces = few.position.float(), few.faces
+        faces = few.faces
+        vertices = denoised(few.position, faces, config.smoothing * voxel).float()
         seen = None if seen is None else few.means(*seen)
     colours = None if seen is None else filled(vertices, *seen).cpu().numpy()
     normals = surface.normals if few is None else TensorMesh(vertices, faces.long()).normals()

@@ -89,7 +89,7 @@ def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers
 
 
 def joint_mesh(space: SpacePlan, config: MeshConfig, workers: Workers, device: str) -> Mesh:
-    """Fuse, extract, colour and decimate.
+    """Fuse, extract, colour, decimate and smooth.
 
     But for the colours of points that no image shows, the mesh is that of one volume.
 
@@ -106,7 +106,8 @@ def joint_mesh(space: SpacePlan, config: MeshConfig, workers: Workers, device: s
     if config.colour:
         colours = coloured(mesh, 2 * space.volume.voxel, space, workers)
         mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, colours)
-    return decimate(mesh, config.detail * space.volume.voxel)
+    voxel = space.volume.voxel
+    return decimate(mesh, config.detail * voxel, config.smoothing * voxel)
 
 
 def coloured(

@@ -11,6 +11,7 @@ from geogs.mesh.clean import remove_degenerate_faces
 from geogs.mesh.decimation.collapse import CollapsingMesh
 from geogs.mesh.decimation.deviation import deviations
 from geogs.mesh.decimation.device_deviation import surface_distances
+from geogs.mesh.denoise import denoised
 from geogs.mesh.triangle_mesh import Mesh, vertex_normals
 from geogs.threads import worker_count
 
@@ -28,8 +29,10 @@ _FEWEST = 200
 """Triangles below which nothing is gained."""
 
 
-def decimate(mesh: Mesh, tolerance: float) -> Mesh:
+def decimate(mesh: Mesh, tolerance: float, smoothing: float = 0.0) -> Mesh:
     """Collapse edges by quadric error for as long as the surface stays where it was.
+
+    What is left is smoothed, by which its vertices move by ``smoothing`` (map units) at most.
 
     Colours are the means of those of the vertices that each new one stands for. Of a mesh that
     this would not make smaller nothing changes. See :func:`merged`.
@@ -42,7 +45,8 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
         given = torch.from_numpy(mesh.colours).float()
         mean, _ = few.means(given, torch.ones(len(given), dtype=torch.bool))
         colours = (mean + 0.5).to(torch.uint8).numpy()
-    new = Mesh.from_triangles(few.position.numpy(), few.faces.numpy())
+    vertices = denoised(few.position, few.faces, smoothing)
+    new = Mesh.from_triangles(vertices.numpy(), few.faces.numpy())
     return remove_degenerate_faces(replace(new, colours=colours))
 
 
