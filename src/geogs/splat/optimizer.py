@@ -69,14 +69,6 @@ class MapOptimizer:
                     rate, self.betas, self.eps,
                 )  # fmt: skip
 
-    @property
-    def position_gradient(self) -> Float[Tensor, "n"]:
-        """Root mean square of each position's gradient over the last steps that saw the disk."""
-        last = self.disks.steps.clamp(max=len(self._corrections[1]) - 1)
-        correction = self._corrections[1][last].clamp(min=1e-6)
-        second = self.disks.second.position
-        return (second.sum(1) / correction.to(second)).sqrt()
-
     def _is_fused(self) -> bool:
         p = self.disks.position
         return p.device.type == "cpu" and p.dtype == torch.float32
