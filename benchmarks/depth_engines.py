@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from geogs.config import DepthConfig
-from geogs.depth.depth_engine import DepthEngine
+from geogs.depth.depth_engine import DepthEngine, DepthTask
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, depth_images
 from geogs.depth.engine_choice import depth_engine
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
@@ -183,7 +183,7 @@ def searched(
 
     def search(at: int) -> DenseDepth:
         some = [keyframes[j].view for j in neighbours_of(keyframes, at, render)]
-        (dense,) = engine.estimate([keyframes[at].view], [some])
+        (dense,) = engine.estimate([DepthTask(keyframes[at].view, some)])
         return dense
 
     start = time.perf_counter()

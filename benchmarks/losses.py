@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import LossAblation, LossConfig
+from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
@@ -74,21 +74,16 @@ def multi_view_cases() -> list[tuple[str, Step, Step]]:
     reference = PhotoView.prepare(image, PHOTO, torch.eye(4, dtype=torch.float64))
     target = PhotoView.prepare(image, PHOTO, aside)
 
-    def step(loss: Callable, config: LossConfig, pose: bool) -> Step:
+    def step(loss: Callable, pose: bool) -> Step:
         def run() -> None:
             moved = reference.at(reference.T_cw.clone().requires_grad_(pose))
-            loss(depth.clone().requires_grad_(), moved, target, depth, config).backward()
+            loss(depth.clone().requires_grad_(), moved, target, depth, LossConfig()).backward()
 
         return run
 
-    exact, sobel = (LossConfig(ablation=LossAblation(photo_gradient=g)) for g in ("exact", "sobel"))
     return [
-        (name, step(multi_view_loss, config, pose), step(fused_multi_view, config, pose))
-        for name, config, pose in (
-            ("multi view", exact, False),
-            ("multi view, Sobel", sobel, False),
-            ("multi view, with pose", exact, True),
-        )
+        (name, step(multi_view_loss, pose), step(fused_multi_view, pose))
+        for name, pose in (("multi view", False), ("multi view, with pose", True))
     ]
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import LossAblation, LossConfig
+from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
@@ -143,7 +143,6 @@ def main() -> None:
     window = Window.make(torch.device("cuda"))
     cases = {
         "default": LossConfig(),
-        "sobel": LossConfig(ablation=LossAblation(photo_gradient="sobel")),
         "with SSIM, smoothness": LossConfig(ssim_weight=0.2, smoothness_weight=0.1),
     }
     print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}\n")

@@ -18,6 +18,7 @@ from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
+from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import ViewPose
 from geogs.depth.estimate import estimate_depth
 from geogs.errors import InputError
@@ -315,12 +316,10 @@ def test_an_engine_searches_between_given_limits():
     scene = make_scene()
     views, cameras = scene.views[:3], (WORKING.resized(96, 72), WORKING)
     engine = CpuDepthEngine(*cameras, DEFAULT.mapping.depth.planes)
-    (depth,) = engine.estimate(views[:1], [views[1:]], limits=[(2.6, 5.0)])
+    (depth,) = engine.estimate([DepthTask(views[0], views[1:], (2.6, 5.0))])
     expected = estimate_depth(views[0], views[1:], *cameras, (2.6, 5.0))
     assert (depth.depth.numpy() == expected.depth).all()
-    (free,) = engine.estimate(views[:1], [views[1:]], limits=[None])
-    (default,) = engine.estimate(views[:1], [views[1:]])
-    assert (free.depth == default.depth).all()
+    (free,) = engine.estimate([DepthTask(views[0], views[1:])])
     assert not (depth.depth == free.depth).all()
 
 

@@ -12,7 +12,6 @@ from geogs.gpu.installation import require_device
 from geogs_train.course import Course, Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining
-from geogs_train.flow.bundle_course import BundleCourse
 from geogs_train.flow.flow_course import FlowCourse
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.pace import shared
@@ -46,10 +45,10 @@ def launch(
 
 
 def course_of(training: FlowTraining | DepthTraining, worker: Worker) -> Course:
-    """What the settings ask for. Raises InputError where they do not fit each other."""
+    """What the settings ask for."""
     if isinstance(training, DepthTraining):
         return DepthCourse(training, worker)
-    return (FlowCourse if training.stage == "flow" else BundleCourse)(training, worker)
+    return FlowCourse(training, worker)
 
 
 @contextmanager

@@ -25,7 +25,6 @@ CASES = {
     "--mapping.pose-lr 1e-3 --mapping.pose-iterations 0": "mapping.pose-lr does nothing",
     "--mapping.pose-every 1 --mapping.pose-iterations 0": "mapping.pose-every does nothing",
     "--mapping.when after --mapping.final-iterations 0": "mapping.when after does nothing",
-    "--mapping.final-pose-rounds 2 --mapping.pose-iterations 0": "final-pose-rounds does nothing",
     "--loop.matches --loop.no-enabled": "loop.matches does nothing",
     "--mapping.depth.engine classical --mapping.depth.weights x": "the engine classical has none",
     "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",

@@ -31,6 +31,7 @@ from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.cuda.images import KeyframeImages, packed
 from geogs.depth.cuda.plane_sweep import PlaneSlots, SweptDepth
 from geogs.depth.cuda.refinement import PixelPositions, SlantedMaps, TrackerMaps
+from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth, homographies
 from geogs.depth.edges import resolve_edges
 from geogs.depth.evidence import (
@@ -263,7 +264,7 @@ def test_grids_too_large_for_the_gpu_or_without_knowledge_are_completed_on_the_c
     for views in ([view, lost], [view]):
         for v in views:
             cuda.observe(v)
-        grids = cuda._complete([cuda._plan(v, []) for v in views]).cpu().numpy()
+        grids = cuda._complete([cuda._plan(DepthTask(v, [])) for v in views]).cpu().numpy()
         for got, v in zip(grids, views, strict=True):
             done = complete_inverse_depth(v.inverse_depth, v.information, v.image)
             assert np.abs(got[0] / done.inverse_depth - 1).max() < 1e-4
@@ -398,9 +399,9 @@ def test_sweep_of_a_view(setting):
 def test_whole_estimate(setting):
     cpu, cuda = _engines(setting)
     views = setting.scene.views
-    (expected,) = cpu.estimate(views[:1], [views[1:]])
+    (expected,) = cpu.estimate([DepthTask(views[0], views[1:])])
     done: list[float] = []
-    (depth,) = cuda.estimate(views[:1], [views[1:]], done.append)
+    (depth,) = cuda.estimate([DepthTask(views[0], views[1:])], done.append)
     assert done == [1.0]
     off = (depth.depth.cpu() / expected.depth - 1).abs()
     assert float((off < 1e-3).float().mean()) > 0.98
@@ -411,18 +412,21 @@ def test_whole_estimate(setting):
 
 def test_estimate_between_given_limits(setting):
     cpu, cuda = _engines(setting)
-    views, limits = setting.scene.views, [(2.6, 5.0)]
-    (expected,), (depth,) = (e.estimate(views[:1], [views[1:]], limits=limits) for e in (cpu, cuda))
+    views = setting.scene.views
+    tasks = [DepthTask(views[0], views[1:], (2.6, 5.0))]
+    (expected,), (depth,) = (e.estimate(tasks) for e in (cpu, cuda))
     off = (depth.depth.cpu() / expected.depth - 1).abs()
     assert float((off < 1e-3).float().mean()) > 0.98
 
 
 def test_without_neighbours_the_completed_tracker_remains(setting):
     cpu, cuda = _engines(setting)
-    (expected,), (depth,) = (e.estimate(setting.scene.views[:1], [[]]) for e in (cpu, cuda))
+    (expected,), (depth,) = (
+        e.estimate([DepthTask(setting.scene.views[0], [])]) for e in (cpu, cuda)
+    )
     _close(depth.depth, expected.depth.numpy(), 1e-5)
     _close(depth.confidence, expected.confidence.numpy(), 1e-5)
-    assert cuda.estimate([], []) == []
+    assert cuda.estimate([]) == []
 
 
 @pytest.mark.parametrize("how", ["bad values", "nothing known, black images"])
@@ -437,7 +441,7 @@ def test_hopeless_input_gives_finite_depth(setting, how):
         black = {"grey": 0 * v.grey, "fine": 0 * v.fine, "image": 0 * v.image}
         views = [replace(v, information=0 * v.information, **black) for v in views]
     _, cuda = _engines(setting)
-    (depth,) = cuda.estimate(views[:1], [views[1:]])
+    (depth,) = cuda.estimate([DepthTask(views[0], views[1:])])
     assert bool(torch.isfinite(depth.depth).all() & (depth.depth > 0).all())
     assert bool(torch.isfinite(depth.confidence).all())
     if how != "bad values":

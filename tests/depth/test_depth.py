@@ -13,6 +13,7 @@ from geogs import threads
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
 from geogs.depth.classical import CpuDepthEngine
+from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth, ViewPose
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
@@ -147,7 +148,9 @@ def test_check_lowers_the_confidence_of_a_floater_and_averages_noise(scene, dept
 def test_the_cpu_engine_is_the_functions(scene, depths):
     engine = CpuDepthEngine(RENDER, WORKING, DepthConfig.planes)
     views = scene.views
-    dense = engine.estimate(views[:2], [[v for v in views if v.id != i] for i in range(2)])
+    dense = engine.estimate(
+        [DepthTask(views[i], [v for v in views if v.id != i]) for i in range(2)]
+    )
     posed = [PosedDepth(v.T_cw, DenseDepth.of(d)) for v, d in zip(views, depths, strict=True)]
     for got, expected in zip(dense, depths, strict=False):
         assert np.array_equal(got.depth.numpy(), expected.depth)

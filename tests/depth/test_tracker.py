@@ -6,6 +6,7 @@ import torch
 
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.config import DepthConfig, MappingConfig, ReconstructConfig
+from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import PosedDepth
 from geogs.depth.engine_choice import depth_engine
 from geogs.depth.tracker_depth import TrackerDepthEngine, enlarged_depth
@@ -51,7 +52,7 @@ def test_the_engine_searches_nothing_and_leaves_depths_alone():
     scene = make_scene()
     engine = depth_engine("cpu", RENDER, WORKING, DepthConfig(engine="tracker"), 8)
     assert isinstance(engine, TrackerDepthEngine)
-    (dense,) = engine.estimate(scene.views[:1], [scene.views[1:]])
+    (dense,) = engine.estimate([DepthTask(scene.views[0], scene.views[1:])])
     sure = dense.confidence > 0
     error = (dense.depth / torch.from_numpy(scene.truth[0]) - 1).abs()
     assert error[sure].median() < 0.03

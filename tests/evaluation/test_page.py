@@ -51,7 +51,7 @@ def test_page_holds_everything_escaped_and_in_order(tmp_path):
             TableSection(
                 "errors", ("scene", "Acc (cm)"), [("a<b", "1.25"), ("  c", "x")], "a note"
             ),
-            PictureSection("mesh", tmp_path / "a b.png", 'from "above"'),
+            PictureSection('mesh "from above"', tmp_path / "a b.png"),
             PictureSection("gone", tmp_path / "gone.png"),
             TextSection("settings", '{\n  "seed": 0\n}'),
         ],
@@ -60,14 +60,18 @@ def test_page_holds_everything_escaped_and_in_order(tmp_path):
     text = page.read_text(encoding="utf-8")
     found = Elements(text)
     assert found.stack == []
-    assert [t for tag, t in found.texts if tag == "h2"] == ["errors", "mesh", "settings"]
+    assert [t for tag, t in found.texts if tag == "h2"] == [
+        "errors",
+        'mesh "from above"',
+        "settings",
+    ]
     assert [t for tag, t in found.texts if tag == "td"] == ["a<b", "1.25", "  c", "x"]
     assert [t for tag, t in found.texts if tag == "th"] == ["scene", "Acc (cm)"]
     assert ("h1", "results of <room> & @body") in found.texts
     assert ("pre", '{\n  "seed": 0\n}') in found.texts
     assert ("p", "a note") in found.texts
     assert ("src", "../a%20b.png") in found.attributes
-    assert ("alt", 'from "above"') in found.attributes
+    assert ("alt", 'mesh "from above"') in found.attributes
     assert "gone" not in text
     assert "<script" not in text
     assert "http" not in text

@@ -76,7 +76,6 @@ def photo_case(seed: int) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Ten
 
 MULTI = {
     "default": LossConfig(),
-    "sobel": LossConfig(ablation=LossAblation(photo_gradient="sobel")),
     "ncc 5": LossConfig(l1_weight=0.0, ncc_patch=5, ncc_reject=1.5),
     "l1 plain": LossConfig(ncc_weight=0.0, l1_huber=0.0, l1_cut=1.0),
     "ssim": LossConfig(ssim_weight=0.4),

@@ -240,11 +240,6 @@ PAIRS = {
     "colour": {"ssim_weight": 0.3, "l1_weight": 1.0, "ncc_weight": 0.5, "colour": True},
     "tau": {"l1_weight": 1.0, "occlusion_ratio": 0.05},
     "ssim, l1": {"ssim_weight": 0.3, "l1_weight": 1.0},
-    "sobel": {
-        "l1_weight": 1.0,
-        "ncc_weight": 0.5,
-        "ablation": LossAblation(photo_gradient="sobel"),
-    },
 }
 EVERYTHING = replace(
     LossConfig(), normal_weight=0.1, smoothness_weight=0.1, ssim_weight=0.3,

@@ -15,7 +15,6 @@ from geogs.losses.multi_view import (
     enlarge_depth,
     multi_view_loss,
     occlusion_mask,
-    sample_image,
     warp,
 )
 from geogs.losses.photometric import MIN_COVERAGE, ssim
@@ -103,19 +102,6 @@ def test_enlarged_depth_is_exact_where_linear_and_keeps_holes() -> None:
     inner = torch.zeros_like(known)
     inner[1:-1, 1:-1] = True
     torch.testing.assert_close(big[known & inner], expected.double()[known & inner])
-
-
-def test_sobel_gives_the_value_of_the_interpolation_and_the_slope_of_the_filter() -> None:
-    rng = np.random.default_rng(0)
-    image = torch.from_numpy(rng.random((9, 10)))
-    pixels = torch.tensor([[3.0, 4.0], [5.25, 2.5]]).double().requires_grad_()
-    values = sample_image(image, pixels, "sobel")
-    torch.testing.assert_close(values, sample_image(image, pixels, "exact"))
-    (slope,) = torch.autograd.grad(values[0], pixels)
-    patch = image[3:6, 2:5]
-    across = (patch[:, 2] - patch[:, 0]) @ torch.tensor([1.0, 2.0, 1.0]).double() / 8
-    down = (patch[2] - patch[0]) @ torch.tensor([1.0, 2.0, 1.0]).double() / 8
-    torch.testing.assert_close(slope[0], torch.stack([across, down]))
 
 
 def test_gradients_match_finite_differences() -> None:

@@ -161,33 +161,6 @@ def test_disturbed_poses_are_drawn_back_by_the_map(mapper, sequence):
         mapper.keyframes[i].T_cw = true[i]
 
 
-def test_the_final_training_draws_poses_back_if_it_is_to(sequence):
-    """All but the first are off by a few millimetres; windows of four overlap by two."""
-    true = {n: k.T_cw for n, k in enumerate(sequence[0][:6])}
-
-    def error(mapper: Mapper) -> float:
-        centres = [
-            torch.linalg.inv(mapper.keyframes[i].T_cw)[:3, 3] - torch.linalg.inv(true[i])[:3, 3]
-            for i in true
-        ]
-        return 100 * float(torch.stack(centres).norm(dim=1).mean())
-
-    config = replace(
-        MAPPING, window=4, final_iterations=6, final_depth=False, final_pose_rounds=2,
-        pose_iterations=15, pose_lr=6e-4,
-    )  # fmt: skip
-    mapper = build(sequence[0][:6], config)
-    g = torch.Generator().manual_seed(1)
-    for i in list(true)[1:]:
-        xi = torch.randn(6, dtype=torch.float64, generator=g) * 0.003
-        mapper.keyframes[i].T_cw = retract(xi, true[i])
-    start = error(mapper)
-    mapper.refine()
-    assert torch.equal(mapper.keyframes[0].T_cw, true[0])
-    # Little: the first of every window holds, with what it is wrong by.
-    assert error(mapper) < 0.97 * start
-
-
 def correct(mapper: Mapper, correction: PoseCorrection) -> MapUpdate:
     """Let the keyframes take over a correction, and the map follow."""
     segment = mapper.keyframes.set_of[0]

@@ -21,9 +21,8 @@ from geogs.tracking.flow.own_network import (
 )
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_train.course import Worker
-from geogs_train.flow.bundle import reproject
 from geogs_train.flow.flow_loss import descriptor_loss, flow_loss
-from geogs_train.flow.flow_options import BundleTraining, FlowTraining
+from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 from geogs_train.flow.flow_scores import CellErrors, has_texture, summarise
 from geogs_train.flow.starts import StartOptions, disturbed_starts
@@ -276,33 +275,6 @@ def test_resuming_nothing_is_one_sentence(tmp_path, capsys):
     (tmp_path / "checkpoint.safetensors").write_bytes(b"rubbish")
     assert main(["train", "flow", str(tmp_path), "--run.resume", "--device", "cpu"]) == 2
     assert "is damaged" in capsys.readouterr().err
-
-
-def test_the_second_stage_begins_near_the_truth_and_learns_from_what_is_adjusted():
-    options = replace(
-        TINY, stage="bundle", rooms=replace(ROOMS, views=4), bundle=BundleTraining(rounds=2)
-    )
-    trainer = trainer_of(options)
-    batch = trainer.course.batch(0, 0.0)
-    assert torch.equal(batch.start.T_cw[:, :2], batch.truth.T_cw[:, :2])
-    assert not torch.equal(batch.start.T_cw[:, 2:], batch.truth.T_cw[:, 2:])
-    scale = batch.truth.inverse_depth.median()
-    assert float(scale) == pytest.approx(1.0)
-    # Truth reprojects to the exact flow of the clip.
-    clips = trainer.course.rooms.sample(0, 1)
-    exact = clips.flow(0, 1).pixels[:, 4::8, 4::8].flatten(1, 2)
-    edge = next(
-        n
-        for n, pair in enumerate(zip(batch.edges.source, batch.edges.target, strict=True))
-        if pair == (0, 1)
-    )
-    found = reproject(batch.cameras, batch.truth, batch.edges).pixels[:, edge]
-    torch.testing.assert_close(found.float(), exact, atol=2e-2, rtol=1e-3)
-    loss = trainer.course.loss(trainer.network, batch)
-    loss.backward()
-    head = trainer.network.update.head[-1].bias.grad
-    assert head.isfinite().all()
-    assert (head[[0, 1, 2, 3, 6]].abs() > 0).all()  # flow, deviations and share all learn
 
 
 def test_the_weight_in_the_adjustment_is_that_of_a_matched_cell():

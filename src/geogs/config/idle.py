@@ -46,11 +46,6 @@ def _run(config: Config) -> Iterator[str]:
         yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."
     if mapping.pose_iterations == 0 and mapping.pose_every != MappingConfig.pose_every:
         yield "mapping.pose-every does nothing: mapping.pose-iterations is 0."
-    if mapping.final_pose_rounds and 0 in (mapping.final_iterations, mapping.pose_iterations):
-        yield (
-            "mapping.final-pose-rounds does nothing: it needs mapping.final-iterations and "
-            "mapping.pose-iterations above 0."
-        )
     if config.loop.matches and not config.loop.enabled:
         yield "loop.matches does nothing: no loops are looked for."
 

@@ -1,7 +1,7 @@
 """Weights and thresholds of the mapping losses."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 from geogs.config.setting import CountOrZero, Fraction, Only, Positive, Range, Settings, Weight
 
@@ -14,8 +14,6 @@ class LossAblation(Settings, group="mapping.loss.ablation"):
     """Relative depth error times confidence; off for the plain difference in map units."""
     smoothness_rewards_edges: bool = False
     """Add the second printed term of L_ds, which wants a depth step at every image edge."""
-    photo_gradient: Literal["exact", "sobel"] = "exact"
-    """Image derivative of the warp: of the bilinear interpolation, or of a 3x3 Sobel filter."""
 
 
 @dataclass(frozen=True)

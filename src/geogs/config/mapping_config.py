@@ -53,9 +53,6 @@ class DiskConfig(Settings, group="mapping.disk"):
     """Largest standard deviation, in u."""
     min_scale: Annotated[float, Range(1e-9, "max_scale")] = 4e-4
     """Smallest standard deviation, in u."""
-    split_ratio: Annotated[float, Range(0, below=1)] = 0.0
-    """Part of the disks that is split in two, where the losses pull hardest, each time that the
-    training over all keyframes reaches a split."""
     carve: bool = True
     """Remove disks that stand in the free space of keyframes, and make none there."""
 
@@ -132,9 +129,6 @@ class MappingConfig(Settings, group="mapping"):
     auto: 600 on a CPU, 3000 on a GPU, where they take a few seconds."""
     final_depth: Annotated[bool, Only("run")] = True
     """Search the depths of a map that was made on the way once more with the final poses."""
-    final_pose_rounds: Annotated[CountOrZero, Only("run")] = 0
-    """Times that the final training pauses to refine the poses of all keyframes against the map, in
-    windows that overlap by half; 0 leaves them to the final bundle adjustment."""
     lr_position: Weight = 6e-4
     """Adam step of positions, in u."""
     lr_final: Annotated[float, Range(1e-9, 1)] = 0.1

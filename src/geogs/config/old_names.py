@@ -10,7 +10,6 @@ from geogs.errors import InputError
 RENAMED = {
     "loop.strain": "loop.residual",
     "mapping.depth.max-planes": "mapping.depth.planes",
-    "mapping.disk.split-share": "mapping.disk.split-ratio",
     "mapping.loss.occlusion-share": "mapping.loss.occlusion-ratio",
     "mapping.photo.level": "mapping.photo.compensate-exposure",
     "mapping.photo.looking-within": "mapping.photo.max-view-angle",
@@ -45,10 +44,12 @@ _REMOVED = {
         "vote-support vote-violation window"
     ),
     "mapping.disk": (
-        "carve-every insert-alpha insert-behind neighbours prune-opacity split-pixels split-times"
+        "carve-every insert-alpha insert-behind neighbours prune-opacity split-pixels split-ratio "
+        "split-share split-times"
     ),
-    "mapping": "history lr-opacity lr-quaternion lr-scale",
+    "mapping": "final-pose-rounds history lr-opacity lr-quaternion lr-scale",
     "mapping.loss": "min-alpha ncc-min-coverage ncc-min-variance smoothness-eta",
+    "mapping.loss.ablation": "photo-gradient",
     "mapping.photo": "max-parallax min-parallax parallax",
     "mesh": "close-holes max-depth min-component-fraction voxel-per-pixel",
     "odometry": "agreement rotation",

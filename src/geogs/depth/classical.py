@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import Limits, Progress, silent
+from geogs.depth.depth_engine import DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
 from geogs.geometry.camera import Camera
 from geogs.threads import thread_map
@@ -32,23 +32,15 @@ class CpuDepthEngine:
     def observe(self, view: DepthView) -> None:
         """As in the protocol; here nothing is kept."""
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol."""
         from geogs.depth.estimate import estimate_depth
 
-        def one(task: tuple[DepthView, Sequence[DepthView], Limits | None]) -> DenseDepth:
-            reference, others, searched = task
+        def one(task: DepthTask) -> DenseDepth:
             cameras = self.render, self.working
-            return DenseDepth.of(estimate_depth(reference, others, *cameras, searched, self.planes))
+            found = estimate_depth(task.view, task.neighbours, *cameras, task.limits, self.planes)
+            return DenseDepth.of(found)
 
-        searched = limits or [None] * len(references)
-        tasks = list(zip(references, neighbours, searched, strict=True))
         return thread_map(one, tasks, progress)
 
     def check(

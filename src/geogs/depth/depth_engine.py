@@ -1,7 +1,7 @@
 """What the mapper asks of whatever finds keyframe depths."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -12,6 +12,16 @@ Progress = Callable[[float], None]
 """Called with the finished fraction."""
 Limits = tuple[float, float]
 """Nearest and farthest depth to search, map units."""
+
+
+class DepthTask(NamedTuple):
+    """A keyframe whose depth is searched."""
+
+    view: DepthView
+    neighbours: Sequence[DepthView]
+    """What it is matched with, best first."""
+    limits: Limits | None = None
+    """Nearest and farthest depth to search; none leaves them to the tracker."""
 
 
 def silent(fraction: float) -> None:
@@ -26,17 +36,8 @@ class DepthEngine(Protocol):
         """A view that others will be matched with: prepare what depends on its image alone."""
         ...
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
-        """Dense depth of every reference, matched with its neighbours (``estimate_depth``).
-
-        ``limits`` are the nearest and farthest depth to search; none leaves them to the tracker.
-        """
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
+        """Dense depth of every task's keyframe (``estimate_depth``)."""
         ...
 
     def check(
@@ -79,6 +80,8 @@ class AlternativeSearch:
 
     def __init__(self, classical: DepthEngine) -> None:
         self.classical = classical
+        self.keep, self.photo_costs = classical.keep, classical.photo_costs
+        self.farther_surface = classical.farther_surface
 
     def observe(self, view: DepthView) -> None:
         """As in the protocol."""
@@ -89,24 +92,3 @@ class AlternativeSearch:
     ) -> list[DenseDepth]:
         """As in the protocol."""
         return self.classical.check(depths, others)
-
-    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """As in the protocol."""
-        return self.classical.keep(points, depths)
-
-    def photo_costs(
-        self,
-        view: DepthView,
-        others: Sequence[DepthView],
-        depths: Float[Tensor, "2 h w"],
-        same: Bool[Tensor, "h w"],
-        asked: Bool[Tensor, "h w"] | None = None,
-    ) -> Float[Tensor, "2 h w"]:
-        """As in the protocol."""
-        return self.classical.photo_costs(view, others, depths, same, asked)
-
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
-        """As in the protocol."""
-        return self.classical.farther_surface(depth, reach, apart)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32
 
 from geogs.depth.completion import known_cells, upsample_grid
-from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
 from geogs.geometry.camera import Camera
 
@@ -50,18 +50,10 @@ class TrackerDepthEngine(AlternativeSearch):
     def observe(self, view: DepthView) -> None:
         """As in the protocol; nothing is matched."""
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol; neighbours and limits say nothing."""
-        return [
-            self._dense(enlarged_depth(r.inverse_depth, r.information, self.working, self.render))
-            for r in references
-        ]
+        grids = ((task.view.inverse_depth, task.view.information) for task in tasks)
+        return [self._dense(enlarged_depth(*g, self.working, self.render)) for g in grids]
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -119,7 +118,10 @@ def enlarge_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float
 
 
 def bilinear(image: Float[Tensor, "h w *c"], pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "..."]:
-    """Bilinear samples of an image at pixel coordinates inside it, ``(*b, *c)``."""
+    """Bilinear samples of an image at pixel coordinates inside it, ``(*b, *c)``.
+
+    Paper Eq. bilinear_interpolation; its slope jumps where it crosses a pixel.
+    """
     height, width = image.shape[:2]
     x, y = pixels.unbind(-1)
     left = x.detach().floor().clamp(0, width - 2)
@@ -133,39 +135,6 @@ def bilinear(image: Float[Tensor, "h w *c"], pixels: Float[Tensor, "*b 2"]) -> F
     return upper * (1 - fy) + lower * fy
 
 
-def _sobel(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives along x and y in grey values per pixel, 3x3 Sobel, replicated border."""
-    channels = (image if image.ndim == 3 else image[..., None]).permute(2, 0, 1)[:, None]
-    padded = F.pad(channels, (1, 1, 1, 1), mode="replicate")
-    across = padded[..., 2:] - padded[..., :-2]
-    down = padded[..., 2:, :] - padded[..., :-2, :]
-    dx = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]) / 8
-    dy = (down[..., :-2] + 2 * down[..., 1:-1] + down[..., 2:]) / 8
-    dx, dy = (d[:, 0].permute(1, 2, 0).reshape(image.shape) for d in (dx, dy))
-    return dx, dy
-
-
-def sample_image(
-    image: Float[Tensor, "h w *c"],
-    pixels: Float[Tensor, "*b 2"],
-    gradient: Literal["exact", "sobel"] = "exact",
-) -> Float[Tensor, "..."]:
-    """Bilinear interpolation B: paper Eq. bilinear_interpolation.
-
-    ``exact`` differentiates the interpolation, whose slope jumps where it crosses a pixel.
-    ``sobel`` gives the same values with the slope of a 3x3 Sobel filter, which looks a pixel
-    further and does not jump, but is not the derivative of the value: descent then settles beside
-    the minimum of the loss (on a rendered room at 1.1 times the depth error, from any start).
-    """
-    if gradient == "exact":
-        return bilinear(image, pixels)
-    fixed = pixels.detach()
-    move = pixels - fixed
-    move = move[..., None, :] if image.ndim == 3 else move
-    dx, dy = (bilinear(d, fixed) for d in _sobel(image))
-    return bilinear(image, fixed) + dx * move[..., 0] + dy * move[..., 1]
-
-
 def warp(
     target_image: Float[Tensor, "th tw *c"],
     depth: Float[Tensor, "h w"],
@@ -173,7 +142,6 @@ def warp(
     target_camera: Camera,
     reference_T_cw: Float[Tensor, "4 4"],
     target_T_cw: Float[Tensor, "4 4"],
-    gradient: Literal["exact", "sobel"] = "exact",
 ) -> Warped:
     """The target image at the points of the reference's depth: paper Eqs. back_project, bilinear.
 
@@ -188,7 +156,7 @@ def warp(
     edge = pixels.new_tensor([target_camera.width - 1, target_camera.height - 1])
     in_view = front & (pixels >= 0).all(-1) & (pixels <= edge).all(-1)
     inside = torch.where(in_view[..., None], pixels, torch.zeros_like(pixels))
-    image = sample_image(target_image, inside, gradient)
+    image = bilinear(target_image, inside)
     mask = in_view if image.ndim == 2 else in_view[..., None]
     image = torch.where(mask, image, torch.zeros_like(image))
     return Warped(image, pixels, z, in_view)
@@ -276,15 +244,8 @@ def _plane_loss(
 ) -> Float[Tensor, ""]:
     grey = reference.grey.to(depth.dtype)
     big = enlarge_depth(depth, *grey.shape)
-    warped = warp(
-        target.grey.to(depth.dtype),
-        big,
-        reference.camera,
-        target.camera,
-        reference.T_cw,
-        target.T_cw,
-        config.ablation.photo_gradient,
-    )
+    image = target.grey.to(depth.dtype)
+    warped = warp(image, big, reference.camera, target.camera, reference.T_cw, target.T_cw)
     mask = warped.in_view
     if target_depth is not None:
         tolerance = occlusion_tolerance(config, target.camera)

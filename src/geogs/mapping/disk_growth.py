@@ -8,21 +8,11 @@ from geogs.config import MappingConfig
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import sure_jumps
-from geogs.splat.density import (
-    split,
-    spread_candidates,
-    unexplained,
-    worth_keeping,
-    worth_splitting,
-)
+from geogs.splat.density import spread_candidates, unexplained, worth_keeping
 from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
-from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.world.map import MapTable
 
-SPLIT_PIXELS = 1.0
-"""Disks with no standard deviation above this many pixels at the map's unit are not split: smaller
-ones show nothing more."""
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
 
@@ -78,16 +68,3 @@ class DiskGrowth:
         if self.config.ablation.initialisation == "random":
             new = turned_at_random(new, self.table.random.of_torch)
         disks.append(new, view.id)
-
-    def split(self, optimizer: MapOptimizer, unit: float) -> None:
-        """Split the disks that are pulled hardest; those below a pixel are small enough."""
-        config, disks = self.config.disk, self.table.disks
-        if config.split_ratio == 0:
-            return
-        pixel = unit / self.depths.views.arrays.cameras.render.fx
-        chosen = worth_splitting(
-            disks, optimizer.position_gradient, config.split_ratio, SPLIT_PIXELS * pixel
-        )
-        halves, ids = split(disks, chosen), disks.keyframe_id[chosen]
-        disks.keep(~chosen)
-        disks.append(halves, torch.cat([ids, ids]))

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import DepthSensorConfig
-from geogs.depth.depth_engine import DepthEngine, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView
+from geogs.depth.depth_engine import DepthEngine, DepthTask, Progress, silent
+from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision.segment_planes import planar_depth
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
@@ -51,11 +51,7 @@ class KeyframeDepths:
 
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
-            searches = [v.row.search for v in batch]
-            depths = self.engine.estimate(
-                [v.depth_view for v in batch], [self._neighbours(v) for v in batch], on,
-                [None if s is None else (s.near, s.far) for s in searches],
-            )  # fmt: skip
+            depths = self.engine.estimate([self._task(view) for view in batch], on)
             for view, depth in zip(batch, self._planar(batch, depths), strict=True):
                 view.set_depth(self._with_sensor(view, depth))
 
@@ -89,12 +85,14 @@ class KeyframeDepths:
         # Read one after the other where they are not in memory.
         return self.engine.keep(points, OnDemand(known, attrgetter("posed")))
 
-    def _neighbours(self, view: MapView) -> list[DepthView]:
-        """What a view is matched with."""
+    def _task(self, view: MapView) -> DepthTask:
+        """The search of a view's depth: with whom it is matched, and between which depths."""
         search = view.row.search
         depth = tracked_depth(view.keyframe) if search is None else search.typical
         around = self.views.near(view, self.views, CANDIDATES)
-        return [v.depth_view for v in self._placed(view, around, depth)]
+        neighbours = [v.depth_view for v in self._placed(view, around, depth)]
+        limits = None if search is None else (search.near, search.far)
+        return DepthTask(view.depth_view, neighbours, limits)
 
     def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
         """The other views from which a depth is best seen, best first."""

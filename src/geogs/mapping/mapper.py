@@ -252,9 +252,7 @@ class Mapper:
         """
         if not goes_on:
             self.table.place, self.table.order = TrainingPlace(), []
-        training = FullTraining(
-            self.table, self.views, self.trainer, self.growth, self.config, self.refine_poses
-        )
+        training = FullTraining(self.table, self.views, self.trainer, self.growth, self.config)
         training.run(steps, progress, until)
         self.growth.prune(self._mapped())
         self.table.disks.keep(self.table.disks.seen > 0)

@@ -1,14 +1,11 @@
 """Where the map needs disks, and which disks it can do without."""
 
-from math import log
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.geometry.lie import quaternion_to_matrix
 from geogs.splat.render import RenderOutput
-from geogs.world.disks import DiskParameters, GaussianMap
+from geogs.world.disks import GaussianMap
 
 INSERT_ALPHA = 0.4
 """A pixel gets a disk where the map's alpha is below this: most of the light passes ..."""
@@ -16,7 +13,6 @@ INSERT_BEHIND = 0.05
 """... or where the map lies this fraction of the depth behind a confident depth."""
 PRUNE_OPACITY = 0.05
 """Disks below this opacity are removed: they hardly show."""
-_SPLIT_SHRINK = 1.6
 
 
 def candidate_pixels(
@@ -80,49 +76,3 @@ def worth_keeping(disks: GaussianMap) -> Bool[Tensor, "n"]:
     finite = torch.stack([torch.isfinite(p).flatten(1).all(1) if p.ndim > 1 else torch.isfinite(p)
                           for p in disks.parameters]).all(0)  # fmt: skip
     return finite & (disks.opacity > PRUNE_OPACITY)
-
-
-def worth_splitting(
-    disks: GaussianMap, gradient: Float[Tensor, "n"], fraction: float, smallest: float
-) -> Bool[Tensor, "n"]:
-    """The ``fraction`` of all disks on which the losses pull hardest, if they are large enough.
-
-    A disk that fits its part of the surface is pulled to no side for long; one that is too large
-    for it is pulled by every view somewhere else, and ``gradient``, the root mean square of its
-    position's gradient, stays high. Only disks whose larger standard deviation exceeds ``smallest``
-    (map units) can be split.
-    """
-    large = disks.scale.amax(1) > smallest
-    count = min(int(fraction * len(disks)), int(large.sum()))
-    chosen = torch.zeros_like(large)
-    if count:
-        pull = torch.where(large, gradient, -1.0)
-        chosen[pull.topk(count).indices] = True
-    return chosen
-
-
-@torch.no_grad()
-def split(disks: GaussianMap, chosen: Bool[Tensor, "n"]) -> DiskParameters:
-    """Two halves of every chosen disk, side by side along its longer axis.
-
-    Their centres lie one standard deviation from each other about the old one, and each is 1.6
-    times smaller along that axis (3DGS's factor). Both halves in their plane, unlike 3DGS.
-    """
-    scale = disks.scale[chosen]
-    longer = scale.argmax(1)
-    rows = torch.arange(len(scale), device=scale.device)
-    position, quaternion, _, opacity_logit = (p.detach()[chosen] for p in disks.parameters)
-    axes = quaternion_to_matrix(quaternion)
-    offset = 0.5 * scale[rows, longer, None] * axes[rows, :, longer]
-    log_scale = scale.log()
-    log_scale[rows, longer] -= log(_SPLIT_SHRINK)
-
-    def twice(x: Tensor) -> Tensor:
-        return torch.cat([x, x])
-
-    return DiskParameters(
-        torch.cat([position - offset, position + offset]),
-        twice(quaternion),
-        twice(log_scale),
-        twice(opacity_logit),
-    )

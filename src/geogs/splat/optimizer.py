@@ -9,6 +9,9 @@ from torch import Tensor
 
 from geogs.world.disks import GaussianMap
 
+BETAS, EPSILON = (0.9, 0.99), 1e-8
+"""Of Adam: decay of both moments, and what is added to the root of the second."""
+
 
 class LearningRates(NamedTuple):
     """Adam step sizes per group."""
@@ -28,19 +31,10 @@ class MapOptimizer:
     count. The moments are the map's, and follow where disks come, go and move.
     """
 
-    def __init__(
-        self,
-        disks: GaussianMap,
-        learning_rates: LearningRates,
-        betas: tuple[float, float] = (0.9, 0.99),
-        eps: float = 1e-8,
-    ) -> None:
+    def __init__(self, disks: GaussianMap, learning_rates: LearningRates) -> None:
         self.disks = disks
         self.learning_rates = learning_rates
-        self.betas = betas
-        self.eps = eps
-        device = disks.device
-        first, second = (_bias_corrections(beta).to(device) for beta in betas)
+        first, second = (_bias_corrections(beta).to(disks.device) for beta in BETAS)
         self._corrections = (first, second)
 
     def zero_grad(self) -> None:
@@ -66,16 +60,8 @@ class MapOptimizer:
             if p.grad is not None:
                 update(
                     p, p.grad, m, v, visible, disks.steps, self._corrections,
-                    rate, self.betas, self.eps,
+                    rate, BETAS, EPSILON,
                 )  # fmt: skip
-
-    @property
-    def position_gradient(self) -> Float[Tensor, "n"]:
-        """Root mean square of each position's gradient over the last steps that saw the disk."""
-        last = self.disks.steps.clamp(max=len(self._corrections[1]) - 1)
-        correction = self._corrections[1][last].clamp(min=1e-6)
-        second = self.disks.second.position
-        return (second.sum(1) / correction.to(second)).sqrt()
 
     def _is_fused(self) -> bool:
         p = self.disks.position
@@ -106,5 +92,5 @@ def adam_reference(
 
 def _bias_corrections(beta: float) -> Float[Tensor, "t"]:
     """1 - beta^t for t = 0, 1, ... until it is one in float32."""
-    count = max(2, math.ceil(math.log(1e-8) / math.log(beta)) + 1) if beta > 0 else 2
+    count = math.ceil(math.log(1e-8) / math.log(beta)) + 1
     return 1 - beta ** torch.arange(count, dtype=torch.float64)

@@ -1,21 +1,19 @@
-"""The flow network's course in the first stage of its training: flow of pairs of views."""
+"""The flow network's course: flow of pairs of views."""
 
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.tracking.flow.own_network import FlowNetwork, load_flow_network
-from geogs_synth.clips.clip_batch import ClipBatch
 from geogs_synth.clips.room_options import SCENE_KINDS
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.ahead import PlansAhead
 from geogs_train.course import Panels, Worker
 from geogs_train.flow.flow_loss import flow_loss, run_network
 from geogs_train.flow.flow_options import FlowTraining
-from geogs_train.flow.flow_pairs import flow_batch
+from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
 from geogs_train.flow.flow_validation import SceneScores, SceneValidation
 from geogs_train.flow.starts import StartOptions
 from geogs_train.trained_weights import write_weights
@@ -59,20 +57,16 @@ class FlowCourse:
         network.encoder.compile(dynamic=False)
         network.update.compile(dynamic=False)
 
-    def batch(self, step: int, progress: float) -> Any:
-        """As in the protocol."""
+    def batch(self, step: int, progress: float) -> FlowBatch:
+        """Every ordered pair of neighbouring views, from disturbed starts; all that is random is
+        drawn here."""
         clips = self.rooms.film(self._plans.plan(step))
         generator = torch.Generator(self.worker.device)
         generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
         with torch.no_grad():
-            return self.prepare(clips, generator)
+            return flow_batch(clips, StartOptions(far=self.options.far), generator)
 
-    def prepare(self, clips: ClipBatch, generator: torch.Generator) -> Any:
-        """Every ordered pair of neighbouring views, from disturbed starts; all that is random is
-        drawn here."""
-        return flow_batch(clips, StartOptions(far=self.options.far), generator)
-
-    def loss(self, network: FlowNetwork, batch: Any) -> Float[Tensor, ""]:
+    def loss(self, network: FlowNetwork, batch: FlowBatch) -> Float[Tensor, ""]:
         """The flow of all iterations and its likelihood."""
         found = run_network(network, batch, self.options.iterations)
         return flow_loss(*found, batch, self.options)

@@ -39,21 +39,16 @@ def flow_loss(
 ) -> Float[Tensor, ""]:
     """Loss of all iterations (later ones count more) and of the upsampled flow of the last.
 
-    With the ``joint`` likelihood a cell's flow and its uncertainty are trained by the negative
-    log-likelihood of the error (and by a little of its size, which keeps hopeless cells learning);
-    with the ``separate`` one the flow is trained by the absolute error alone.
+    A cell's flow and its uncertainty are trained by the negative log-likelihood of the error, and
+    by a little of its size, which keeps hopeless cells learning.
     """
     truth, weight = batch.at_cells(batch.truth), _weights(batch, options)
     at_cells = batch.at_cells(weight)
     total = truth.new_zeros(())
     for n, estimate in enumerate(estimates):
         error = (truth - estimate.pixels).clamp(-MAX_ERROR, MAX_ERROR)
-        if options.likelihood == "joint":
-            value = estimate.error.negative_log_likelihood(error)
-            value = value + options.absolute * error.abs().log1p().mean(-1)
-        else:
-            value = 0.2 * estimate.error.negative_log_likelihood(error.detach())
-            value = error.abs().mean(-1) + value
+        value = estimate.error.negative_log_likelihood(error)
+        value = value + options.absolute * error.abs().log1p().mean(-1)
         total = total + options.decay ** (len(estimates) - 1 - n) * _mean(value, at_cells)
     missed = (batch.flow - dense).clamp(-MAX_ERROR, MAX_ERROR).abs()
     total = total + options.dense * _mean(missed.log1p().mean(-1), weight)

@@ -1,36 +1,18 @@
 """Settings of the training of the flow network."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
-from geogs.config.setting import Count, Fraction, Range, Settings, Weight
+from geogs.config.setting import Count, Fraction, Range, Weight
 from geogs.tracking.flow.own_options import NetworkOptions
 from geogs_synth.clips.room_options import RoomOptions, SceneWeights
 from geogs_train.training_options import TrainingSchedule
 
 
 @dataclass(frozen=True)
-class BundleTraining(Settings, group="training.bundle"):
-    """The second stage, through the dense bundle adjustment."""
-
-    rounds: Count = 3
-    """Rounds of flow and adjustment."""
-    reach: Count = 2
-    """Views of a clip at most so far apart are matched."""
-    pose: Weight = 10.0
-    """Weight of the error of relative poses, median depths plus radians."""
-    flow: Weight = 0.05
-    """Weight of the error of the flow that poses and depths induce, pixels."""
-    likelihood: Weight = 0.3
-    """Weight of the likelihood of the network's own flow."""
-
-
-@dataclass(frozen=True)
 class FlowTraining(TrainingSchedule):
     """What a training run of the flow network does."""
 
-    stage: Literal["flow", "bundle"] = "flow"
-    """Pairs of views with exact flow, or clips through the dense bundle adjustment."""
     batch: Count = 16
     """Clips per step and device."""
     rooms: RoomOptions = field(
@@ -47,15 +29,12 @@ class FlowTraining(TrainingSchedule):
     """Iterations of the network per edge."""
     decay: Annotated[float, Range(1e-9, 1)] = 0.8
     """Weight of an iteration's loss relative to the next."""
-    likelihood: Literal["joint", "separate"] = "joint"
-    """Whether the likelihood of the error trains the flow, too, or an absolute error does."""
     absolute: Weight = 0.3
-    """Weight of log(1 + absolute error in pixels) beside a joint likelihood."""
+    """Weight of log(1 + absolute error in pixels) beside the likelihood of the error."""
     dense: Weight = 0.5
     """Weight of the same of the upsampled flow after the last iteration."""
     descriptors: Weight = 0.3
     """Weight of the cross-entropy between correlation windows and where the truth lies in them."""
     occluded: Weight = 0.3
     """Weight of cells that the other view does not see, relative to those that it sees."""
-    bundle: BundleTraining = field(default_factory=BundleTraining)
     network: NetworkOptions = field(default_factory=NetworkOptions)

@@ -8,7 +8,7 @@ import torch
 
 from depth_scene import RENDER, WORKING, DepthScene, make_scene, trace
 from geogs.config import DepthConfig
-from geogs.depth.depth_engine import DepthEngine
+from geogs.depth.depth_engine import DepthEngine, DepthTask
 from geogs.depth.depth_view import PosedDepth
 from geogs.depth.engine_choice import depth_engine
 from geogs.depth.network import engine as network_engine
@@ -33,7 +33,7 @@ def engine() -> DepthEngine:
 
 @pytest.fixture(scope="module")
 def found(scene, engine):
-    return engine.estimate([scene.views[0]], [scene.views[1:4]])[0]
+    return engine.estimate([DepthTask(scene.views[0], scene.views[1:4])])[0]
 
 
 def test_the_shipped_network_finds_depth_and_knows_how_well(scene, found):
@@ -67,13 +67,13 @@ def test_the_unit_of_length_does_not_matter(scene, engine, found):
         inverse, information = (view.inverse_depth / 7), view.information * 49
         grids = inverse.astype(np.float32), information.astype(np.float32)
         scaled.append(replace(view, T_cw=T_cw, inverse_depth=grids[0], information=grids[1]))
-    one = engine.estimate([scene.views[0]], [scene.views[1:3]])[0]
-    other = engine.estimate([scaled[0]], [scaled[1:]])[0]
+    one = engine.estimate([DepthTask(scene.views[0], scene.views[1:3])])[0]
+    other = engine.estimate([DepthTask(scaled[0], scaled[1:])])[0]
     torch.testing.assert_close(7 * one.depth, other.depth, rtol=2e-3, atol=0)
 
 
 def test_the_check_keeps_normals_and_without_neighbours_the_tracker_remains(scene, engine, found):
-    alone = engine.estimate([scene.views[1]], [[]])[0]
+    alone = engine.estimate([DepthTask(scene.views[1], [])])[0]
     assert alone.normal is None
     assert alone.confidence.max() <= 0.5
     posed = [PosedDepth(v.T_cw, d) for v, d in zip(scene.views, (found, alone), strict=False)]

@@ -9,6 +9,7 @@ import torch
 
 from depth_scene import make_scene
 from geogs.config import DepthConfig
+from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.engine_choice import depth_engine
 from geogs.depth.network.joint import AGREE, APART, REACH, VOTE, joined
@@ -70,7 +71,7 @@ def test_together_they_are_as_good_as_the_better_one():
     scene = make_scene(0, working, render)
     for name in ("classical", "network", "joint"):
         engine = depth_engine("cpu", render, working, DepthConfig(engine=name), 8)
-        found = engine.estimate([scene.views[0]], [scene.views[1:5]])[0]
+        found = engine.estimate([DepthTask(scene.views[0], scene.views[1:5])])[0]
         errors[name] = np.abs(found.depth.numpy() / scene.truth[0] - 1)
     right = {name: (error < 0.02).mean() for name, error in errors.items()}
     assert right["joint"] > max(right["classical"], right["network"]) - 0.005

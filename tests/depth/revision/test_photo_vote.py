@@ -11,7 +11,7 @@ from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.cuda import far_side as cuda_far_side
 from geogs.depth.cuda import photo_vote as cuda_photo_vote
 from geogs.depth.cuda.classical import CudaDepthEngine
-from geogs.depth.depth_engine import AlternativeSearch
+from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision.far_side import (
     APART,
@@ -209,8 +209,8 @@ class _Grown(AlternativeSearch):
         super().__init__(CpuDepthEngine(render, WORKING, 8))
         self.found = DenseDepth(depth, confidence, depth.median())
 
-    def estimate(self, references, neighbours, progress=None, limits=None):
-        return [self.found for _ in references]
+    def estimate(self, tasks, progress=None):
+        return [self.found for _ in tasks]
 
 
 def test_a_foreground_that_has_grown_gives_back_what_is_behind_it():
@@ -223,7 +223,7 @@ def test_a_foreground_that_has_grown_gives_back_what_is_behind_it():
     nearest = max_pool2d(ball / truth, 5, 1, 2)[0, 0]
     depth = torch.where(fringe, 1 / nearest.clamp(min=1e-6), truth)
     engine = FarSideSearch(_Grown(depth, torch.full_like(depth, 0.9), render))
-    (found,) = engine.estimate([scene.views[0]], [scene.views[1:]])
+    (found,) = engine.estimate([DepthTask(scene.views[0], scene.views[1:])])
     wrong = lambda z, where: float(((z / truth - 1).abs() > 0.05)[where].float().mean())  # noqa: E731
     assert round(REACH * 192) >= 3
     assert wrong(depth, fringe) > 0.95

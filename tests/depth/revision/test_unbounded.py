@@ -9,7 +9,7 @@ import torch
 
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.classical import CpuDepthEngine
-from geogs.depth.depth_engine import AlternativeSearch
+from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, depth_images
 from geogs.depth.revision.unbounded import FAR, SkySearch, unbounded
 from geogs.geometry.camera import Camera
@@ -99,8 +99,8 @@ class Found(AlternativeSearch):
         super().__init__(ENGINE)
         self.depth = depth
 
-    def estimate(self, references, neighbours, progress=None, limits=None):
-        return [self.depth for _ in references]
+    def estimate(self, tasks, progress=None):
+        return [self.depth for _ in tasks]
 
 
 def test_the_search_is_sure_of_no_sky():
@@ -108,7 +108,7 @@ def test_the_search_is_sure_of_no_sky():
     normal = torch.zeros(*depth.shape, 3)
     normal[..., 2] = -1
     given = replace(dense(depth), normal=normal)
-    (found,) = SkySearch(Found(given)).estimate([views[0]], [views[1:]])
+    (found,) = SkySearch(Found(given)).estimate([DepthTask(views[0], views[1:])])
     unsure = found.confidence == 0
     assert unsure[torch.from_numpy(inner(sky))].float().mean() > 0.95
     assert (found.confidence[~unsure] == given.confidence[~unsure]).all()

@@ -19,7 +19,7 @@ from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
 from geogs.depth.cuda.photo_vote import photo_costs
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
 from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
-from geogs.depth.depth_engine import Limits, Progress, silent
+from geogs.depth.depth_engine import DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
 from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
@@ -80,27 +80,20 @@ class CudaDepthEngine:
         self._pixels[view.id] = self._threads.submit(image_pixels, view)
         self._edges[view.id] = self._threads.submit(edge_weights, view.image, shape)
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol; at most 16 neighbours are used."""
-        usable = [list(n[:MAX_NEIGHBOURS]) for n in neighbours]
-        for view in (*references, *(v for group in usable for v in group)):
+        tasks = [DepthTask(t.view, t.neighbours[:MAX_NEIGHBOURS], t.limits) for t in tasks]
+        for view in (view for task in tasks for view in (task.view, *task.neighbours)):
             if view.id not in self._edges:
                 self.observe(view)
-        searched = limits or [None] * len(references)
-        plans = list(self._threads.map(self._plan, references, usable, searched))
+        plans = list(self._threads.map(self._plan, tasks))
         maps: list[tuple[Tensor, Tensor]] = []
         for start in range(0, len(plans), _BATCH):
             batch = slice(start, start + _BATCH)
             evidence = self._complete(plans[batch])
             for i, grids in enumerate(evidence, start):
-                maps.append(self._search(references[i], usable[i], plans[i], grids))
-                progress(len(maps) / len(references))
+                maps.append(self._search(tasks[i], plans[i], grids))
+                progress(len(maps) / len(tasks))
         return dense_depths(maps)
 
     def check(
@@ -152,9 +145,8 @@ class CudaDepthEngine:
         pixels = None if prepared is None else prepared.result()
         return KeyframeImages.of(view, self.device, pixels)
 
-    def _plan(
-        self, reference: DepthView, neighbours: list[DepthView], limits: Limits | None = None
-    ) -> SearchPlan:
+    def _plan(self, task: DepthTask) -> SearchPlan:
+        reference, neighbours, limits = task
         grid, information = reference.inverse_depth, reference.information
         known = known_cells(grid, information)
         typical = float(np.median(grid[known])) if known.any() else 0.0
@@ -176,13 +168,10 @@ class CudaDepthEngine:
         return upload(np.array(evidence, np.float32), self.device)
 
     def _search(
-        self,
-        reference: DepthView,
-        neighbours: list[DepthView],
-        plan: SearchPlan,
-        grids: Float32[Tensor, "3 gh gw"],
+        self, task: DepthTask, plan: SearchPlan, grids: Float32[Tensor, "3 gh gw"]
     ) -> tuple[Tensor, Tensor]:
         """Depth and confidence of one keyframe."""
+        reference, neighbours, _ = task
         device, own = self.device, self._images_of(reference)
         tracker = TrackerMaps.of(grids, self._positions)
         if not neighbours:

@@ -14,7 +14,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from geogs.depth.completion import known_cells
-from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_engine import (
+    AlternativeSearch,
+    DepthEngine,
+    DepthTask,
+    Limits,
+    Progress,
+    silent,
+)
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.search_range import SearchRange, search_range
@@ -81,22 +88,16 @@ class NetworkDepthEngine(AlternativeSearch):
             views = (black, others, self._intrinsics, lenses, poses, valid, one, 4 * one, 2 * one)
             self.network(StereoViews(*views))
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol; at most ``MOST_NEIGHBOURS`` are used."""
         found: list[DenseDepth] = []
-        searched = limits or [None] * len(references)
-        for reference, others, between in zip(references, neighbours, searched, strict=True):
-            if others:
-                found.append(self._search(reference, others[:MOST_NEIGHBOURS], between))
+        for task in tasks:
+            if task.neighbours:
+                few = task.neighbours[:MOST_NEIGHBOURS]
+                found.append(self._search(task.view, few, task.limits))
             else:
-                found += self.classical.estimate([reference], [[]], limits=[between])
-            progress(len(found) / len(references))
+                found += self.classical.estimate([task])
+            progress(len(found) / len(tasks))
         return found
 
     @torch.no_grad()

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, Limits, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
+from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, DepthTask, Progress, silent
+from geogs.depth.depth_view import DenseDepth, dense_depths
 
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""
@@ -30,35 +30,19 @@ class JointDepthEngine(AlternativeSearch):
         super().__init__(classical)
         self.network = network
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol."""
-        learned = self.network.estimate(
-            references, neighbours, lambda done: progress(0.5 * done), limits
-        )
-        searched = self.classical.estimate(
-            references, neighbours, lambda done: progress(0.5 + 0.5 * done), limits
-        )
+        learned = self.network.estimate(tasks, lambda done: progress(0.5 * done))
+        searched = self.classical.estimate(tasks, lambda done: progress(0.5 + 0.5 * done))
         return [
-            self._joined(view, others, s, n) if others else n
-            for view, others, s, n in zip(references, neighbours, searched, learned, strict=True)
+            self._joined(task, s, n) if task.neighbours else n
+            for task, s, n in zip(tasks, searched, learned, strict=True)
         ]
 
-    def _joined(
-        self,
-        reference: DepthView,
-        neighbours: Sequence[DepthView],
-        searched: DenseDepth,
-        learned: DenseDepth,
-    ) -> DenseDepth:
+    def _joined(self, task: DepthTask, searched: DenseDepth, learned: DenseDepth) -> DenseDepth:
         depths = torch.stack([searched.depth, learned.depth])
         same = agreement(searched, learned)
-        costs = self.classical.photo_costs(reference, neighbours, depths, same)
+        costs = self.classical.photo_costs(task.view, task.neighbours, depths, same)
         return joined(searched, learned, costs[0] - costs[1])
 
 

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from geogs.depth.depth_engine import AlternativeSearch, Limits, Progress, silent
+from geogs.depth.depth_engine import AlternativeSearch, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView
 from geogs.threads import thread_map
 
@@ -11,17 +11,15 @@ from geogs.threads import thread_map
 class RevisedSearch(AlternativeSearch, ABC):
     """Another engine's search, of which each depth is looked at once more by itself."""
 
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol."""
-        searched = self.classical.estimate(references, neighbours, progress, limits)
-        tasks = list(zip(references, neighbours, searched, strict=True))
-        return thread_map(lambda task: self.revised(*task), tasks)
+        searched = self.classical.estimate(tasks, progress)
+
+        def one(pair: tuple[DepthTask, DenseDepth]) -> DenseDepth:
+            task, found = pair
+            return self.revised(task.view, task.neighbours, found)
+
+        return thread_map(one, list(zip(tasks, searched, strict=True)))
 
     @abstractmethod
     def revised(

@@ -32,16 +32,14 @@ class PictureSection:
 
     heading: str
     file: Path
-    caption: str = ""
 
 
 @dataclass(frozen=True)
 class TextSection:
-    """Text under a heading, with its spaces and line ends kept where it is preformatted."""
+    """Text under a heading, with its spaces and line ends kept."""
 
     heading: str
     text: str
-    preformatted: bool = True
 
 
 @dataclass(frozen=True)
@@ -135,8 +133,7 @@ def _section(section: Section, folder: Path | None) -> str:
         case HtmlSection():
             return section.html
         case TextSection():
-            tag = "pre" if section.preformatted else "p"
-            return f"{_heading(section.heading)}<{tag}>{html.escape(section.text)}</{tag}>"
+            return f"{_heading(section.heading)}<pre>{html.escape(section.text)}</pre>"
 
 
 def _table(section: TableSection) -> str:
@@ -172,11 +169,9 @@ def _picture(section: PictureSection, folder: Path | None) -> str:
         place = quote(Path(os.path.relpath(section.file, folder)).as_posix())
     if not place:
         return ""
-    caption = section.caption or section.heading
-    below = f"<figcaption>{html.escape(section.caption)}</figcaption>" if section.caption else ""
-    image = f'<img src="{place}" alt="{html.escape(caption)}">'
+    image = f'<img src="{place}" alt="{html.escape(section.heading)}">'
     linked = image if folder is None else f'<a href="{place}">{image}</a>'
-    return f"{_heading(section.heading)}<figure>{linked}{below}</figure>"
+    return f"{_heading(section.heading)}<figure>{linked}</figure>"
 
 
 def _inside(file: Path) -> str:
@@ -224,7 +219,7 @@ th { font-weight: 600; } th:first-child, td:first-child { text-align: left; }
 tbody tr:hover { background: var(--box); }
 figure { margin: 0; } figure img { max-width: 100%; height: auto; border-radius: 6px;
   background: #fff; }
-figcaption, .note { color: var(--soft); font-size: 0.92em; margin: 0.4em 0; }
+.note { color: var(--soft); font-size: 0.92em; margin: 0.4em 0; }
 pre { background: var(--box); color: var(--soft); padding: 0.8em 1em; border-radius: 6px;
   overflow-x: auto; font-size: 0.87em; }
 """

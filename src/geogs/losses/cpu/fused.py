@@ -110,10 +110,9 @@ class _MultiView(torch.autograd.Function):
         extra = np.empty((3, height, width) if with_pose else (3, 0, 0), np.float32)
         fields = np.empty((3, height, width) if half >= 0 else (3, 0, 0), np.float32)
         loss = np.zeros(height, np.float32)
-        sobel = config.ablation.photo_gradient == "sobel"
         over_rows(
             lambda a, b: multi.warp_rows(
-                a, b, small, *tables, grey, image, hidden, lenses, T34, settings, sobel,
+                a, b, small, *tables, grey, image, hidden, lenses, T34, settings,
                 warped, slope, mask, extra, loss,
             ),
             height,

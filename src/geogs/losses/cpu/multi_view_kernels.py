@@ -44,29 +44,6 @@ def fetch_corners(image, us, vs, index, shares, corners):
 
 
 @njit(**PART)
-def sample_sobel(image, i, j, fx, fy):
-    """The bilinear samples of the two 3x3 Sobel derivatives: one separable 4x4 filter each."""
-    height, width = image.shape
-    left, right = max(i - 1, 0), min(i + 2, width - 1)
-    dx = dy = ZERO
-    for k in range(4):
-        row = min(max(j + k - 1, 0), height - 1)
-        a, b, c, d = image[row, left], image[row, i], image[row, i + 1], image[row, right]
-        slope = (c - a) * (ONE - fx) + (d - b) * fx
-        smooth = (a + TWO * b + c) * (ONE - fx) + (b + TWO * c + d) * fx
-        near, far = (ONE - fy), fy
-        if k == 0:
-            dx, dy = dx + near * slope, dy - near * smooth
-        elif k == 1:
-            dx, dy = dx + (TWO * near + far) * slope, dy - far * smooth
-        elif k == 2:
-            dx, dy = dx + (near + TWO * far) * slope, dy + near * smooth
-        else:
-            dx, dy = dx + far * slope, dy + far * smooth
-    return dx / np.float32(8), dy / np.float32(8)
-
-
-@njit(**PART)
 def hide_line(depth, lenses, tolerance, geometry, places, index, shares, corners):
     """Clears ``geometry[2]``, the depth in the target, where the target's depth map is nearer or
     farther by ``tolerance`` of it, or not known. The other arguments but ``lenses`` are scratch."""
@@ -149,7 +126,7 @@ def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
 @njit(cache=True, **PART)
 def warp_rows(
     first, last, depth, rows, row_share, columns, column_share, reference, target, target_depth,
-    lenses, T, settings, sobel, warped, slope, mask, extra, loss,
+    lenses, T, settings, warped, slope, mask, extra, loss,
 ):  # fmt: skip
     """The target image through the reference's depth, rows ``first <= y < last``.
 
@@ -178,13 +155,6 @@ def warp_rows(
             )
         fetch_corners(target, geometry[0], geometry[1], index, shares, corners)
         sample_line(y, geometry, shares, corners, reference, warped, slope, mask)
-        if sobel:
-            for x in range(count):
-                if geometry[2, x] > ZERO:
-                    i, j = min(int(geometry[0, x]), width - 2), min(int(geometry[1, x]), height - 2)
-                    du, dv = sample_sobel(target, i, j, shares[0, x], shares[1, x])
-                    slope[y, x] = du * geometry[3, x] + dv * geometry[4, x]
-                    corners[2, x], corners[3, x] = du, dv
         if with_extra:
             for x in range(count):
                 extra[0, y, x], extra[1, y, x] = corners[2, x], corners[3, x]

@@ -9,7 +9,7 @@
 extern "C" __global__ void __launch_bounds__(256) motion_gradient(
     const int* targets, const float* motions, const long long* maps, const float* settings,
     const float* depth, const float* warped, const float* gradient, double* d_motion, int height,
-    int width, int big_height, int big_width, int partners, int sobel) {
+    int width, int big_height, int big_width, int partners) {
   __shared__ float part[8][12];
   const int pair = blockIdx.z, b = pair / partners, target = targets[pair];
   if (target < 0) return;
@@ -30,7 +30,7 @@ extern "C" __global__ void __launch_bounds__(256) motion_gradient(
     const float d = enlarged_depth(depth, width, source_pixels(y, height, ratio), column);
     const Landing p = land(motion, (float)x, (float)y, d, big_height, big_width, c);
     if (!(p.z > 0.f)) continue;
-    const Sample s = sample_image(image, big_height, big_width, p.u, p.v, sobel);
+    const Sample s = sample_image(image, big_height, big_width, p.u, p.v);
     const float gx = g * c.fx * s.dx / p.z, gy = g * c.fy * s.dy / p.z;
     const float rows[3] = {gx, gy, -gx * (p.u - c.cx) / c.fx - gy * (p.v - c.cy) / c.fy};
 #pragma unroll

@@ -33,35 +33,13 @@ __device__ __forceinline__ Landing land(
 
 struct Sample { float value, dx, dy; };
 
-__device__ __forceinline__ Sample sample_plain(const float* image, int width, int i, int j, float fx, float fy) {
+__device__ __forceinline__ Sample sample_image(const float* image, int height, int width, float u, float v) {
+  const int i = min((int)u, width - 2), j = min((int)v, height - 2);
+  const float fx = u - (float)i, fy = v - (float)j;
   const float* at = image + (size_t)j * width + i;
   const float p = at[0], q = at[1], r = at[width], s = at[width + 1];
   const float upper = p + (q - p) * fx, lower = r + (s - r) * fx;
   return {upper + (lower - upper) * fy, (q - p) * (1.f - fy) + (s - r) * fy, lower - upper};
-}
-
-// The bilinear samples of the two 3x3 Sobel derivatives: one separable 4x4 filter each.
-__device__ __forceinline__ void sobel_slopes(
-    const float* image, int height, int width, int i, int j, float fx, float fy, Sample& s) {
-  const int left = max(i - 1, 0), right = min(i + 2, width - 1);
-  const float smooth_weight[4] = {1.f - fy, 2.f - fy, 1.f + fy, fy};
-  const float slope_weight[4] = {fy - 1.f, -fy, 1.f - fy, fy};
-  s.dx = s.dy = 0.f;
-#pragma unroll
-  for (int k = 0; k < 4; k++) {
-    const float* line = image + (size_t)min(max(j + k - 1, 0), height - 1) * width;
-    const float a = line[left], b = line[i], c = line[i + 1], d = line[right];
-    s.dx += smooth_weight[k] * ((c - a) * (1.f - fx) + (d - b) * fx) * 0.125f;
-    s.dy += slope_weight[k] * ((a + 2.f * b + c) * (1.f - fx) + (b + 2.f * c + d) * fx) * 0.125f;
-  }
-}
-
-__device__ __forceinline__ Sample sample_image(
-    const float* image, int height, int width, float u, float v, bool sobel) {
-  const int i = min((int)u, width - 2), j = min((int)v, height - 2);
-  Sample s = sample_plain(image, width, i, j, u - (float)i, v - (float)j);
-  if (sobel) sobel_slopes(image, height, width, i, j, u - (float)i, v - (float)j, s);
-  return s;
 }
 
 // Whether the target's rendered depth (0 unknown) at pixel (u, v) of the big image agrees with z.
@@ -140,7 +118,7 @@ extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
     const int* batch, const int* targets, const float* motions, const long long* maps,
     const int* rendered, const float* settings, const float* depth, float* warped, float* slope,
     float* push, float* loss, int height, int width, int big_height, int big_width, int partners,
-    int sobel, int last) {
+    int last) {
   const int pair = blockIdx.z, b = pair / partners, target = targets[pair];
   if (target < 0) return;
   const PhotoSettings c = *(const PhotoSettings*)settings;
@@ -162,7 +140,7 @@ extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
     const size_t pixel = (size_t)y * big_width + x, at = (size_t)pair * big_height * big_width + pixel;
     const float a = grey[pixel];
     Sample s = {a, 0.f, 0.f};
-    if (seen) s = sample_image(image, big_height, big_width, p.u, p.v, sobel);
+    if (seen) s = sample_image(image, big_height, big_width, p.u, p.v);
     const float rate = seen ? s.dx * p.du + s.dy * p.dv : 0.f;
     if (seen && c.l1 > 0.f) total += l1_loss(a, s.value, c);
     warped[at] = packed(s.value, seen);

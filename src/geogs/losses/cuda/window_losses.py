@@ -156,13 +156,12 @@ class WindowLosses:
         pairs = self.views * self.partners
         height, width = t.photo.height, t.photo.width
         sizes = (t.render.height, t.render.width, height, width, self.partners)
-        sobel = c.ablation.photo_gradient == "sobel"
         windowed = c.ssim_weight > 0 or c.ncc_weight > 0
         columns = _blocks(width, 32)
         kernels["warp_pairs"](
             (columns, _blocks(height, _WARP_ROWS), pairs), (32, 8), batch, self._targets,
             self._motions, pointers, t.rendered, settings, self._clean, self._warped,
-            self._pull, self._image_gradient, loss, *sizes, sobel, not windowed,
+            self._pull, self._image_gradient, loss, *sizes, not windowed,
         )  # fmt: skip
         keep = _Flags.KEEP_GRADIENT if self._with_pose else _Flags(0)
         if c.ssim_weight > 0:
@@ -177,7 +176,7 @@ class WindowLosses:
             kernels["motion_gradient"](
                 (columns, _blocks(height, _MOTION_ROWS), pairs), (32, 8), self._targets,
                 self._motions, pointers, settings, self._clean, self._warped,
-                self._image_gradient, relative_gradient, *sizes, sobel,
+                self._image_gradient, relative_gradient, *sizes,
             )  # fmt: skip
         grid = (_blocks(t.render.width, 32), _blocks(t.render.height, 8), self.views)
         kernels["gather_depth_gradient"](grid, (32, 8), self._targets, self._pull, d_depth, *sizes)

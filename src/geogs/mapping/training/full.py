@@ -1,7 +1,7 @@
 """The long training over all keyframes at the end."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.map_trainer import MapTrainer, draw_batch
 from geogs.world.map import MapTable, TrainingPlace
 
-SPLIT_TIMES = 0.2, 0.35, 0.5
-"""Fractions of the training at which disks are split; what is split late is not trained enough."""
 # Steps between two reports of progress, at least.
 _REPORTED_STEPS = 20
 # Steps from which the time of one is judged, if they take so many seconds; else so often again.
@@ -23,8 +21,8 @@ _REHEARSED_STEPS, _ENOUGH_SECONDS, _REHEARSALS = 16, 0.2, 8
 class FullTraining:
     """Single-view steps over all mapped keyframes in random order, with falling learning rates.
 
-    The first go at half the resolution, where the trainer has it so. On the way the map is pruned,
-    filled and split, and poses are refined, as the settings say.
+    The first go at half the resolution, where the trainer has it so. On the way the map is pruned
+    and filled.
     """
 
     def __init__(
@@ -34,10 +32,9 @@ class FullTraining:
         trainer: MapTrainer,
         growth: DiskGrowth,
         config: MappingConfig,
-        refine_poses: Callable[[Sequence[int]], None],
     ) -> None:
         self._table, self._views, self._trainer = table, views, trainer
-        self._growth, self._config, self._refine_poses = growth, config, refine_poses
+        self._growth, self._config = growth, config
         self._mapped = [views[i] for i in table.mapped]
 
     def run(self, total: int, progress: Progress, until: float | None) -> None:
@@ -47,9 +44,9 @@ class FullTraining:
         table, config = self._table, self._config
         begin, seconds_to_prune = time.perf_counter() - table.place.seconds, 0.0
         prunes = max(total // 4, 1)
-        fills, splits, poses = self._events(total)
+        fills = {total // 3, 2 * total // 3}
         coarse = int(self._trainer.coarse_part * total)
-        events = fills | splits | poses | set(range(prunes, total, prunes)) | {coarse} - {0}
+        events = fills | set(range(prunes, total, prunes)) | {coarse} - {0}
         # Where time is short steps are few and slow, so that it is looked at the clock more often.
         at_once = _REPORTED_STEPS if until is None else min(_REPORTED_STEPS, max(total // 50, 1))
         stops = sorted(events | set(range(at_once, total, at_once)) | {total})
@@ -71,24 +68,11 @@ class FullTraining:
                 start = time.perf_counter()
                 self._growth.prune(seen)
                 seconds_to_prune = time.perf_counter() - start
-            if done in splits:
-                self._growth.split(self._trainer.optimizer, self._trainer.unit)
-            if done in poses:
-                self._refine_all_poses()
             if done in fills:
                 for view in seen:
                     self._growth.insert(view, config.disk.fill_confidence)
             table.place = TrainingPlace(done, total, time.perf_counter() - begin)
             progress(done / total)
-
-    def _events(self, total: int) -> tuple[set[int], set[int], set[int]]:
-        """Steps after which the map is filled, split, and poses are refined."""
-        rounds = self._config.final_pose_rounds
-        return (
-            {total // 3, 2 * total // 3},
-            {int(total * part) for part in SPLIT_TIMES},
-            {total * (n + 1) // (rounds + 1) for n in range(rounds)},
-        )
 
     def _draw(self) -> list[tuple[MapView, list[MapView]]]:
         """The view that comes next, each once before any comes again."""
@@ -97,12 +81,6 @@ class FullTraining:
             table.order = table.random.of_numpy.permutation(len(self._mapped)).tolist()
         id = self._mapped[table.order.pop()].id
         return draw_batch([id], self._views, self._config, table.random.of_numpy)
-
-    def _refine_all_poses(self) -> None:
-        """In windows that overlap by half, earliest first."""
-        mapped, step = self._table.mapped, max(self._config.window // 2, 1)
-        for start in range(0, max(len(mapped) - step, 1), step):
-            self._refine_poses(mapped[start : start + 2 * step])
 
     def _trained_lately(self, total: int) -> list[MapView]:
         """The views around which the map may have changed in a training of so many steps: all, but

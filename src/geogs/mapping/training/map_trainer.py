@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_views import MapView
-from geogs.splat.optimizer import LearningRates, MapOptimizer
+from geogs.splat.optimizer import LearningRates
 
 Batch = list[tuple[MapView, list[MapView]]]
 """The views of one step, each with the partners that check it by their images."""
@@ -79,9 +79,6 @@ def _draw_partners(
 class MapTrainer(Protocol):
     """Trains a map in place, and poses on it."""
 
-    optimizer: MapOptimizer
-    unit: float
-    """Length in map units by which settings that are lengths are scaled."""
     coarse_part: float
     """Part of a training over all keyframes, its first, that goes at half the resolution."""
 

@@ -1,6 +1,6 @@
 """The image of a textured mesh: patches side by side, their exposures compensated."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -34,7 +34,6 @@ def draw_atlas(
     corrections: Float32[np.ndarray, "n 3"],
     swatches: UInt8[np.ndarray, "s 3"],
     limit: int,
-    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Atlas:
     """Draw the part of its view that each patch needs, its exposure compensated, into an atlas.
 
@@ -45,7 +44,6 @@ def draw_atlas(
         corrections: at the corners, added to the colours (0 to 255).
         swatches: plain colours for the faces that no view shows.
         limit: longest side of the atlas, pixels.
-        progress: called with the patches done and their number.
 
     Raises:
         InputError: the atlas has no room for them.
@@ -64,7 +62,6 @@ def draw_atlas(
         w, h = scaled[number]
         drawn = _patch(patches, number, views, gains, corrections, local, (int(w), int(h)))
         image[y : y + h, x : x + w] = drawn
-        progress(number + 1, len(sizes))
     corner = places[: len(sizes)][own] + local if len(own) else np.zeros((0, 2))
     index = np.arange(len(swatches))
     middle = np.zeros((0, 2))

@@ -1,6 +1,6 @@
 """Which views show each face of a mesh, and how well."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -37,7 +37,6 @@ def find_candidates(
     mesh: Mesh,
     views: Sequence[DepthMapView],
     tolerance: float,
-    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Candidates:
     """Views that show each face: near ones from the front first, sharp ones before blurred ones.
 
@@ -56,7 +55,6 @@ def find_candidates(
         if view.image is not None:
             faces, score, colour = _seen_faces(mesh, view, tolerance)
             _enter(best, number, faces, score * sharpness[number], colour)
-        progress(number + 1, len(views))
     return best
 
 

@@ -1,6 +1,6 @@
 """A mesh with an image for its surface, made from the images of its views."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +41,6 @@ def texture_mesh(
     views: Sequence[DepthMapView],
     tolerance: float,
     limit: int = 4096,
-    progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
 ) -> TexturedMesh:
     """Give a mesh an image, put together from those of the views.
 
@@ -54,16 +53,13 @@ def texture_mesh(
         views: depth maps with images; each is asked for once or twice.
         tolerance: how far a face may lie off a depth map that shows it, map units.
         limit: longest side of the image, pixels.
-        progress: called with a stage, how much of it is done, and of how much.
 
     Raises:
         InputError: there is no face, no image, or no room.
     """
     if not len(mesh.faces):
         raise InputError("There is no mesh to give a texture to.")
-    candidates = find_candidates(
-        mesh, views, tolerance, lambda done, of: progress("views", done, of)
-    )
+    candidates = find_candidates(mesh, views, tolerance)
     if not (candidates.view >= 0).any():
         raise InputError("No image shows any of the mesh, so there is no texture for it.")
     gains = view_gains(candidates, len(views))
@@ -75,10 +71,7 @@ def texture_mesh(
     colour = _corner_colours(patches, images, gains)
     corrections = seam_corrections(patches.corner_vertex, patches.edges(), colour)
     plain, swatches, swatch_of = _plain_colours(mesh, label)
-    atlas = draw_atlas(
-        patches, images, gains, corrections, swatches, limit,
-        lambda done, of: progress("atlas", done, of),
-    )  # fmt: skip
+    atlas = draw_atlas(patches, images, gains, corrections, swatches, limit)
     return _assembled(mesh, patches, plain, swatch_of, atlas.corner, atlas.swatch, atlas.image)
 
 

@@ -109,16 +109,13 @@ class FlowNetwork(nn.Module):
         edges: Edges,
         start: Float[Tensor, "e p 2"],
         iterations: int,
-        hidden: Float[Tensor, "e ch gh gw"] | None = None,
     ) -> Iterator[FlowEstimate]:
         """Estimates of where the cells of each edge's first image lie in its second, in pixels.
 
-        ``start`` is what is known before; ``hidden`` a state to go on with instead of a new one.
-        Positions are detached between iterations.
+        ``start`` is what is known before. Positions are detached between iterations.
         """
         first = edges.first.long()
-        state = features.hidden[first] if hidden is None else hidden
-        context = features.context[first]
+        state, context = features.hidden[first], features.context[first]
         height, width = state.shape[-2:]
         cells = cell_pixels(height, width, start)
         pixels = start

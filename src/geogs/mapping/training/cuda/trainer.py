@@ -19,7 +19,7 @@ from geogs.mapping.training.cuda.window_pass import WindowPass
 from geogs.mapping.training.map_trainer import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.view_arrays import MapCameras
 from geogs.splat.cuda import rasterize
-from geogs.splat.optimizer import MapOptimizer
+from geogs.splat.optimizer import BETAS, EPSILON, MapOptimizer
 from geogs.world.disks import GaussianMap
 
 _ADAM = Path(rasterize.__file__).with_name("adam.cu")
@@ -159,7 +159,7 @@ class _TrainingStep:
 
     def _launch(self) -> None:
         trainer, p, room = self._trainer, self.window, self._trainer.disks.room
-        optimizer, disk = trainer.optimizer, trainer.config.disk
+        disk = trainer.config.disk
         assert p.d_disks is not None
         self._kernels["begin_step"](
             1, 64, len(p.slots), self._schedule, self._factors, self._completed, self._base,
@@ -170,5 +170,5 @@ class _TrainingStep:
         self._kernels["adam_step"](
             -(-self._capacity // 256), 256, self._capacity, self._count, p.rasterizer.status,
             self._completed, *room, *p.d_disks, *trainer.disks.training_room(), p.maps.visible,
-            self._rates, *optimizer.betas, optimizer.eps, GRADIENT_LIMIT, *bounds,
+            self._rates, *BETAS, EPSILON, GRADIENT_LIMIT, *bounds,
         )  # fmt: skip
