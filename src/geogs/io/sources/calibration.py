@@ -17,12 +17,12 @@ _LONGEST_EDGE = 1 << 20
 
 @dataclass(frozen=True)
 class FocalRefinement:
-    """What the video itself said of the focal length."""
+    """What the video itself said of the focal length, and of the distortion with it."""
 
     deviation: float | None = None
     """Standard deviation of fx in pixels of the source's images; none where there is a failure."""
-    deviation_k1: float | None = None
-    """Standard deviation of the radial term; none where it was not asked for."""
+    deviations: tuple[float, float] | None = None
+    """Standard deviations of k1 and k2; none where they were not found beside it."""
     keyframes: int = 0
     frames: int = 0
     """Looked at."""
@@ -92,7 +92,9 @@ class Calibration:
     @property
     def is_unknown_lens(self) -> bool:
         """Whether nobody said how the lens bends, and what is said is but from the video."""
-        return self.is_guess or (self.refinement is not None and not self.is_distorted)
+        said = self.refinement
+        is_found = said is not None and (said.deviations is not None or not self.is_distorted)
+        return self.is_guess or is_found
 
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""

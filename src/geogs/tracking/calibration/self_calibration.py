@@ -1,4 +1,4 @@
-"""The focal length of a video, from the video: what its stretches say, and a verdict."""
+"""The lens of a video, from the video: what its stretches say, and a verdict."""
 
 import math
 from collections.abc import Iterable
@@ -35,11 +35,12 @@ class SelfCalibration:
 
     camera: Camera
     """Camera of the working image; the guess where there is a ``failure``."""
-    k1: float = 0.0
+    distortion: tuple[float, float] | None = None
+    """OpenCV's k1 and k2; none where they were not asked for, or the video does not tell them."""
     deviation: float = math.inf
     """Standard deviation of the focal length, relative."""
-    deviation_k1: float | None = None
-    """Standard deviation of k1; none where it was not asked for."""
+    deviations: tuple[float, float] | None = None
+    """Standard deviations of k1 and k2."""
     keyframes: int = 0
     frames: int = 0
     """That were used."""
@@ -57,7 +58,7 @@ def self_calibrate(
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
 ) -> SelfCalibration:
-    """Estimate the focal length, and k1 if ``radial``, of the camera that took ``frames``.
+    """Estimate the focal length, k1 and k2 if ``radial``, of the camera that took ``frames``.
 
     Aspect and principal point of ``camera`` are believed, its focal length is only one of several
     to start from. Flow is measured by the operator without a network. Stretch after stretch of the
@@ -85,7 +86,7 @@ def self_calibrate(
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
         by_pairs = view_graph_estimate(camera, flows)
         if by_pairs is not None and by_pairs.deviation < UNRELIABLE:
-            found = by_pairs
+            found, radial = by_pairs, False
     if found is None:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
@@ -113,7 +114,8 @@ def _verdict(guess: Camera, radial: bool, found: Estimate, frames: int) -> SelfC
     if not found.deviation < UNRELIABLE:
         failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
         return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
-    deviation_k1 = found.deviation_k1 if radial else None
+    distortion, deviations = (found.lens.k1, found.lens.k2), found.deviations[1:]
     return SelfCalibration(
-        found.camera, found.k1, found.deviation, deviation_k1, found.keyframes, frames
-    )
+        found.camera, distortion if radial else None, found.deviation,
+        deviations if radial else None, found.keyframes, frames,
+    )  # fmt: skip

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from geogs.bundle.lens import RadialLens
 from geogs.geometry.camera import Camera
 from geogs.geometry.least_squares import Policy, Solution, Step, minimise
 from geogs.tracking.calibration.epipolar_error import (
@@ -26,7 +27,6 @@ from geogs.tracking.calibration.epipolar_error import (
     linearised,
 )
 from geogs.tracking.calibration.focal_uncertainty import (
-    DISTORTION_FRACTION,
     FIELDS_OF_VIEW,
     STANDARD_ERRORS,
     Estimate,
@@ -34,6 +34,8 @@ from geogs.tracking.calibration.focal_uncertainty import (
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
+DISTORTION_FRACTION = 0.5
+"""Fraction of the change of the focal length when k1 is free too that counts as deviation."""
 LEAST_PAIRS = 12
 """Fewer pairs that show more than a plane or a rotation are not believed."""
 LEAST_DEVIATION = 0.02
@@ -78,7 +80,8 @@ def view_graph_estimate(camera: Camera, flows: Sequence[tuple[int, FlowMatch]]) 
     widest, narrowest = (camera.with_field_of_view(angle).fx for angle in FIELDS_OF_VIEW[::-1])
     if not widest < result.fx < narrowest:
         return None
-    return Estimate(result, 0.0, deviation, deviation_k1, len(witness.unique()))
+    covariance = torch.tensor([deviation**2, deviation_k1**2, 0.0], dtype=torch.float64).diag()
+    return Estimate(RadialLens(result), covariance, len(witness.unique()))
 
 
 def _pair(
