@@ -92,9 +92,13 @@ class Calibration:
     @property
     def is_unknown_lens(self) -> bool:
         """Whether nobody said how the lens bends, and what is said is but from the video."""
-        said = self.refinement
-        is_found = said is not None and (said.deviations is not None or not self.is_distorted)
-        return self.is_guess or is_found
+        is_asked = self.refinement is not None and not self.is_distorted
+        return self.is_guess or self.is_found_lens or is_asked
+
+    @property
+    def is_found_lens(self) -> bool:
+        """Whether focal length and distortion are what the video itself said of them."""
+        return self.refinement is not None and self.refinement.deviations is not None
 
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
@@ -115,11 +119,12 @@ class Calibration:
         bent = replace(self, distortion=distortion, origin=origin)
         if factor == 1:
             return bent
-        fx, said = factor * self.fx, self.refinement or FocalRefinement()
+        fx, own = factor * self.fx, (found.deviation_k1, found.deviation_k2)
+        said = replace(self.refinement or FocalRefinement(), deviations=own, failure=None)
         return replace(
             bent, fx=fx, fy=factor * self.fy, is_guess=False, is_nominal=False,
             origin=f"{origin}, fx times {factor:.4f}",
-            refinement=replace(said, deviation=found.deviation_focal * fx, failure=None),
+            refinement=replace(said, deviation=found.deviation_focal * fx),
         )  # fmt: skip
 
     def _size(self) -> tuple[int, int]:
