@@ -79,8 +79,8 @@ def correct_lens(
             break
         said, left = asked.whole, left - 1
         if is_open:
-            for n, (found, prior) in enumerate(zip((focal, bend.k1, bend.k2), PRIOR, strict=True)):
-                said = said.told(n, -found, prior)
+            for n, (taken, prior) in enumerate(zip((focal, bend.k1, bend.k2), PRIOR, strict=True)):
+                said = said.told(n, -taken, prior)
         if rows is not None:
             said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
         if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:
