@@ -20,6 +20,11 @@ LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
 PRIOR = 0.1, 0.2
 """Deviations of k1 and k2 before any match is asked. A narrow field of view does not tell them."""
+EVIDENCE = 25.0
+"""Square of k1 and k2 in their deviations from which on a lens is believed to bend."""
+DISTORTION_FRACTION = 0.5
+"""Fraction of the change of the focal length when the lens may bend that counts as deviation where
+it is taken for a pinhole."""
 FIELDS_OF_VIEW = 15.0, 150.0
 """Degrees along the longer side; what lies outside is no pinhole camera's."""
 AGREEMENT = 3.0
@@ -56,6 +61,21 @@ class Estimate:
     def deviation(self) -> float:
         """Standard deviation of the focal length, relative."""
         return self.deviations[0]
+
+    def as_told(self) -> "Estimate":
+        """A pinhole where the matches do not tell that the lens bends: real ones that tell little
+        of it err alike, too, and the focal length by as much as k1 and k2 lean on it."""
+        bend, lean = self.covariance[1:, 1:], self.covariance[1:, 0]
+        k = self.sizes[1:]
+        if not bool((bend.diagonal() > 0).all()) or k @ torch.linalg.solve(bend, k) >= EVIDENCE:
+            return self
+        follows = torch.linalg.solve(bend, lean)
+        shift = -float(follows @ k)
+        left = float(self.covariance[0, 0] - follows @ lean) + (DISTORTION_FRACTION * shift) ** 2
+        covariance = torch.zeros_like(self.covariance)
+        covariance[0, 0] = max(left, LEAST_DEVIATION**2)
+        pinhole = RadialLens(self.lens.camera).moved(shift)
+        return Estimate(pinhole, covariance, self.keyframes)
 
     def moved(
         self, sizes: Float64[Tensor, "3"], covariance: Float64[Tensor, "3 3"], keyframes: int

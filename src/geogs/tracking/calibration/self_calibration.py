@@ -36,7 +36,8 @@ class SelfCalibration:
     camera: Camera
     """Camera of the working image; the guess where there is a ``failure``."""
     distortion: tuple[float, float] | None = None
-    """OpenCV's k1 and k2; none where they were not asked for, or the video does not tell them."""
+    """OpenCV's k1 and k2; none where they were not asked for, or the video does not tell that the
+    lens bends."""
     deviation: float = math.inf
     """Standard deviation of the focal length, relative."""
     deviations: tuple[float, float] | None = None
@@ -80,17 +81,17 @@ def self_calibrate(
             failure = failure or said
         if gatherer.is_over or (estimates and joined(estimates).deviation < CONFIDENT):
             break
-    found = joined(estimates) if estimates else None
+    found = joined(estimates).as_told() if estimates else None
     if found is None or not found.deviation < UNRELIABLE:
         asked = _part_of(report, STRETCHES)
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
         by_pairs = view_graph_estimate(camera, flows)
         if by_pairs is not None and by_pairs.deviation < UNRELIABLE:
-            found, radial = by_pairs, False
+            found = by_pairs
     if found is None:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
-    return _verdict(camera, radial, found, gatherer.frames)
+    return _verdict(camera, found, gatherer.frames)
 
 
 def _ask(stretch: Stretch) -> Estimate | str:
@@ -109,13 +110,14 @@ def _part_of(report: Report, n: int) -> Report:
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
 
 
-def _verdict(guess: Camera, radial: bool, found: Estimate, frames: int) -> SelfCalibration:
+def _verdict(guess: Camera, found: Estimate, frames: int) -> SelfCalibration:
     """The estimate, or why it is not believed."""
     if not found.deviation < UNRELIABLE:
         failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
         return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
-    distortion, deviations = (found.lens.k1, found.lens.k2), found.deviations[1:]
+    k1, k2 = found.lens.k1, found.lens.k2
+    bends = k1 != 0 or k2 != 0
     return SelfCalibration(
-        found.camera, distortion if radial else None, found.deviation,
-        deviations if radial else None, found.keyframes, frames,
+        found.camera, (k1, k2) if bends else None, found.deviation,
+        found.deviations[1:] if bends else None, found.keyframes, frames,
     )  # fmt: skip

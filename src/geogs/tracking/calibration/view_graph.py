@@ -27,6 +27,7 @@ from geogs.tracking.calibration.epipolar_error import (
     linearised,
 )
 from geogs.tracking.calibration.focal_uncertainty import (
+    DISTORTION_FRACTION,
     FIELDS_OF_VIEW,
     STANDARD_ERRORS,
     Estimate,
@@ -34,8 +35,6 @@ from geogs.tracking.calibration.focal_uncertainty import (
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
-DISTORTION_FRACTION = 0.5
-"""Fraction of the change of the focal length when k1 is free too that counts as deviation."""
 LEAST_PAIRS = 12
 """Fewer pairs that show more than a plane or a rotation are not believed."""
 LEAST_DEVIATION = 0.02
