@@ -20,8 +20,9 @@ LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
 PRIOR = 0.1, 0.2
 """Deviations of k1 and k2 before any match is asked. A narrow field of view does not tell them."""
-EVIDENCE = 25.0
-"""Square of k1 and k2 in their deviations from which on a lens is believed to bend."""
+EVIDENCE = 36.0
+"""Square of k1 and k2 in their deviations from which on a lens is believed to bend: 1 to 21 where
+it does not or hardly does, 65 and more where it does (docs/calibration.md)."""
 DISTORTION_FRACTION = 0.5
 """Fraction of the change of the focal length when the lens may bend that counts as deviation where
 it is taken for a pinhole."""
