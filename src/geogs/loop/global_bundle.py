@@ -57,8 +57,8 @@ def global_bundle(
     message. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking and a
     lens was found, everything is straightened by that, matched and adjusted once more, and what
     matches say of the lens then is taken off them and the images; so it is found in any case where
-    what the images were taken for was but found in the video (not ``lens_is_known``). A tracker without a map is left
-    alone, and one whose images are straight already.
+    what the images were taken for was but found in the video (not ``lens_is_known``). A tracker
+    without a map is left alone, and one whose images are straight already.
     """
     config, segment, store = tracker.config, tracker.segment, tracker.keyframes
     ids = tracker.segment.ids if keyframes is None else list(keyframes)

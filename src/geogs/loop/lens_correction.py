@@ -61,8 +61,8 @@ def correct_lens(
     times it. ``before`` was found already, and images are straight, so that what matches say is
     believed however little it is; so is it at the end, and the focal length with it, where what the
     images were taken for was but found in the video (not ``lens_is_known``), which the sizes are
-    then not expected to be far from (``PRIOR``). Not in the world of a saved map, whose keyframes stay as its own
-    adjustment left them.
+    then not expected to be far from (``PRIOR``). Not in the world of a saved map, whose keyframes
+    stay as its own adjustment left them.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = graph.packed
