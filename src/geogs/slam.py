@@ -52,6 +52,7 @@ class Slam(SlamOutput):
         black_is_masked: bool = False,
         defers_map: bool = False,
         world: World | None = None,
+        lens_is_known: bool = True,
     ) -> None:
         """A system that has seen nothing, or goes on with the ``world`` of another.
 
@@ -65,12 +66,15 @@ class Slam(SlamOutput):
                 nor, with ``black_is_masked``, what is quite black in an image.
             defers_map: make the map in :meth:`refine`, of all keyframes at their final poses;
                 ``mapping.when`` may say otherwise.
+            lens_is_known: whether somebody said what lens took the images; else it was but found in
+                the video, and is once more of all matches at the end.
 
         Raises:
             InputError: images of that size cannot be tracked, or the world is of another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
         self.config = c = config or Config()
+        self.lens_is_known = lens_is_known
         maps_at_end = defers_map and not live and c.mapping.may_follow
         self.world = world or World(maps_at_end=maps_at_end)
         self.stopwatch = Stopwatch(self.world.times)
@@ -154,8 +158,9 @@ class Slam(SlamOutput):
             return
         with self.stopwatch("global bundle adjustment"):
             global_bundle(
-                main, lambda f, _: progress("bundle adjustment", f), ends=self.world.is_ended
-            )
+                main, lambda f, _: progress("bundle adjustment", f), None, self.world.is_ended,
+                self.lens_is_known,
+            )  # fmt: skip
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
                 self.world.uncertainty = frame_uncertainty(main)

@@ -72,9 +72,9 @@ def test_intrinsics_json_holds_the_deviation(video, tmp_path, capfd):
     assert 0.002 * CAMERA.fx < deviation < 0.05 * CAMERA.fx
     assert of_source["is_guess"] is False
     assert of_source["self_calibration"]["failure"] is None
-    assert of_source["k1_deviation"] is None
     assert document["fx"] == pytest.approx(of_source["fx"])
     said = f"refined from the video: {of_source['fx']:.1f} +- {deviation:.1f} pixels"
+    assert of_source["k1_deviation"] is of_source["k2_deviation"] is None  # a pinhole
     assert of_source["origin"] == f"{said} (a field of view of 60 degrees was assumed)"
     assert source.intrinsics_origin == of_source["origin"]
     assert listener.said == [f"Intrinsics: {source.intrinsics_origin}."]
@@ -139,16 +139,17 @@ def test_what_was_found_at_working_size_is_carried_to_the_source():
     )
     working = nominal.camera().with_long_edge(512)
     camera = replace(working, fx=1.1 * working.fx, fy=1.1 * working.fy)
-    found = SelfCalibration(camera, -0.08, 0.01, 0.004, 12, 80)
+    found = SelfCalibration(camera, (-0.08, 0.02), 0.01, (0.004, 0.003), 12, 80)
     after = refined(nominal, working.fx, found)
     assert after.fx == pytest.approx(1650.0)
     assert after.fy == pytest.approx(1650.0)
-    assert after.distortion == (-0.08, 0.0, 0.0, 0.0)
+    assert after.distortion == (-0.08, 0.02, 0.0, 0.0)
     assert after.refinement is not None
     assert after.refinement.deviation == pytest.approx(16.5)
-    assert after.refinement.deviation_k1 == 0.004
+    assert after.refinement.deviations == (0.004, 0.003)
+    assert after.is_unknown_lens
     assert not after.is_nominal
-    assert "k1 -0.0800 +- 0.0040 (EXIF says 1500.0)" in after.origin
+    assert "k1 -0.0800 +- 0.0040, k2 0.0200 +- 0.0030 (EXIF says 1500.0)" in after.origin
 
 
 def test_a_focal_length_that_all_matches_find_takes_the_place_of_the_guess():

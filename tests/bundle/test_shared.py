@@ -26,7 +26,7 @@ def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
     for source, tracked in zip(*both, strict=True):
         own, theirs = source.edges, tracked.edges
         at = len(theirs.gradient)
-        assert (source.frame, own.shared, theirs.shared) == (tracked.frame, 2, 0)
+        assert (source.frame, own.shared, theirs.shared) == (tracked.frame, 3, 0)
         scale = theirs.hessian.diagonal().sqrt()
         error = (own.hessian[:at, :at] - theirs.hessian) / (scale[:, None] * scale)
         assert float(error.abs().max()) < 1e-5
@@ -39,9 +39,11 @@ def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
 
 @pytest.mark.parametrize("huber", [0.5, 50.0])
 def test_one_step_matches_the_dense_equations(huber):
-    lens = RadialLens(CAMERA, 0.05)
-    problem = disturbed(lens_problem(lens.moved(0.02, 0.01), frames=3), 0.01, 0.03)
-    xi, unknowns, delta = gauss_newton_step(problem, CAMERA, GRID.pixels, 0.05, huber, 1e-5)
+    lens = RadialLens(CAMERA, 0.05, -0.03)
+    problem = disturbed(lens_problem(lens.moved(0.02, 0.01, 0.01), frames=3), 0.01, 0.03)
+    xi, unknowns, delta = gauss_newton_step(
+        problem, CAMERA, GRID.pixels, (0.05, -0.03), huber, 1e-5
+    )
     block = LensBlock(lens, GRID.pixels, radial=True)
     shared = SharedSchur(problem, BundleOptions(huber=huber, depth_damping=1e-5))
     state = BundleState(problem.T_cw, problem.inverse_depth, block)
@@ -50,9 +52,9 @@ def test_one_step_matches_the_dense_equations(huber):
     assert step is not None
     depth = problem.inverse_depth + shared.depth_steps(state, linear, step)
     assert float(unknowns.abs().min()) > 1e-3
-    torch.testing.assert_close(step[-2:], unknowns, rtol=2e-3, atol=2e-5)
+    torch.testing.assert_close(step[-3:], unknowns, rtol=2e-3, atol=2e-5)
     # Poses and depths agree up to the scale, which nothing measures.
-    ours, theirs = step[6:-2].reshape(-1, 6), xi[1:]
+    ours, theirs = step[6:-3].reshape(-1, 6), xi[1:]
     torch.testing.assert_close(ours[:, 3:], theirs[:, 3:], rtol=0, atol=5e-5)
     away, rest = problem.T_cw[1:, :3, 3].reshape(-1), (ours - theirs)[:, :3].reshape(-1)
     scale = float(away @ rest / (away @ away))
@@ -61,8 +63,8 @@ def test_one_step_matches_the_dense_equations(huber):
     torch.testing.assert_close(change, -scale * problem.inverse_depth.double(), rtol=0, atol=2e-3)
 
 
-def test_recovers_focal_length_and_radial_term():
-    truth = RadialLens(CAMERA, -0.1)
+def test_recovers_focal_length_and_radial_terms():
+    truth = RadialLens(CAMERA, -0.2, 0.05)
     start = disturbed(lens_problem(truth), 0.01, 0.05)
     guess = RadialLens(CAMERA).moved(math.log(1.25))
     options = replace(OPTIONS, iterations=40, huber=100.0)
@@ -72,7 +74,8 @@ def test_recovers_focal_length_and_radial_term():
     found = result.block.lens
     assert abs(found.camera.fx / CAMERA.fx - 1) < 1e-3
     assert abs(found.camera.fy / CAMERA.fy - 1) < 1e-3
-    assert abs(found.k1 + 0.1) < 1e-3
+    assert abs(found.k1 + 0.2) < 1e-3
+    assert abs(found.k2 - 0.05) < 1e-3
 
 
 def test_deviations_are_those_of_repeated_measurements():
@@ -81,7 +84,7 @@ def test_deviations_are_those_of_repeated_measurements():
         problem = lens_problem(RadialLens(CAMERA), frames=8, noise=0.3, seed=seed)
         result = solve_shared(problem, LensBlock(RadialLens(CAMERA), GRID.pixels, radial=True))
         lens = result.block.lens
-        errors.append([math.log(lens.camera.fx / CAMERA.fx), lens.k1])
+        errors.append([math.log(lens.camera.fx / CAMERA.fx), lens.k1, lens.k2])
         deviations.append(result.covariance.diagonal().sqrt().tolist())
     actual = np.sqrt(np.square(errors).mean(0))
     said = np.sqrt(np.square(deviations).mean(0))

@@ -192,6 +192,19 @@ def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatc
     assert error(tracker, truth) < 0.5 * bent
 
 
+def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypatch):
+    monkeypatch.setattr(lens_correction, "EVIDENCE", np.inf)
+    tracker, _ = tracker_of((0.02, -0.03), -0.03)
+    global_bundle(tracker, ends=True)
+    assert tracker.keyframes.table.lens is None
+    tracker, _ = tracker_of((0.02, -0.03), -0.03)
+    global_bundle(tracker, ends=True, lens_is_known=False)
+    lens = tracker.keyframes.table.lens
+    assert lens is not None
+    assert lens.focal == pytest.approx(1 / 1.03, abs=0.01)
+    assert (lens.k1, lens.k2) == pytest.approx((0.02, -0.03), abs=0.006)
+
+
 def test_while_tracking_goes_on_the_focal_length_stays():
     tracker, _ = tracker_of(BEND, -0.05)
     global_bundle(tracker)

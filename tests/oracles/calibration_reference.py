@@ -12,21 +12,26 @@ from geogs.geometry.lie import retract, se3_inverse
 def reproject(
     camera: Camera,
     pixels: Float[Tensor, "p 2"],
-    unknowns: Float[Tensor, "2"],
+    unknowns: Float[Tensor, "3"],
     T_ji: Float[Tensor, "4 4"],
     inverse_depth: Float[Tensor, "p"],
 ) -> Float[Tensor, "p 2"]:
-    """Pixels of one frame in another, for log of the factor on the focal length, and k1."""
+    """Pixels of one frame in another, for log of the factor on the focal length, k1 and k2."""
+
+    def bent(x: Float[Tensor, "p 2"]) -> Float[Tensor, "p 1"]:
+        square = x.square().sum(-1, keepdim=True)
+        return 1 + unknowns[1] * square + unknowns[2] * square.square()
+
     centre = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
     focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64) * unknowns[0].exp()
     distorted = (pixels.double() - centre) / focal
     x = distorted
     for _ in range(40):  # a fixed point; autograd goes through all of it
-        x = distorted / (1 + unknowns[1] * x.square().sum(-1, keepdim=True))
+        x = distorted / bent(x)
     rays = torch.cat([x, torch.ones_like(x[:, :1])], -1)
     y = rays @ T_ji[:3, :3].mT + inverse_depth[:, None] * T_ji[:3, 3]
     y = y[:, :2] / y[:, 2:]
-    return y * (1 + unknowns[1] * y.square().sum(-1, keepdim=True)) * focal + centre
+    return y * bent(y) * focal + centre
 
 
 def residuals(
@@ -34,7 +39,7 @@ def residuals(
     camera: Camera,
     pixels: Float[Tensor, "p 2"],
     xi: Float[Tensor, "n 6"],
-    unknowns: Float[Tensor, "2"],
+    unknowns: Float[Tensor, "3"],
     delta: Float[Tensor, "n p"],
 ) -> Float[Tensor, "e p 2"]:
     """Measured minus projected pixels after steps of poses and inverse depths."""
@@ -50,10 +55,10 @@ def gauss_newton_step(
     problem: BundleProblem,
     camera: Camera,
     pixels: Float[Tensor, "p 2"],
-    k1: float,
+    distortion: tuple[float, float],
     huber: float,
     depth_damping: float,
-) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "2"], Float[Tensor, "n p"]]:
+) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "3"], Float[Tensor, "n p"]]:
     """Steps of poses (the first is fixed), lens and inverse depths from the full equations.
 
     The scale, which is not determined, is that of the least step (pseudo-inverse of the poses'
@@ -61,7 +66,7 @@ def gauss_newton_step(
     """
     n, p = problem.inverse_depth.shape
     xi = torch.zeros(n, 6, dtype=torch.float64)
-    lens = torch.tensor([0.0, k1], dtype=torch.float64)
+    lens = torch.tensor([0.0, *distortion], dtype=torch.float64)
     delta = torch.zeros(n, p, dtype=torch.float64)
     r = residuals(problem, camera, pixels, xi, lens, delta)
     w = problem.weight.double()
@@ -78,5 +83,5 @@ def gauss_newton_step(
     S = Jx.mT @ (w * Jx) - (E / C) @ E.mT
     step = torch.linalg.pinv(S, hermitian=True, rtol=1e-9) @ (v - E @ (u / C[:, None]))
     depth = (u - E.mT @ step)[:, 0] / C
-    xi[1:] = step[:-2].reshape(n - 1, 6)
-    return xi, step[-2:, 0], depth.reshape(n, p)
+    xi[1:] = step[:-3].reshape(n - 1, 6)
+    return xi, step[-3:, 0], depth.reshape(n, p)

@@ -46,11 +46,12 @@ def self_calibrated(
         return source
     from geogs.tracking.calibration.self_calibration import self_calibrate
 
+    given = source.calibration
     found = _found_in(
         source.linked_frames(), "calibration", progress, stop,
         lambda frames, report: self_calibrate(
-            frames, source.camera, config.calibration.radial, torch.device(device),
-            report, source.mask, source.black_is_masked,
+            frames, source.camera, config.calibration.radial and not given.is_distorted,
+            torch.device(device), report, source.mask, source.black_is_masked,
         ),
     )  # fmt: skip
     if found is None:
@@ -59,7 +60,7 @@ def self_calibrated(
             "Press Ctrl-C again to end."
         )
         return source
-    calibration = refined(source.calibration, source.camera.fx, found)
+    calibration = refined(given, source.camera.fx, found)
     progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
 
@@ -80,15 +81,18 @@ def refined(
     factor = found.camera.fx / working_focal
     focal = calibration.fx * factor
     deviation = found.deviation * focal
-    said = FocalRefinement(deviation, found.deviation_k1, found.keyframes, found.frames)
+    said = FocalRefinement(deviation, found.deviations, found.keyframes, found.frames)
     was = "was assumed" if calibration.is_guess else f"says {calibration.fx:.1f}"
     origin = f"refined from the video: {focal:.1f} +- {deviation:.1f} pixels"
-    if found.deviation_k1 is not None:
-        origin += f", k1 {found.k1:.4f} +- {found.deviation_k1:.4f}"
+    distortion = calibration.distortion
+    if found.distortion is not None and found.deviations is not None:
+        distortion = (*found.distortion, 0.0, 0.0)
+        for name, k, error in zip(("k1", "k2"), found.distortion, found.deviations, strict=True):
+            origin += f", {name} {k:.4f} +- {error:.4f}"
     return replace(
         calibration,
         fx=focal, fy=calibration.fy * factor,
-        distortion=(found.k1, 0.0, 0.0, 0.0) if found.k1 else (),
+        distortion=distortion,
         origin=f"{origin} ({calibration.origin} {was})",
         is_guess=False, is_nominal=False, refinement=said,
     )  # fmt: skip

@@ -1,7 +1,7 @@
-"""The camera with unknowns: one focal length and one radial term, with exact Jacobians.
+"""The camera with unknowns: one focal length and two radial terms, with exact Jacobians.
 
-Both enter twice: in the ray of a source's cell and in its projection into the target. Pixel =
-c + F x (1 + k1 |x|^2), x = (X / Z, Y / Z), which is OpenCV's model with k1 alone.
+All enter twice: in the ray of a source's cell and in its projection into the target. Pixel =
+c + F x (1 + k1 |x|^2 + k2 |x|^4), x = (X / Z, Y / Z), which is OpenCV's model with k1 and k2 alone.
 """
 
 import math
@@ -24,20 +24,31 @@ _LEAST_SLOPE = 0.1
 
 @dataclass(frozen=True)
 class RadialLens:
-    """A pinhole behind one radial term; the aspect and the principal point are known."""
+    """A pinhole behind radial terms; the aspect and the principal point are known."""
 
     camera: Camera
     k1: float = 0.0
+    k2: float = 0.0
 
-    def moved(self, log_focal: float, k1: float = 0.0) -> "RadialLens":
-        """With the focal length times ``exp(log_focal)`` and ``k1`` added to the radial term."""
+    def moved(self, log_focal: float, k1: float = 0.0, k2: float = 0.0) -> "RadialLens":
+        """With the focal length times ``exp(log_focal)``, ``k1`` and ``k2`` added to the terms."""
         c, factor = self.camera, math.exp(log_focal)
-        return RadialLens(replace(c, fx=c.fx * factor, fy=c.fy * factor), self.k1 + k1)
+        camera = replace(c, fx=c.fx * factor, fy=c.fy * factor)
+        return RadialLens(camera, self.k1 + k1, self.k2 + k2)
+
+    def growth(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Of a ray's distance from the axis, whose square is given."""
+        return 1 + square * (self.k1 + square * self.k2)
+
+    def steepness(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
+        ``_LEAST_SLOPE``."""
+        return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=_LEAST_SLOPE)
 
 
 @dataclass(frozen=True)
 class LensBlock:
-    """A lens as a block of unknowns: log of the focal length, and k1."""
+    """A lens as a block of unknowns: log of the focal length, k1 and k2."""
 
     lens: RadialLens
     pixels: Float[Tensor, "p 2"]
@@ -45,22 +56,22 @@ class LensBlock:
     focal: bool = True
     """Whether the focal length is a variable."""
     radial: bool = False
-    """Whether k1 is a variable."""
+    """Whether k1 and k2 are variables."""
     largest_step: ClassVar[float] = 0.3
 
     @property
-    def free(self) -> tuple[bool, bool]:
+    def free(self) -> tuple[bool, bool, bool]:
         """As in the protocol."""
-        return self.focal, self.radial
+        return self.focal, self.radial, self.radial
 
     @cached_property
     def rays(self) -> "LensRays":
         """Rays of the cells."""
         return lens_rays(self.lens, self.pixels)
 
-    def moved(self, step: Float[Tensor, "2"]) -> "LensBlock":
+    def moved(self, step: Float[Tensor, "3"]) -> "LensBlock":
         """As in the protocol."""
-        return replace(self, lens=self.lens.moved(float(step[0]), float(step[1])))
+        return replace(self, lens=self.lens.moved(*step.tolist()))
 
     def project(
         self,
@@ -91,21 +102,23 @@ class LensBlock:
         # A change of the lens moves the ray by a factor of (x, y, 0).
         ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
         along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
-        row_x = [along_x * rays.slope[0], along_x * rays.slope[1], (tx - tz * u) * q]
-        row_y = [along_y * rays.slope[0], along_y * rays.slope[1], (ty - tz * v) * q]
+        row_x = [*(along_x * slope for slope in rays.slope), (tx - tz * u) * q]
+        row_y = [*(along_y * slope for slope in rays.slope), (ty - tz * v) * q]
         others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
         J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
         square = u * u + v * v
-        if lens.k1:
+        if lens.k1 or lens.k2:
             point = x.mT[:, None]
             inward = (J * point).sum(2, keepdim=True)
-            J = J * (1 + lens.k1 * square)[:, None, None] + 2 * lens.k1 * point * inward
+            bent = (2 * lens.k1 + 4 * lens.k2 * square)[:, None, None]
+            J = J * lens.growth(square)[:, None, None] + bent * point * inward
         J = J * J.new_tensor([c.fx, c.fy])[:, None]
         pixels = _to_pixels(lens, x)
         centred = (pixels - pixels.new_tensor([c.cx, c.cy])).mT
         bulge = (x * pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
-        own = [(J[:, 6] + centred)[:, None], (J[:, 7] + bulge)[:, None]]
-        return SharedProjection(pixels, valid, z, torch.cat([J[:, :6], *own], 1), J[:, 8])
+        own = torch.stack([centred, bulge, bulge * square[:, None]], 1)
+        by = torch.cat([J[:, :6], J[:, 6:9] + own], 1)
+        return SharedProjection(pixels, valid, z, by, J[:, 9])
 
 
 @dataclass(frozen=True)
@@ -114,30 +127,28 @@ class LensRays:
 
     rays: Float[Tensor, "p 3"]
     """z = 1."""
-    slope: Float[Tensor, "2 p"]
-    """d x / d log f and d x / d k1 are these factors times x, and alike for y."""
+    slope: Float[Tensor, "3 p"]
+    """d x / d log f, d x / d k1 and d x / d k2 are these factors times x, and alike for y."""
 
 
 def lens_rays(lens: RadialLens, pixels: Float[Tensor, "p 2"]) -> LensRays:
-    """Undistort pixels: Newton's method on the radius, s (1 + k1 s^2) = s_distorted."""
-    c, k1 = lens.camera, lens.k1
+    """Undistort pixels: Newton's method on the radius, s (1 + k1 s^2 + k2 s^4) = s_distorted."""
+    c = lens.camera
     centre, focal = pixels.new_tensor([c.cx, c.cy]), pixels.new_tensor([c.fx, c.fy])
     distorted = (pixels - centre) / focal
     radius = distorted.norm(dim=-1)
     s = radius
-    for _ in range(_NEWTON_STEPS if k1 else 0):
-        s = s - (s + k1 * s**3 - radius) / (1 + 3 * k1 * s.square()).clamp(min=_LEAST_SLOPE)
+    for _ in range(_NEWTON_STEPS if lens.k1 or lens.k2 else 0):
+        square = s.square()
+        s = s - (s * lens.growth(square) - radius) / lens.steepness(square)
     square = s.square()
-    growth = 1 + k1 * square
+    growth, steep = lens.growth(square), lens.steepness(square)
     x = distorted / growth[:, None]
-    steep = (1 + 3 * k1 * square).clamp(min=_LEAST_SLOPE)
-    return LensRays(
-        torch.cat([x, torch.ones_like(x[:, :1])], -1),
-        torch.stack([-growth / steep, -square / steep]),
-    )
+    slope = torch.stack([-growth / steep, -square / steep, -square.square() / steep])
+    return LensRays(torch.cat([x, torch.ones_like(x[:, :1])], -1), slope)
 
 
 def _to_pixels(lens: RadialLens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:
     c = lens.camera
-    growth = 1 + lens.k1 * x.square().sum(-1, keepdim=True)
+    growth = lens.growth(x.square().sum(-1, keepdim=True))
     return x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])

@@ -24,8 +24,9 @@ class CalibrationConfig(Settings, group="calibration"):
 
     refine: Annotated[bool, Basic()] = True
     """Whether a guessed focal length, or one from EXIF, is refined before the run."""
-    radial: Annotated[bool, Basic()] = False
-    """Also find one radial distortion term (OpenCV's k1) and undistort the images by it."""
+    radial: Annotated[bool, Basic()] = True
+    """Find the distortion with it (OpenCV's k1 and k2), unless that is given, and undistort the
+    images by it. Off for a lens that bends nothing."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from operator import methodcaller
 
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.lens_error import SHAPES, LensBend
+from geogs.bundle.uncertainty.lens_error import PRIOR, SHAPES, LensBend
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
 from geogs.tracking.frames.row_errors import TOGETHER, RowErrors
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -51,6 +51,7 @@ def correct_lens(
     ends: bool = False,
     before: FoundLens | None = None,
     readout: float = 1.0,
+    lens_is_known: bool = True,
 ) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
@@ -58,20 +59,28 @@ def correct_lens(
     only where tracking ``ends`` with it: what is matched afterwards would be of another; so is the
     readout, where it was found in the video: matches were corrected for rows that took so many
     times it. ``before`` was found already, and images are straight, so that what matches say is
-    believed however little it is. Not in the world of a saved map, whose keyframes stay as its own
-    adjustment left them.
+    believed however little it is; so is it at the end, and the focal length with it, where what the
+    images were taken for was but found in the video (not ``lens_is_known``), which the sizes are
+    then not expected to be far from (``PRIOR``). Not in the world of a saved map, whose keyframes
+    stay as its own adjustment left them.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = graph.packed
     bend, said, focal, longer = LensBend(), None, 0.0, 0.0
     left = ROUNDS if measured and not tracker.segment.fixed else 0
-    is_asked = before is not None and before.focal != 1
+    is_open = ends and not lens_is_known
+    is_asked = before.focal != 1 if before else is_open
     rows = _rows_in_doubt(log, keyframes, readout) if ends and left else None
     while left:
         asked = said_of_lens(tracker, list(free_depth), rows)
-        if asked is None or (said is None and not before and asked.bend.evidence < EVIDENCE):
+        if asked is None:
+            break
+        if said is None and not (before or is_open) and asked.bend.evidence < EVIDENCE:
             break
         said, left = asked.whole, left - 1
+        if is_open:
+            for n, (taken, prior) in enumerate(zip((focal, bend.k1, bend.k2), PRIOR, strict=True)):
+                said = said.told(n, -taken, prior)
         if rows is not None:
             said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
         if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:

@@ -17,12 +17,12 @@ _LONGEST_EDGE = 1 << 20
 
 @dataclass(frozen=True)
 class FocalRefinement:
-    """What the video itself said of the focal length."""
+    """What the video itself said of the focal length, and of the distortion with it."""
 
     deviation: float | None = None
     """Standard deviation of fx in pixels of the source's images; none where there is a failure."""
-    deviation_k1: float | None = None
-    """Standard deviation of the radial term; none where it was not asked for."""
+    deviations: tuple[float, float] | None = None
+    """Standard deviations of k1 and k2; none where they were not found beside it."""
     keyframes: int = 0
     frames: int = 0
     """Looked at."""
@@ -92,7 +92,13 @@ class Calibration:
     @property
     def is_unknown_lens(self) -> bool:
         """Whether nobody said how the lens bends, and what is said is but from the video."""
-        return self.is_guess or (self.refinement is not None and not self.is_distorted)
+        is_asked = self.refinement is not None and not self.is_distorted
+        return self.is_guess or self.is_found_lens or is_asked
+
+    @property
+    def is_found_lens(self) -> bool:
+        """Whether focal length and distortion are what the video itself said of them."""
+        return self.refinement is not None and self.refinement.deviations is not None
 
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
@@ -113,11 +119,12 @@ class Calibration:
         bent = replace(self, distortion=distortion, origin=origin)
         if factor == 1:
             return bent
-        fx, said = factor * self.fx, self.refinement or FocalRefinement()
+        fx, own = factor * self.fx, (found.deviation_k1, found.deviation_k2)
+        said = replace(self.refinement or FocalRefinement(), deviations=own, failure=None)
         return replace(
             bent, fx=fx, fy=factor * self.fy, is_guess=False, is_nominal=False,
             origin=f"{origin}, fx times {factor:.4f}",
-            refinement=replace(said, deviation=found.deviation_focal * fx, failure=None),
+            refinement=replace(said, deviation=found.deviation_focal * fx),
         )  # fmt: skip
 
     def _size(self) -> tuple[int, int]:

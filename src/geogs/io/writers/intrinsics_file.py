@@ -57,9 +57,11 @@ def _refinement(calibration: Calibration) -> dict[str, object]:
     said = calibration.refinement
     if said is None:
         return {}
+    k1, k2 = said.deviations or (None, None)
     return {
         "focal_deviation": said.deviation,
-        "k1_deviation": said.deviation_k1,
+        "k1_deviation": k1,
+        "k2_deviation": k2,
         "self_calibration": {
             "keyframes": said.keyframes,
             "frames": said.frames,

@@ -1,7 +1,9 @@
 """A first focal length: several fields of view tried on the same flows from one keyframe.
 
 Flow needs no focal length, so it is measured once. Every candidate places the keyframes by the
-essential matrix and PnP and is adjusted, the focal length with the rest; the least cost wins.
+essential matrix and PnP and is adjusted, the focal length with the rest, at last the distortion,
+too: of a lens that bends, pinholes of different focal lengths are all about as wrong. The least
+cost wins.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +24,9 @@ from geogs.world.grid import SampleGrid
 
 FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
 """Degrees along the longer side, besides that of the guess."""
-_HUBERS = (30.0, 10.0, 3.0)
+_STAGES = (30.0, 10), (10.0, 10), (3.0, 30)
+"""Huber's limit, and steps at most. Those of the last are many, as from a pinhole to the lens leads
+a long valley; whoever stops in it may take the wrong one for the best."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +46,11 @@ def candidates(camera: Camera) -> list[Camera]:
     return [camera.with_focal(camera.fx), *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
 
 
-def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Start | None:
-    """Place and adjust the keyframes from one focal length; None where it shows no parallax."""
+def try_candidate(
+    camera: Camera, flows: list[FlowMatch], min_parallax: float, radial: bool
+) -> Start | None:
+    """Place and adjust the keyframes from one focal length, at last with k1 and k2 if ``radial``;
+    None where it shows no parallax."""
     flows = [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view(camera, flows[1::2], min_parallax)
@@ -66,7 +73,7 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
         free, torch.ones(n, dtype=torch.bool),
         pixels=torch.cat([f.pixels for f in flows]), weight=torch.cat([f.weight for f in flows]),
     )  # fmt: skip
-    result = _adjusted(problem, LensBlock(RadialLens(camera), grid.pixels))
+    result = _adjusted(problem, LensBlock(RadialLens(camera), grid.pixels), radial)
     if result is None:
         return None
     return Start(
@@ -74,11 +81,14 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
     )
 
 
-def _adjusted(problem: BundleProblem, block: LensBlock) -> SharedResult[LensBlock] | None:
+def _adjusted(
+    problem: BundleProblem, block: LensBlock, radial: bool
+) -> SharedResult[LensBlock] | None:
     """From forgiving to strict, always with the focal length."""
     result = None
-    for huber in _HUBERS:
-        result = solve_shared(problem, block, replace(OPTIONS, iterations=10, huber=huber))
+    for huber, steps in _STAGES:
+        block = replace(block, radial=radial and huber == _STAGES[-1][0])
+        result = solve_shared(problem, block, replace(OPTIONS, iterations=steps, huber=huber))
         if not result.finite:
             return None
         block = result.block

@@ -133,8 +133,9 @@ class GrowingBundle:
         )
 
     def adjust(self, radial: bool) -> bool:
-        """Solve for everything, k1 if ``radial``, and take it over; False if that fails."""
-        result = self.solve(radial)
+        """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
+        block = LensBlock(self.lens, self.grid.pixels, radial=radial)
+        result = solve_shared(self.problem(), block)
         if not result.finite:
             return False
         self.result, self.lens = result, result.block.lens
@@ -143,11 +144,6 @@ class GrowingBundle:
         self._depth = list(grid_fields(self.grid).fill(result.inverse_depth, result.information))
         self._normalise()
         return True
-
-    def solve(self, radial: bool) -> SharedResult[LensBlock]:
-        """The solution, with k1 as a variable too if ``radial``; nothing is taken over."""
-        block = LensBlock(self.lens, self.grid.pixels, radial=radial)
-        return solve_shared(self.problem(), block)
 
     def _normalise(self) -> None:
         """Median depth 1, so that limits and thresholds mean the same everywhere."""

@@ -1,4 +1,4 @@
-"""The focal length of a video, from the video: what its stretches say, and a verdict."""
+"""The lens of a video, from the video: what its stretches say, and a verdict."""
 
 import math
 from collections.abc import Iterable
@@ -35,11 +35,13 @@ class SelfCalibration:
 
     camera: Camera
     """Camera of the working image; the guess where there is a ``failure``."""
-    k1: float = 0.0
+    distortion: tuple[float, float] | None = None
+    """OpenCV's k1 and k2; none where they were not asked for, or the video does not tell that the
+    lens bends."""
     deviation: float = math.inf
     """Standard deviation of the focal length, relative."""
-    deviation_k1: float | None = None
-    """Standard deviation of k1; none where it was not asked for."""
+    deviations: tuple[float, float] | None = None
+    """Standard deviations of k1 and k2."""
     keyframes: int = 0
     frames: int = 0
     """That were used."""
@@ -57,7 +59,7 @@ def self_calibrate(
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
 ) -> SelfCalibration:
-    """Estimate the focal length, and k1 if ``radial``, of the camera that took ``frames``.
+    """Estimate the focal length, k1 and k2 if ``radial``, of the camera that took ``frames``.
 
     Aspect and principal point of ``camera`` are believed, its focal length is only one of several
     to start from. Flow is measured by the operator without a network. Stretch after stretch of the
@@ -79,7 +81,7 @@ def self_calibrate(
             failure = failure or said
         if gatherer.is_over or (estimates and joined(estimates).deviation < CONFIDENT):
             break
-    found = joined(estimates) if estimates else None
+    found = joined(estimates).as_told() if estimates else None
     if found is None or not found.deviation < UNRELIABLE:
         asked = _part_of(report, STRETCHES)
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
@@ -89,7 +91,7 @@ def self_calibrate(
     if found is None:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
-    return _verdict(camera, radial, found, gatherer.frames)
+    return _verdict(camera, found, gatherer.frames)
 
 
 def _ask(stretch: Stretch) -> Estimate | str:
@@ -108,12 +110,14 @@ def _part_of(report: Report, n: int) -> Report:
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
 
 
-def _verdict(guess: Camera, radial: bool, found: Estimate, frames: int) -> SelfCalibration:
+def _verdict(guess: Camera, found: Estimate, frames: int) -> SelfCalibration:
     """The estimate, or why it is not believed."""
     if not found.deviation < UNRELIABLE:
         failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
         return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
-    deviation_k1 = found.deviation_k1 if radial else None
+    k1, k2 = found.lens.k1, found.lens.k2
+    bends = k1 != 0 or k2 != 0
     return SelfCalibration(
-        found.camera, found.k1, found.deviation, deviation_k1, found.keyframes, frames
-    )
+        found.camera, (k1, k2) if bends else None, found.deviation,
+        found.deviations[1:] if bends else None, found.keyframes, frames,
+    )  # fmt: skip

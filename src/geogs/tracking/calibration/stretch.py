@@ -1,4 +1,4 @@
-"""One stretch of a video whose views are placed and adjusted together with the focal length."""
+"""One stretch of a video whose views are placed and adjusted together with the lens."""
 
 from collections.abc import Callable
 
@@ -37,7 +37,7 @@ class Stretch:
         radial: bool,
         report: Report,
     ) -> None:
-        """``radial``: whether k1 is found, too."""
+        """``radial``: whether k1 and k2 are found, too."""
         self.grid, self.operator, self.radial = grid, operator, radial
         self._gatherer, self._report = gatherer, report
         self._views: list[View] = []
@@ -77,7 +77,7 @@ class Stretch:
         if wrong is not None:
             return wrong
         starts = thread_map(
-            lambda c: try_candidate(c, flows, self._min_parallax), candidates(camera)
+            lambda c: try_candidate(c, flows, self._min_parallax, self.radial), candidates(camera)
         )
         found = [s for s in starts if s is not None]
         if not found:

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from geogs.bundle.lens import RadialLens
 from geogs.geometry.camera import Camera
 from geogs.geometry.least_squares import Policy, Solution, Step, minimise
 from geogs.tracking.calibration.epipolar_error import (
@@ -78,7 +79,8 @@ def view_graph_estimate(camera: Camera, flows: Sequence[tuple[int, FlowMatch]]) 
     widest, narrowest = (camera.with_field_of_view(angle).fx for angle in FIELDS_OF_VIEW[::-1])
     if not widest < result.fx < narrowest:
         return None
-    return Estimate(result, 0.0, deviation, deviation_k1, len(witness.unique()))
+    covariance = torch.tensor([deviation**2, deviation_k1**2, 0.0], dtype=torch.float64).diag()
+    return Estimate(RadialLens(result), covariance, len(witness.unique()))
 
 
 def _pair(
