@@ -67,6 +67,14 @@ def rejoined(
     return best
 
 
+def believed(model: Any, database: Path, known: Container[int] = ()) -> Any:
+    """What of a reconstruction hangs together, and contradicts no matches.
+
+    With pictures ``known`` from elsewhere it is what does with these.
+    """
+    return firmly_joined(undisputed(model, database, known), known)
+
+
 def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
     """The largest part of a reconstruction whose scale is one; the other pictures lose their poses.
 
@@ -98,9 +106,8 @@ def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
 
 
 def _believed(parts: Sequence[Any], database: Path) -> list[Any]:
-    """What hangs together of each, and contradicts no matches; the largest first."""
-    believed = [firmly_joined(undisputed(part, database)) for part in parts]
-    return sorted(believed, key=lambda part: -len(placed_images(part)))
+    """What is to be believed of each; the largest first."""
+    return sorted((believed(part, database) for part in parts), key=lambda part: -_placed([part]))
 
 
 def _placed(parts: Sequence[Any]) -> int:

@@ -134,6 +134,13 @@ def placed_images(model: Any) -> list[Any]:
     return sorted(placed, key=lambda image: image.name)
 
 
+def world_to_camera(image: Any) -> Float64[np.ndarray, "4 4"]:
+    """The pose of a picture."""
+    T = np.eye(4)
+    T[:3] = image.cam_from_world().matrix()
+    return T
+
+
 def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:
     """The reconstruction adjusted once more, robustly, with more of each camera.
 

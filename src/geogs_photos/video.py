@@ -19,9 +19,14 @@ from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import rejoined
-from geogs_photos.incremental_mapping import LEAST_IMAGES, placed_images, refine
+from geogs_photos.incremental_mapping import (
+    LEAST_IMAGES,
+    placed_images,
+    refine,
+    world_to_camera,
+)
 from geogs_photos.photo_features import find_features
-from geogs_photos.photo_pairs import choose_pairs
+from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import Progress, structure_of
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.upright import upright_rotation
@@ -29,8 +34,6 @@ from geogs_photos.upright import upright_rotation
 MOST_CHANGE = 0.1
 """Relative. Where the focal length ends farther from one that the video told, both cannot be right,
 and shape and path bend with it: of a camera that turns, points at wrong distances explain any."""
-NEXT = 6
-"""Chosen frames after each that it is matched with in any case."""
 
 
 def place_frames(
@@ -50,10 +53,7 @@ def place_frames(
     features = thread_map(
         lambda frame: find_features(frame.image), chosen.frames, lambda f: progress("features", f)
     )
-    alike = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
-    count = len(chosen.frames)
-    following = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEXT, count))}
-    pairs = sorted({*alike, *following})
+    pairs, count = frame_pairs(features, seed, progress), len(chosen.frames)
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
     shared = [SharedCamera(begin, is_known)]
     with tempfile.TemporaryDirectory(prefix="geogs-video-") as work:
@@ -81,10 +81,9 @@ def _placed(
     model: Any, chosen: ChosenFrames, entries: Sequence[Entry], is_known: bool
 ) -> PlacedVideo:
     images = placed_images(model)
-    T_cw = np.tile(np.eye(4), (len(images), 1, 1))
+    T_cw = np.stack([world_to_camera(image) for image in images])
     positions, descriptors = [], []
-    for pose, image in zip(T_cw, images, strict=True):
-        pose[:3] = image.cam_from_world().matrix()
+    for image in images:
         seen = [(k, p.point3D_id) for k, p in enumerate(image.points2D) if p.has_point3D()]
         positions.append(np.array([model.points3D[p].xyz for _, p in seen]).reshape(-1, 3))
         descriptors.append(entries[int(image.name)].features.descriptors[[k for k, _ in seen]])

@@ -63,8 +63,7 @@ def test_of_three_ways_the_one_that_puts_most_into_one(
 
         return way
 
-    monkeypatch.setattr(fragments, "firmly_joined", lambda part: part)
-    monkeypatch.setattr(fragments, "undisputed", lambda part, _: part)
+    monkeypatch.setattr(fragments, "believed", lambda part, _: part)
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
     parts = [Part(n) for n in first]

@@ -118,7 +118,7 @@ def place_lost(
     T_cw: Sequence[Float64[np.ndarray, "4 4"] | None],
     seen_by: Calibration,
     seed: int,
-    report: Callable[[float], None],
+    report: StageProgress,
 ) -> FoundFrames:
     """Find where frames without a pose were taken by others around them, whose poses stay.
 
@@ -127,7 +127,7 @@ def place_lost(
         T_cw: their poses, world to camera; none of those to be found.
         seen_by: the camera of all, with its distortion where they still bend.
         seed: of the random choices.
-        report: called with the finished part; what it raises ends the work.
+        report: follows the work; what it raises ends it.
 
     Raises:
         InputError: pycolmap is missing.
