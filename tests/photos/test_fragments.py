@@ -100,14 +100,24 @@ def model_of(pictures: int, points: Iterable[Sequence[int]]) -> Any:
         ([], {1, 2, 3, 4}),
         ([(4, 5)] * 200, {1, 2, 3, 4}),  # of these 5 has a direction, and no distance
         ([(3, 4, 5)] * 14, {1, 2, 3, 4}),
-        ([(3, 4, 5)] * 15, {1, 2, 3, 4, 5, 6, 7}),
-        ([(4, 5, 6)] * 15, {1, 2, 3, 4, 5, 6, 7}),
+        ([(3, 4, 5)] * 15, {1, 2, 3, 4, 5}),  # what 6 and 7 see has no scale about 5
+        ([(4, 5, 6)] * 15, {1, 2, 3, 4}),
+        ([(3, 4, 5)] * 15 + [(3, 4, 6)] * 14, {1, 2, 3, 4, 5}),
+        ([(3, 4, 5)] * 15 + [(3, 4, 6)] * 8 + [(2, 3, 7)] * 7, {1, 2, 3, 4, 5, 6, 7}),
+        ([(3, 4, 5, 6)] * 15, {1, 2, 3, 4, 5, 6, 7}),
     ],
 )
 def test_parts_without_a_common_scale_are_not_one(between, kept):
     points = [(1, 2, 3)] * 30 + [(2, 3, 4)] * 20 + [(5, 6, 7)] * 500 + between
     model = firmly_joined(model_of(7, points))
     assert {n for n, image in model.images.items() if image.has_pose} == kept
+
+
+def test_what_hangs_on_a_single_known_picture_has_no_scale():
+    points = [(1, 2, 3)] * 30 + [(5, 6, 7)] * 500 + [(3, 5, 6)] * 90
+    for known, kept in (({1, 2, 3}, {1, 2, 3}), ({1, 2, 3, 7}, {1, 2, 3, 5, 6, 7})):
+        model = firmly_joined(model_of(7, points), known)
+        assert {n for n, image in model.images.items() if image.has_pose} == kept
 
 
 def test_a_reconstruction_of_nothing_stays_nothing():
