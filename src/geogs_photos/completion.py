@@ -11,7 +11,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
 from geogs.types import FoundFrames, Frame
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
-from geogs_photos.deviations import deviations_beside
+from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import believed
 from geogs_photos.incremental_mapping import continued, placed_images, world_to_camera
 from geogs_photos.photo_features import find_features
@@ -46,11 +46,14 @@ def place_lost(
         if model is None:
             return FoundFrames.none()
         model = believed(model, database, known)
-    images = [image for image in placed_images(model) if image.image_id not in known]
-    found = [frames[int(image.name)] for image in images]
-    poses = np.array([world_to_camera(image) for image in images]).reshape(-1, 4, 4)
-    times = np.array([frame.timestamp for frame in found], np.float64)
-    return FoundFrames(
-        tuple(frame.index for frame in found), times, poses,
-        *deviations_beside(model, images, poses, known),
-    )  # fmt: skip
+    images = placed_images(model)
+    is_known = np.array([image.image_id in known for image in images], bool)
+    if is_known.all():
+        return FoundFrames.none()
+    poses = np.stack([world_to_camera(image) for image in images])
+    error = float(model.compute_mean_reprojection_error())
+    deviations = pose_deviations(model, images, poses, error, True, is_known)
+    of = [frames[int(image.name)] for image in images]
+    times = np.array([frame.timestamp for frame in of], np.float64)
+    numbers = tuple(frame.index for frame in of)
+    return FoundFrames(numbers, times, poses, *deviations).of(~is_known)
