@@ -21,6 +21,7 @@ from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import rejoined
 from geogs_photos.incremental_mapping import (
     LEAST_IMAGES,
+    adjust_free,
     placed_images,
     refine,
     world_to_camera,
@@ -29,6 +30,7 @@ from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import Progress, structure_of
 from geogs_photos.pycolmap_library import load_colmap
+from geogs_photos.rolling_rows import with_rows_at_once
 from geogs_photos.upright import upright_rotation
 
 MOST_CHANGE = 0.1
@@ -41,6 +43,7 @@ def place_frames(
     camera: Camera,
     is_known: bool,
     is_found: bool,
+    is_rolling: bool,
     seed: int,
     progress: Progress,
 ) -> PlacedVideo:
@@ -70,7 +73,17 @@ def place_frames(
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
+    unsure = np.zeros(len(images))
+    if is_rolling:
+        progress("finding the readout", 0.0)
+        times = np.array([frame.timestamp for frame in chosen.frames])
+        known = set(best.cameras) if is_known else set[int]()
+        best, unsure = with_rows_at_once(
+            best, times, lambda model: adjust_free(model, known, worker_count())
+        )
+        progress("finding the readout", 1.0)
     placed = _placed(best, chosen, entries, is_known)
+    placed = replace(placed, deviation=np.hypot(placed.deviation, unsure))
     if is_found and abs(math.log(placed.calibration.fx / camera.fx)) > MOST_CHANGE:
         unknown = np.full(len(images), np.inf)
         return replace(placed, deviation=unknown, rotation=unknown, depth=unknown)

@@ -147,7 +147,7 @@ def test_each_way_places_a_room(monkeypatch):
         return parts
 
     monkeypatch.setattr(video, "rejoined", check)
-    placed = video.place_frames(chosen, room.camera, False, False, 0, lambda *_: None)
+    placed = video.place_frames(chosen, room.camera, False, False, False, 0, lambda *_: None)
     assert placed.numbers == tuple(range(9))
 
 
@@ -165,5 +165,11 @@ def test_a_reconstruction_of_too_few_points_is_none(monkeypatch):
     monkeypatch.setattr(incremental_mapping, "LEAST_POINTS", 10**6)
     with pytest.raises(InputError, match="no three tell where they were taken"):
         video.place_frames(
-            ChosenFrames(frames, np.arange(4) / 10), room.camera, True, False, 0, lambda *_: None
+            ChosenFrames(frames, np.arange(4) / 10),
+            room.camera,
+            True,
+            False,
+            False,
+            0,
+            lambda *_: None,
         )

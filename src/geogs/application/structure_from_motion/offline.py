@@ -97,7 +97,9 @@ class PlacedOffline(Work):
             told = video.calibration.refinement
             placed = place_frames(
                 chosen, video.camera, not video.is_calibration_open,
-                told is not None and told.failure is None, config.seed, driver.report,
+                told is not None and told.failure is None,
+                config.input.readout == "auto" and not video.shutter.readout, config.seed,
+                driver.report,
             )  # fmt: skip
         del chosen
         driver.progress.write(
