@@ -81,8 +81,10 @@ def without_gauge(
     identity = np.tile(np.eye(3), (count, 1))
     rotated = np.concatenate([-_cross(c) for c in centres])
     similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
-    rows = np.repeat(fitted, 3)
-    return _left(moves, joint, similarity, rows), _left(rotations, joint, identity, rows)
+    of_fitted = np.repeat(fitted, 3)
+    return (
+        _left(moves, joint, similarity, of_fitted), _left(rotations, joint, identity, of_fitted)
+    )  # fmt: skip
 
 
 def _left(

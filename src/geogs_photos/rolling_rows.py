@@ -24,6 +24,8 @@ MOST = 2.0
 LEFT = 0.33
 """Part of what a readout moves that stays unsure, as motion between frames is only roughly known.
 Measured on videos with a truth (docs/photographs.md)."""
+MAX_ERROR = 4.0
+"""Pixels beyond which a point is given up."""
 _APART = 2.5
 """Times the usual step of time from which on motion between two frames is not known."""
 
@@ -45,10 +47,12 @@ def with_rows_at_once(
     model.update_point_3d_errors()  # those that it comes with are older than its poses
     step = TRIED * float(np.median(np.diff(times)))
     trials = [_adjusted(model, times, readout, adjust) for readout in (-step, step)]
-    squares = [m.compute_mean_reprojection_error() ** 2 for m in (trials[0], model, trials[1])]
+    squares = [_square(m) for m in (trials[0], model, trials[1])]
     bend = squares[0] + squares[2] - 2 * squares[1]
     best = 0.5 * (squares[0] - squares[2]) / bend if bend > 0 else 0.0
     found = _adjusted(model, times, float(np.clip(best, -MOST, MOST)) * step, adjust)
+    for number in [n for n, point in found.points3D.items() if not point.error <= MAX_ERROR]:
+        found.delete_point3D(number)
     images = placed_images(found)
     before, now = (
         torch.from_numpy(np.stack([m.images[i.image_id].projection_center() for i in images]))
@@ -56,6 +60,12 @@ def with_rows_at_once(
     )
     scale, R, t = umeyama(before, now)
     return found, LEFT * (scale * before @ R.T + t - now).norm(dim=1).numpy()
+
+
+def _square(model: Any) -> float:
+    """Mean squared distance of the points from where they were seen; what is far off is far off."""
+    error = np.nan_to_num([point.error for point in model.points3D.values()], nan=MAX_ERROR)
+    return float(np.square(error.clip(max=MAX_ERROR)).mean())
 
 
 def _adjusted(

@@ -5,6 +5,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -26,6 +27,9 @@ AROUND = 10
 MOST = 250
 """Lost frames that are looked for at once, for time and memory; of more every second one comes
 first, or every third, ..."""
+UNREAD = 3.0
+"""Times deviations are larger where no readout is known by which the rows could be rectified.
+Measured on a phone's video with a truth (docs/photographs.md)."""
 STAGE = "lost frames"
 
 
@@ -116,6 +120,8 @@ class LostFrames:
         frames = _read(self._video, {*wanted, *near})
         T_cw = [known.get(frame.index) for frame in frames]
         found = place_lost(frames, T_cw, self._seen_by, self._seed, report)
+        times = 1.0 if self._video.shutter.readout else UNREAD
+        found = replace(found, position=times * found.position, rotation=times * found.rotation)
         return found.of(found.position <= self._most_deviation)
 
 
