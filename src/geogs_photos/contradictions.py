@@ -5,7 +5,7 @@ all matches between them lie near a circle through both cameras (a horopter), wh
 But where a turn alone explains the matches in both coordinates, hardly another one can be true.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +26,25 @@ a step to the side does of which all that is seen is equally far."""
 _ROUNDS = 15
 
 
-def undisputed(model: Any, database: Path) -> Any:
+def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
     """The largest part of a reconstruction across whose borders matches contradict its poses.
 
     The other pictures lose their poses: which of two parts is where it should be, nobody knows.
+    With pictures ``known`` from elsewhere it is the part that holds these, which stay together.
     """
     images = sorted(image.image_id for image in model.images.values() if image.has_pose)
-    places = {number: k for k, number in enumerate(images)}
+    first = next((k for k, number in enumerate(images) if number in known), None)
+    place = {n: first if first is not None and n in known else k for k, n in enumerate(images)}
     votes = [
-        (places[pair.one], places[pair.other], speaks_for(pair))
+        (place[pair.one], place[pair.other], speaks_for(pair))
         for pair in verified_matches(model, database, images)
+        if place[pair.one] != place[pair.other]
     ]
-    kept = max(undivided(len(images), votes), key=len, default=[])
-    for number in set(images) - {images[k] for k in kept}:
-        model.deregister_frame(model.images[number].frame_id)
+    parts = undivided(len(images), votes)
+    kept = max(parts, key=lambda part: (first in part, len(part)), default=[])
+    for number in images:
+        if place[number] not in kept:
+            model.deregister_frame(model.images[number].frame_id)
     return model
 
 

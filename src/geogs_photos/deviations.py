@@ -1,10 +1,10 @@
 """How well structure from motion knows its poses, whatever frame of reference it was solved in."""
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -19,6 +19,7 @@ def pose_deviations(
     T_cw: Float64[np.ndarray, "n 4 4"],
     error: float,
     is_known: bool,
+    fitted: Bool[np.ndarray, "n"] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Standard deviations of the images' centres (world units) and orientations (radians).
 
@@ -32,6 +33,9 @@ def pose_deviations(
         T_cw: the same.
         error: deviation of a measured point, pixels.
         is_known: whether the camera was given, or found along with the poses.
+        fitted: the images that the alignment fits; none fits all. The others are told beside
+            these, which count as unsure as their matches leave them: what hangs on at an end sways
+            with that.
     """
     colmap = load_colmap()
     options = colmap.BundleAdjustmentOptions(
@@ -49,57 +53,23 @@ def pose_deviations(
     if joint is None:
         unknown = np.full(len(images), np.inf)
         return unknown, unknown.copy()
-    centre, rotation = without_gauge(joint, T_cw)
+    centre, rotation = without_gauge(joint, T_cw, fitted)
     return ALIKE * error * centre, ALIKE * error * rotation
 
 
-def deviations_beside(
-    model: Any,
-    images: Sequence[Any],
-    T_cw: Float64[np.ndarray, "n 4 4"],
-    known: Container[int],
-) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """As :func:`pose_deviations`, beside images ``known`` from elsewhere, which count as exact.
-
-    Nothing is aligned: the world is theirs. With T = [Exp(w) R, t + dt] the centre moves by
-    R^T (w x t - dt).
-    """
-    unknown = np.full(len(images), np.inf)
-    if not len(images):
-        return unknown, unknown.copy()
-    colmap, error = load_colmap(), float(model.compute_mean_reprojection_error())
-    config = colmap.BundleAdjustmentConfig()
-    for image in model.images.values():
-        if image.has_pose:
-            config.add_image(image.image_id)
-            if image.image_id in known:
-                config.set_constant_rig_from_world_pose(image.frame_id)
-    for number in model.cameras:
-        config.set_constant_cam_intrinsics(number)
-    options = colmap.BundleAdjustmentOptions(print_summary=False)
-    covariance = _covariance(model, config, options)
-    if covariance is None:
-        return unknown, unknown.copy()
-    deviation, rotation = unknown, unknown.copy()
-    for k, (image, T) in enumerate(zip(images, T_cw, strict=True)):
-        own = covariance.get_cam_cov_from_world(image.image_id)
-        if own is not None and own.shape == (6, 6):
-            J = np.concatenate([-_cross(T[:3, 3]), -np.eye(3)], 1)
-            deviation[k] = np.sqrt(np.trace(J @ own @ J.T).clip(0))
-            rotation[k] = np.sqrt(np.trace(own[:3, :3]).clip(0))
-    return ALIKE * error * deviation, ALIKE * error * rotation
-
-
 def without_gauge(
-    joint: Float64[np.ndarray, "k k"], T_cw: Float64[np.ndarray, "n 4 4"]
+    joint: Float64[np.ndarray, "k k"],
+    T_cw: Float64[np.ndarray, "n 4 4"],
+    fitted: Bool[np.ndarray, "n"] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Deviations of centres and orientations without what a similarity of the world changes.
 
     ``joint`` is the covariance of the poses' left tangents, rotation (3) then translation (3) of
     each. With T = [Exp(w) R, t + dt] the centre -R^T t moves by R^T (w x t - dt), and the axes of
-    the camera turn by R^T w in the world.
+    the camera turn by R^T w in the world. The similarity is that of the images ``fitted``, or all.
     """
     count = len(T_cw)
+    fitted = np.ones(count, bool) if fitted is None else fitted
     moves, rotations = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
     for k, T in enumerate(T_cw):
         back, t = T[:3, :3].T, T[:3, 3]
@@ -107,20 +77,24 @@ def without_gauge(
         moves[rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
         rotations[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
     centres = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
-    centres = centres - centres.mean(0)
+    centres = centres - centres[fitted].mean(0)
     identity = np.tile(np.eye(3), (count, 1))
     rotated = np.concatenate([-_cross(c) for c in centres])
     similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
-    return _left(moves, joint, similarity), _left(rotations, joint, identity)
+    of_fitted = np.repeat(fitted, 3)
+    return (
+        _left(moves, joint, similarity, of_fitted), _left(rotations, joint, identity, of_fitted)
+    )  # fmt: skip
 
 
 def _left(
     J: Float64[np.ndarray, "m k"],
     joint: Float64[np.ndarray, "k k"],
     gauge: Float64[np.ndarray, "m g"],
+    fitted: Bool[np.ndarray, "m"],
 ) -> Float64[np.ndarray, "n"]:
-    """Deviation of each triple of J x beside what lies along ``gauge``."""
-    free = J - gauge @ (np.linalg.pinv(gauge) @ J)
+    """Deviation of each triple of J x beside what lies along ``gauge`` in the rows ``fitted``."""
+    free = J - gauge @ (np.linalg.pinv(gauge[fitted]) @ J[fitted])
     variance = np.einsum("ij,jk,ik->i", free, joint, free, optimize=True)
     return np.sqrt(variance.reshape(-1, 3).sum(1).clip(0))
 

@@ -7,13 +7,13 @@ the largest part, which short parts cannot tell, and mapped incrementally.
 """
 
 import shutil
-from collections import Counter
 from collections.abc import Callable, Container, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from scipy.sparse import coo_array
+import numpy as np
+from jaxtyping import Bool, Int64
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from geogs_photos.contradictions import undisputed
@@ -67,40 +67,67 @@ def rejoined(
     return best
 
 
+def believed(model: Any, database: Path, known: Container[int] = ()) -> Any:
+    """What of a reconstruction hangs together, and contradicts no matches.
+
+    With pictures ``known`` from elsewhere it is what does with these.
+    """
+    return firmly_joined(undisputed(model, database, known), known)
+
+
 def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
     """The largest part of a reconstruction whose scale is one; the other pictures lose their poses.
 
-    With pictures ``known`` from elsewhere it is all that hangs together with one of them.
+    With pictures ``known`` from elsewhere it is all that hangs together with these.
 
     Between two pictures scale is passed on by points that a third one sees as well. Where only a
-    few such points join two parts, how large and how far one is as seen from the other is made up.
+    few such points join two parts, or all of them are seen from one picture of a part, how large
+    and how far one is as seen from the other is made up: about a single centre any scale fits.
     """
-    shared: Counter[tuple[int, int]] = Counter()
-    for point in model.points3D.values():
-        seen_by = sorted({element.image_id for element in point.track.elements})
-        if len(seen_by) >= LEAST_VIEWS:
-            shared.update(combinations(seen_by, 2))
     images = sorted(image.image_id for image in model.images.values() if image.has_pose)
     place = {number: k for k, number in enumerate(images)}
-    joined = [(place[a], place[b]) for (a, b), count in shared.items() if count >= LEAST_POINTS]
-    rows, columns = ([pair[k] for pair in joined] for k in (0, 1))
-    graph = coo_array(([1] * len(joined), (rows, columns)), shape=(len(images), len(images)))
-    _, part = connected_components(graph, directed=False)
-    of = dict(zip(images, part.tolist(), strict=True))
-    kept = {of[n] for n in images if n in known}
-    if not kept and images:
-        kept = {Counter(of.values()).most_common(1)[0][0]}
-    for number, own in of.items():
-        if own not in kept:
-            model.deregister_frame(model.images[number].frame_id)
+    views = (sorted({e.image_id for e in p.track.elements}) for p in model.points3D.values())
+    firm = [seen_by for seen_by in views if len(seen_by) >= LEAST_VIEWS]
+    rows = [(k, place[number]) for k, seen_by in enumerate(firm) for number in seen_by]
+    point, image = np.array(rows, np.int64).reshape(-1, 2).T
+    seen = csr_array((np.ones(len(rows), np.int64), (point, image)), (len(firm), len(images)))
+    kept = of_one_scale(seen, np.array([number in known for number in images], bool))
+    for number in set(images) - {images[k] for k in kept}:
+        model.deregister_frame(model.images[number].frame_id)
     model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
     return model
 
 
+def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndarray, "m"]:
+    """The pictures that hang together, and still would without any single one of them.
+
+    Args:
+        seen: 1 where a point (row) is seen by a picture (column).
+        known: the pictures that hang together in any case.
+    """
+    kept = np.arange(seen.shape[1])
+    shared = (seen.T @ seen).toarray()
+    shared[np.ix_(known, known)] = LEAST_POINTS
+    for without in (-1, *kept):
+        rest = kept[kept != without]
+        if not len(rest):
+            break
+        _, part = connected_components(shared[np.ix_(rest, rest)] >= LEAST_POINTS, directed=False)
+        if part.any():
+            # Points may join two parts though no two of their pictures share enough of them.
+            in_part = csr_array((np.ones(len(rest), np.int64), (np.arange(len(rest)), part)))
+            by_part = (seen[:, rest] @ in_part > 0).astype(np.int64)
+            joined = (by_part.T @ by_part).toarray() >= LEAST_POINTS
+            part = connected_components(joined, directed=False)[1][part]
+        counted = part[known[rest]] if known[rest].any() else part
+        is_kept = part == np.bincount(counted).argmax()
+        kept = np.union1d(rest[is_kept], kept[kept == without])
+    return kept
+
+
 def _believed(parts: Sequence[Any], database: Path) -> list[Any]:
-    """What hangs together of each, and contradicts no matches; the largest first."""
-    believed = [firmly_joined(undisputed(part, database)) for part in parts]
-    return sorted(believed, key=lambda part: -len(placed_images(part)))
+    """What is to be believed of each; the largest first."""
+    return sorted((believed(part, database) for part in parts), key=lambda part: -_placed([part]))
 
 
 def _placed(parts: Sequence[Any]) -> int:

@@ -1,7 +1,7 @@
 """Poses, cameras and points of matched photographs, by pycolmap's incremental mapping."""
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,13 @@ def placed_images(model: Any) -> list[Any]:
     return sorted(placed, key=lambda image: image.name)
 
 
+def world_to_camera(image: Any) -> Float64[np.ndarray, "4 4"]:
+    """The pose of a picture."""
+    T = np.eye(4)
+    T[:3] = image.cam_from_world().matrix()
+    return T
+
+
 def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:
     """The reconstruction adjusted once more, robustly, with more of each camera.
 
@@ -156,6 +163,12 @@ def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:
             return trial
     _adjust(colmap, model, known, with_centres=False, threads=threads)
     return model
+
+
+def adjust_free(model: Any, known: Container[int], threads: int) -> None:
+    """A refined reconstruction adjusted once more, with all of the cameras that are not known."""
+    colmap, constant = load_colmap(), {number for number in model.cameras if number in known}
+    _adjust(colmap, model, constant, with_centres=True, threads=threads)
 
 
 def _is_free(model: Any, number: int) -> bool:

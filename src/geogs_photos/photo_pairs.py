@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from geogs.stopwatch import StageProgress
 from geogs.threads import thread_map
 from geogs_photos.photo_features import PhotoFeatures
 
@@ -29,6 +30,8 @@ MOST = 40
 """Most pictures that one brings along, those most alike to it."""
 NEIGHBOURS = 2
 """Next pictures by name that are matched in any case: photographs are taken one after another."""
+FOLLOWING = 6
+"""Frames of a video after each that it is matched with in any case."""
 _WORDS, _SAMPLE, _CANDIDATES = 64, 200, 60
 _RATIO = 0.85
 
@@ -54,6 +57,12 @@ def choose_pairs(
     return _best(count, looked_at, alike)
 
 
+def frame_pairs(features: Sequence[PhotoFeatures], seed: int, progress: StageProgress) -> Pairs:
+    """Pairs of a video's frames, in time order: those chosen, and each with those that follow."""
+    alike = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
+    return sorted({*alike, *_following(len(features), FOLLOWING)})
+
+
 def mutual_matches(one: Float32[np.ndarray, "n 128"], other: Float32[np.ndarray, "m 128"]) -> int:
     """Features that are each other's nearest, and clearly nearer than the second nearest."""
     if len(one) < 2 or len(other) < 2:
@@ -72,12 +81,16 @@ def _best(count: int, pairs: Pairs, alike: Sequence[int]) -> Pairs:
         if matches:
             of_picture[i].append((-matches, j))
             of_picture[j].append((-matches, i))
-    kept = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEIGHBOURS, count))}
+    kept = _following(count, NEIGHBOURS)
     for i, others in enumerate(of_picture):
         for rank, (matches, j) in enumerate(sorted(others)[:MOST]):
             if rank < ALWAYS or -matches >= LEAST_ALIKE:
                 kept.add((min(i, j), max(i, j)))
     return sorted(kept)
+
+
+def _following(count: int, most: int) -> set[tuple[int, int]]:
+    return {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + most, count))}
 
 
 def _candidates(features: Sequence[PhotoFeatures], seed: int) -> Pairs:

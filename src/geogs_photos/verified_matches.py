@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.geometry.epipolar import epipolar_distance, homogeneous
+from geogs_photos.incremental_mapping import world_to_camera
 from geogs_photos.pycolmap_library import load_colmap
 
 MAX_ERROR = 4.0
@@ -47,7 +48,7 @@ def verified_matches(
             if one not in rays or other not in rays:
                 continue
             matches = opened.read_two_view_geometry(one, other).inlier_matches
-            first, second = (_pose(model, n) for n in (one, other))
+            first, second = (world_to_camera(model.images[n]) for n in (one, other))
             yield PairMatches(
                 one, other, second @ np.linalg.inv(first),
                 (rays[one][matches[:, 0]], rays[other][matches[:, 1]]),
@@ -55,13 +56,6 @@ def verified_matches(
             )  # fmt: skip
     finally:
         opened.close()
-
-
-def _pose(model: Any, number: int) -> Float64[np.ndarray, "4 4"]:
-    """World to camera of a picture."""
-    T = np.eye(4)
-    T[:3] = model.images[number].cam_from_world().matrix()
-    return T
 
 
 def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:

@@ -19,18 +19,23 @@ from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import rejoined
-from geogs_photos.incremental_mapping import LEAST_IMAGES, placed_images, refine
+from geogs_photos.incremental_mapping import (
+    LEAST_IMAGES,
+    adjust_free,
+    placed_images,
+    refine,
+    world_to_camera,
+)
 from geogs_photos.photo_features import find_features
-from geogs_photos.photo_pairs import choose_pairs
+from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import Progress, structure_of
 from geogs_photos.pycolmap_library import load_colmap
+from geogs_photos.rolling_rows import with_rows_at_once
 from geogs_photos.upright import upright_rotation
 
 MOST_CHANGE = 0.1
 """Relative. Where the focal length ends farther from one that the video told, both cannot be right,
 and shape and path bend with it: of a camera that turns, points at wrong distances explain any."""
-NEXT = 6
-"""Chosen frames after each that it is matched with in any case."""
 
 
 def place_frames(
@@ -38,6 +43,7 @@ def place_frames(
     camera: Camera,
     is_known: bool,
     is_found: bool,
+    is_rolling: bool,
     seed: int,
     progress: Progress,
 ) -> PlacedVideo:
@@ -50,10 +56,7 @@ def place_frames(
     features = thread_map(
         lambda frame: find_features(frame.image), chosen.frames, lambda f: progress("features", f)
     )
-    alike = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
-    count = len(chosen.frames)
-    following = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEXT, count))}
-    pairs = sorted({*alike, *following})
+    pairs, count = frame_pairs(features, seed, progress), len(chosen.frames)
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
     shared = [SharedCamera(begin, is_known)]
     with tempfile.TemporaryDirectory(prefix="geogs-video-") as work:
@@ -70,7 +73,17 @@ def place_frames(
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
+    unsure = np.zeros(len(images))
+    if is_rolling:
+        progress("finding the readout", 0.0)
+        times = np.array([frame.timestamp for frame in chosen.frames])
+        known = set(best.cameras) if is_known else set[int]()
+        best, unsure = with_rows_at_once(
+            best, times, lambda model: adjust_free(model, known, worker_count())
+        )
+        progress("finding the readout", 1.0)
     placed = _placed(best, chosen, entries, is_known)
+    placed = replace(placed, deviation=np.hypot(placed.deviation, unsure))
     if is_found and abs(math.log(placed.calibration.fx / camera.fx)) > MOST_CHANGE:
         unknown = np.full(len(images), np.inf)
         return replace(placed, deviation=unknown, rotation=unknown, depth=unknown)
@@ -81,10 +94,9 @@ def _placed(
     model: Any, chosen: ChosenFrames, entries: Sequence[Entry], is_known: bool
 ) -> PlacedVideo:
     images = placed_images(model)
-    T_cw = np.tile(np.eye(4), (len(images), 1, 1))
+    T_cw = np.stack([world_to_camera(image) for image in images])
     positions, descriptors = [], []
-    for pose, image in zip(T_cw, images, strict=True):
-        pose[:3] = image.cam_from_world().matrix()
+    for image in images:
         seen = [(k, p.point3D_id) for k, p in enumerate(image.points2D) if p.has_point3D()]
         positions.append(np.array([model.points3D[p].xyz for _, p in seen]).reshape(-1, 3))
         descriptors.append(entries[int(image.name)].features.descriptors[[k for k, _ in seen]])

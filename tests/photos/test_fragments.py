@@ -63,8 +63,7 @@ def test_of_three_ways_the_one_that_puts_most_into_one(
 
         return way
 
-    monkeypatch.setattr(fragments, "firmly_joined", lambda part: part)
-    monkeypatch.setattr(fragments, "undisputed", lambda part, _: part)
+    monkeypatch.setattr(fragments, "believed", lambda part, _: part)
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
     parts = [Part(n) for n in first]
@@ -101,14 +100,24 @@ def model_of(pictures: int, points: Iterable[Sequence[int]]) -> Any:
         ([], {1, 2, 3, 4}),
         ([(4, 5)] * 200, {1, 2, 3, 4}),  # of these 5 has a direction, and no distance
         ([(3, 4, 5)] * 14, {1, 2, 3, 4}),
-        ([(3, 4, 5)] * 15, {1, 2, 3, 4, 5, 6, 7}),
-        ([(4, 5, 6)] * 15, {1, 2, 3, 4, 5, 6, 7}),
+        ([(3, 4, 5)] * 15, {1, 2, 3, 4, 5}),  # what 6 and 7 see has no scale about 5
+        ([(4, 5, 6)] * 15, {1, 2, 3, 4}),
+        ([(3, 4, 5)] * 15 + [(3, 4, 6)] * 14, {1, 2, 3, 4, 5}),
+        ([(3, 4, 5)] * 15 + [(3, 4, 6)] * 8 + [(2, 3, 7)] * 7, {1, 2, 3, 4, 5, 6, 7}),
+        ([(3, 4, 5, 6)] * 15, {1, 2, 3, 4, 5, 6, 7}),
     ],
 )
 def test_parts_without_a_common_scale_are_not_one(between, kept):
     points = [(1, 2, 3)] * 30 + [(2, 3, 4)] * 20 + [(5, 6, 7)] * 500 + between
     model = firmly_joined(model_of(7, points))
     assert {n for n, image in model.images.items() if image.has_pose} == kept
+
+
+def test_what_hangs_on_a_single_known_picture_has_no_scale():
+    points = [(1, 2, 3)] * 30 + [(5, 6, 7)] * 500 + [(3, 5, 6)] * 90
+    for known, kept in (({1, 2, 3}, {1, 2, 3}), ({1, 2, 3, 7}, {1, 2, 3, 5, 6, 7})):
+        model = firmly_joined(model_of(7, points), known)
+        assert {n for n, image in model.images.items() if image.has_pose} == kept
 
 
 def test_a_reconstruction_of_nothing_stays_nothing():
@@ -138,7 +147,7 @@ def test_each_way_places_a_room(monkeypatch):
         return parts
 
     monkeypatch.setattr(video, "rejoined", check)
-    placed = video.place_frames(chosen, room.camera, False, False, 0, lambda *_: None)
+    placed = video.place_frames(chosen, room.camera, False, False, False, 0, lambda *_: None)
     assert placed.numbers == tuple(range(9))
 
 
@@ -156,5 +165,11 @@ def test_a_reconstruction_of_too_few_points_is_none(monkeypatch):
     monkeypatch.setattr(incremental_mapping, "LEAST_POINTS", 10**6)
     with pytest.raises(InputError, match="no three tell where they were taken"):
         video.place_frames(
-            ChosenFrames(frames, np.arange(4) / 10), room.camera, True, False, 0, lambda *_: None
+            ChosenFrames(frames, np.arange(4) / 10),
+            room.camera,
+            True,
+            False,
+            False,
+            0,
+            lambda *_: None,
         )

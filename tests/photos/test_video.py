@@ -65,7 +65,7 @@ def test_deviations_hold_what_the_truth_is_off(tmp_path):
     room = render_room(9, 3, 320, 240)
     frames = [Frame(k, k / 10, image) for k, image in enumerate(room.images)]
     chosen = ChosenFrames(tuple(frames), np.arange(9) / 10)
-    placed = place_frames(chosen, room.camera, True, False, 0, lambda *_: None)
+    placed = place_frames(chosen, room.camera, True, False, False, 0, lambda *_: None)
     assert placed.numbers == tuple(range(9))
     centres, truth = np.linalg.inv(placed.T_cw)[:, :3, 3], room.T_wc[:, :3, 3]
     one, other = (np.linalg.norm(c - c[0], axis=1) for c in (centres, truth))
@@ -85,7 +85,7 @@ def test_a_focal_length_that_contradicts_the_one_the_video_told_leaves_all_unkno
     chosen = ChosenFrames(tuple(frames), np.arange(9) / 10)
     for told, is_believed in ((1.02, True), (1.3, False)):
         camera = room.camera.with_focal(told * room.camera.fx)
-        placed = place_frames(chosen, camera, False, True, 0, lambda *_: None)
+        placed = place_frames(chosen, camera, False, True, False, 0, lambda *_: None)
         assert placed.calibration.fx == pytest.approx(room.camera.fx, rel=0.03)
         for known in (placed.deviation, placed.rotation, placed.depth):
             assert bool(np.isfinite(known).all()) is is_believed

@@ -179,7 +179,7 @@ def test_frames_that_are_found_about_the_keyframes_have_a_place(video, tmp_path,
         times = np.array([lost._times[k] for k in lost.numbers])
         return FoundFrames(tuple(lost.numbers), times, poses, *np.full((2, count), 1e-3))
 
-    monkeypatch.setattr(fallback, "placed_after_all", finds)
+    monkeypatch.setattr(LostFrames, "search", finds)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: False)
     monkeypatch.setattr(Result, "verdict", property(relied_on))
     summary = run(video, tmp_path / "out")

@@ -3,19 +3,22 @@
 import copy
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.application.driver import Driver
+from geogs.application.results.verdict import MAX_POSITION_DEVIATION, extent_of
 from geogs.application.structure_from_motion.photos import SECONDS_PER_FRAME, place_lost
 from geogs.errors import InputError
 from geogs.evaluation.duration import duration
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
-from geogs.stopwatch import StageProgress
+from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.threads import worker_count
 from geogs.types import FoundFrames, FoundLens, Frame, Trajectory, Uncertainty
 
@@ -24,6 +27,9 @@ AROUND = 10
 MOST = 250
 """Lost frames that are looked for at once, for time and memory; of more every second one comes
 first, or every third, ..."""
+UNREAD = 3.0
+"""Times deviations are larger where no readout is known by which the rows could be rectified.
+Measured on a phone's video with a truth (docs/photographs.md)."""
 STAGE = "lost frames"
 
 
@@ -36,7 +42,7 @@ class LostFrames:
         seen_by: Calibration,
         trajectory: Trajectory,
         sharp: Iterable[int],
-        most_deviation: float,
+        keyframes: Trajectory,
         seed: int,
     ) -> None:
         """About what, and how well.
@@ -46,12 +52,13 @@ class LostFrames:
             seen_by: the camera of its frames, with its distortion where they still bend.
             trajectory: of all frames.
             sharp: frames about which the others are looked for, those of them that have a place.
-            most_deviation: of the camera's centre, map units, above which a frame stays lost.
+            keyframes: a frame whose place is not known to a part of their extent stays lost.
             seed: of the random choices.
         """
         # A copy, as a source knows how far it has been read.
         self._video, self._seen_by, self._seed = copy.copy(video), seen_by, seed
-        self._most_deviation, self._times = most_deviation, trajectory.timestamps
+        self._most_deviation = MAX_POSITION_DEVIATION * extent_of(keyframes)
+        self._times = trajectory.timestamps
         states, T_wc = trajectory.states, trajectory.T_wc
         self.known = {k: np.linalg.inv(T_wc[k]) for k in sharp if states[k] == "tracked"}
         """World to camera of the frames about which they are looked for."""
@@ -64,19 +71,34 @@ class LostFrames:
         looked_at = len({*self.numbers, *about(self.numbers, self.known)})
         return looked_at * sum(SECONDS_PER_FRAME.values()) / worker_count()
 
-    def find(self, report: StageProgress) -> FoundFrames:
-        """Those that have a place after all.
+    def search(self, driver: Driver, stopwatch: Stopwatch) -> FoundFrames:
+        """Those that have a place after all, with what is to be said of it; none where that fails.
 
-        Raises:
-            InputError: pycolmap is missing.
-            KeyboardInterrupt: it was stopped.
+        Raises KeyboardInterrupt if it was stopped.
         """
+        if not self.numbers or not self.known:
+            return FoundFrames.none()
+        say = driver.progress.write
+        say(
+            f"Frames without a place: {len(self.numbers)}; looking for it, about "
+            f"{duration(self.seconds)}."
+        )
+        try:
+            with stopwatch(STAGE):
+                found = self._found(driver.report)
+        except (InputError, RuntimeError) as error:  # of a library
+            say(f"That failed, they stay lost: {error}")
+            return FoundFrames.none()
+        say(f"Structure from motion finds the place of {len(found)} of them.")
+        return found
+
+    def _found(self, report: StageProgress) -> FoundFrames:
         known, rounds = dict(self.known), math.ceil(len(self.numbers) / MOST)
         at = np.array([self._times[k] for k in sorted(known)])
         beside = Uncertainty(at, *np.zeros((3, len(at))))
         poses: dict[int, Float64[np.ndarray, "4 4"]] = {}
         for k in range(rounds):
-            some = self._find(known, self.numbers[k::rounds], _part_of(report, k, rounds))
+            some = self._find(known, self.numbers[k::rounds], _in_all(report, k, rounds))
             beside = beside.with_found(some)
             poses |= dict(zip(some.numbers, some.T_cw, strict=True))
             known |= poses
@@ -89,7 +111,7 @@ class LostFrames:
         self,
         known: Mapping[int, Float64[np.ndarray, "4 4"]],
         wanted: Sequence[int],
-        report: Callable[[float], None],
+        report: StageProgress,
     ) -> FoundFrames:
         """Those of some lost frames that are found about known ones, and known well enough."""
         near = about(wanted, known)
@@ -98,27 +120,9 @@ class LostFrames:
         frames = _read(self._video, {*wanted, *near})
         T_cw = [known.get(frame.index) for frame in frames]
         found = place_lost(frames, T_cw, self._seen_by, self._seed, report)
+        times = 1.0 if self._video.shutter.readout else UNREAD
+        found = replace(found, position=times * found.position, rotation=times * found.rotation)
         return found.of(found.position <= self._most_deviation)
-
-
-def placed_after_all(
-    lost: LostFrames, say: Callable[[str], None], report: StageProgress
-) -> FoundFrames:
-    """The lost frames that are found, with what is to be said of it; none where that fails.
-
-    Raises KeyboardInterrupt if it was stopped.
-    """
-    if not lost.numbers or not lost.known:
-        return FoundFrames.none()
-    count = len(lost.numbers)
-    say(f"Frames without a place: {count}; looking for it, about {duration(lost.seconds)}.")
-    try:
-        found = lost.find(report)
-    except (InputError, RuntimeError) as error:  # of a library
-        say(f"That failed, they stay lost: {error}")
-        return FoundFrames.none()
-    say(f"Structure from motion finds the place of {len(found)} of them.")
-    return found
 
 
 def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
@@ -151,5 +155,13 @@ def _read(video: Source, numbers: Collection[int]) -> list[Frame]:
     return frames
 
 
-def _part_of(report: StageProgress, round: int, rounds: int) -> Callable[[float], None]:
-    return lambda fraction: report(STAGE, (round + fraction) / rounds)
+def _in_all(report: StageProgress, round: int, rounds: int) -> StageProgress:
+    """Progress of one stage of one round, as one of all of them."""
+    stages = list(SECONDS_PER_FRAME)
+
+    def of_all(stage: str, fraction: float) -> None:
+        before = sum(SECONDS_PER_FRAME[s] for s in stages[: stages.index(stage)])
+        done = before + SECONDS_PER_FRAME[stage] * fraction
+        report(STAGE, (round + done / sum(SECONDS_PER_FRAME.values())) / rounds)
+
+    return of_all

@@ -15,16 +15,10 @@ from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
     MAX_POSITION_DEVIATION,
     Verdict,
-    extent_of,
 )
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.agreement import turn_alike
-from geogs.application.structure_from_motion.completion import (
-    STAGE,
-    LostFrames,
-    as_seen,
-    placed_after_all,
-)
+from geogs.application.structure_from_motion.completion import LostFrames, as_seen
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
@@ -116,16 +110,13 @@ class TrackedOrPlaced(Work):
         keyframes = [slam.world.keyframes[i].frame_index for i in slam.segments.main.segment.free]
         lost = LostFrames(
             source, as_seen(slam.camera, slam.lens), result.trajectory, keyframes,
-            MAX_POSITION_DEVIATION * extent_of(result.keyframes), slam.config.seed,
+            result.keyframes, slam.config.seed,
         )  # fmt: skip
-        if not lost.numbers:
-            return False
         found = FoundFrames.none()
 
         def find() -> None:
             nonlocal found
-            with slam.stopwatch(STAGE):
-                found = placed_after_all(lost, driver.progress.write, driver.report)
+            found = lost.search(driver, slam.stopwatch)
 
         if not stop.lets_finish(find):
             driver.stop_early("The search for lost frames is stopped")

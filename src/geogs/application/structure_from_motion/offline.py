@@ -9,19 +9,9 @@ from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.results.verdict import (
-    MAX_POSITION_DEVIATION,
-    Verdict,
-    extent_of,
-    verdict,
-)
+from geogs.application.results.verdict import Verdict, verdict
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames, choose_frames
-from geogs.application.structure_from_motion.completion import (
-    STAGE,
-    LostFrames,
-    as_seen,
-    placed_after_all,
-)
+from geogs.application.structure_from_motion.completion import LostFrames, as_seen
 from geogs.application.structure_from_motion.offline_plan import offline_config
 from geogs.application.structure_from_motion.photos import (
     PlacedVideo,
@@ -107,7 +97,9 @@ class PlacedOffline(Work):
             told = video.calibration.refinement
             placed = place_frames(
                 chosen, video.camera, not video.is_calibration_open,
-                told is not None and told.failure is None, config.seed, driver.report,
+                told is not None and told.failure is None,
+                config.input.readout == "auto" and not video.shutter.readout, config.seed,
+                driver.report,
             )  # fmt: skip
         del chosen
         driver.progress.write(
@@ -122,22 +114,14 @@ class PlacedOffline(Work):
         with self._stopwatch("placing frames"):
             T_cw = _place_all(self.source, scene, placed, config, driver.report)
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
-        self._find_lost(driver, T_cw)
-
-    def _find_lost(self, driver: Driver, T_cw: list[Float64[Tensor, "4 4"] | None]) -> None:
-        """Look for the frames that have no pose among those that have one."""
-        scene, source = self.scene, self.source
         lost = LostFrames(
-            source, as_seen(source.camera, None), self.trajectory, scene.sharp,
-            MAX_POSITION_DEVIATION * extent_of(scene.keyframe_trajectory()), self._config.seed,
+            self.source, as_seen(self.source.camera, None), self.trajectory, placed.numbers,
+            scene.keyframe_trajectory(), config.seed,
         )  # fmt: skip
-        if not lost.numbers:
-            return
-        with self._stopwatch(STAGE):
-            scene.found = placed_after_all(lost, driver.progress.write, driver.report)
+        scene.found = lost.search(driver, self._stopwatch)
         for number, pose in zip(scene.found.numbers, scene.found.T_cw, strict=True):
             T_cw[number] = torch.from_numpy(pose)
-        self.trajectory = bridged(self.trajectory.timestamps, T_cw, [None] * len(T_cw))
+        self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
 
     def judged(self) -> Verdict:
         """How far the poses are to be relied on, once there are some."""
@@ -184,11 +168,6 @@ class OfflineScene(Reconstruction):
         """What was said of tracking, where the video was tracked before."""
         self.found = FoundFrames.none()
         """Frames that were lost, and found once the others had been placed."""
-
-    @property
-    def sharp(self) -> tuple[int, ...]:
-        """Which frames structure from motion placed."""
-        return self._placed.numbers
 
     def map(self, progress: StageProgress) -> None:
         """Depths of the sharp frames, and the map from them."""

@@ -91,6 +91,7 @@ def place_frames(
     camera: Camera,
     is_known: bool,
     is_found: bool,
+    is_rolling: bool,
     seed: int,
     report: StageProgress,
 ) -> PlacedVideo:
@@ -102,6 +103,7 @@ def place_frames(
         is_known: whether the camera is to stay as it is.
         is_found: whether the video told its focal length before; where another comes out, poses
             and depths count as unknown.
+        is_rolling: whether rows may have been read one after the other by nobody knows what time.
         seed: of the random choices.
         report: follows the work; what it raises ends it.
 
@@ -109,7 +111,7 @@ def place_frames(
         InputError: pycolmap is missing, or fewer than three frames hang together.
     """
     place = _registered("place_frames")
-    placed: PlacedVideo = place(chosen, camera, is_known, is_found, seed, report)
+    placed: PlacedVideo = place(chosen, camera, is_known, is_found, is_rolling, seed, report)
     return placed
 
 
@@ -118,7 +120,7 @@ def place_lost(
     T_cw: Sequence[Float64[np.ndarray, "4 4"] | None],
     seen_by: Calibration,
     seed: int,
-    report: Callable[[float], None],
+    report: StageProgress,
 ) -> FoundFrames:
     """Find where frames without a pose were taken by others around them, whose poses stay.
 
@@ -127,7 +129,7 @@ def place_lost(
         T_cw: their poses, world to camera; none of those to be found.
         seen_by: the camera of all, with its distortion where they still bend.
         seed: of the random choices.
-        report: called with the finished part; what it raises ends the work.
+        report: follows the work; what it raises ends it.
 
     Raises:
         InputError: pycolmap is missing.
