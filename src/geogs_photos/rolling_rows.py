@@ -16,6 +16,7 @@ from scipy.linalg import logm
 from geogs.geometry.umeyama import umeyama
 from geogs_photos.incremental_mapping import placed_images, world_to_camera
 from geogs_photos.pycolmap_library import load_colmap
+from geogs_photos.verified_matches import MAX_ERROR
 
 TRIED = 0.1
 """Readout that is tried, of the time from one frame to the next: 20 ms of five a second."""
@@ -24,8 +25,6 @@ MOST = 2.0
 LEFT = 0.33
 """Part of what a readout moves that stays unsure, as motion between frames is only roughly known.
 Measured on videos with a truth (docs/photographs.md)."""
-MAX_ERROR = 4.0
-"""Pixels beyond which a point is given up."""
 _APART = 2.5
 """Times the usual step of time from which on motion between two frames is not known."""
 

@@ -5,6 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from geogs.mesh.device.tensor_mesh import vertex_sums
+
 ALIKE = 0.2
 """Standard deviation of the length between unit normals (11 degrees) that are of one surface."""
 _TURNS = 10
@@ -30,34 +32,33 @@ def denoised(
     start = vertices.double()
     if reach <= 0 or not len(faces):
         return start
-    faces = faces.long()
-    normal, area = _facets(start, faces)
-    beyond = faces_beyond(faces)
+    faces, count = faces.long(), len(start)
+    before, area = _facets(start, faces)
+    normal, beyond = before, faces_beyond(faces)
     for _ in range(_TURNS):
         normal = _mean_of_neighbours(normal, area, beyond)
-    weight = _sums(area, faces, start).clamp(min=1e-300)
+    weight = vertex_sums(area, faces, count).clamp(min=1e-300)
     moved = start
     for _ in range(_MOVES):
         moved = moved + _missing(moved, faces, normal, area) / weight
     away = moved - start
-    away = away - _sums(away[faces].mean(1) * area, faces, start) / weight
+    away = away - vertex_sums(away[faces].mean(1) * area, faces, count) / weight
     away = away * (reach / away.norm(dim=1, keepdim=True).clamp(min=reach))
-    return _unfolded(start + away, start, faces, normal)
+    upright = (before * normal).sum(1).clamp(max=0)
+    return _unfolded(start + away, start, faces, normal, upright)
 
 
 def faces_beyond(faces: Int[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
     """The face across the edge from each corner to the next; itself where not just one other is."""
-    count = len(faces)
-    own = torch.arange(count, device=faces.device)
     low, high = torch.stack([faces, faces.roll(-1, 1)]).flatten(1).sort(0).values
     _, edge = torch.unique(low * (high.max() + 1) + high, return_inverse=True)
     order = torch.argsort(edge, stable=True)
     sides = torch.bincount(edge)
     first = (sides.cumsum(0) - sides)[sides == 2]
     one, other = order[first], order[first + 1]
-    beyond = own.repeat_interleave(3)
+    beyond = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
     beyond[one], beyond[other] = other // 3, one // 3
-    return beyond.view(count, 3)
+    return beyond.view(-1, 3)
 
 
 def _unfolded(
@@ -65,24 +66,17 @@ def _unfolded(
     start: Float[Tensor, "n 3"],
     faces: Int[Tensor, "m 3"],
     normal: Float[Tensor, "m 3"],
+    upright: Float[Tensor, "m"],
 ) -> Float[Tensor, "n 3"]:
-    """The vertices, those of facets that turned over against their normals at their start; as that
-    may turn the facets around, until there is none."""
-    enough = _along(start, faces, normal).clamp(max=0)
+    """The vertices, those of facets whose cosine to their normal fell below ``upright`` at their
+    start; as that may turn the facets around, until there is none."""
     while True:
         moves = (moved != start).any(1)[faces].any(1)
-        folded = moves & (_along(moved, faces, normal) < enough)
+        folded = moves & ((_facets(moved, faces)[0] * normal).sum(1) < upright)
         if not folded.any():
             return moved
         back = faces[folded].flatten()
         moved = moved.index_copy(0, back, start[back])
-
-
-def _along(
-    vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"], normal: Float[Tensor, "m 3"]
-) -> Float[Tensor, "m"]:
-    """Cosine between facets and given normals."""
-    return (_facets(vertices, faces)[0] * normal).sum(1)
 
 
 def _facets(
@@ -116,14 +110,4 @@ def _missing(
     for corner in faces.unbind(1):
         height = ((centre - vertices[corner]) * normal).sum(1, keepdim=True)
         total.index_add_(0, corner, normal * height * area)
-    return total
-
-
-def _sums(
-    values: Float[Tensor, "m k"], faces: Int[Tensor, "m 3"], vertices: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n k"]:
-    """Sum over each vertex's facets."""
-    total = vertices.new_zeros(len(vertices), values.shape[1])
-    for corner in faces.unbind(1):
-        total.index_add_(0, corner, values)
     return total

@@ -27,10 +27,7 @@ class TensorMesh:
     def normals(self) -> Float[Tensor, "n 3"]:
         """Unit normals in float32, the mean of a vertex's faces weighted by area."""
         a, b, c = self.corners()
-        normal = torch.linalg.cross(b - a, c - a)
-        total = torch.zeros_like(self.vertices, dtype=torch.float64)
-        for corner in self.faces.unbind(1):
-            total.index_add_(0, corner, normal)
+        total = vertex_sums(torch.linalg.cross(b - a, c - a), self.faces, len(self.vertices))
         return torch.nn.functional.normalize(total, dim=-1, eps=1e-300).float()
 
     def corners(self) -> tuple[Tensor, ...]:
@@ -43,3 +40,13 @@ class TensorMesh:
         used = torch.zeros(len(self.vertices), dtype=torch.bool, device=faces.device)
         used[faces.flatten()] = True
         return TensorMesh(self.vertices[used], (used.cumsum(0) - 1)[faces])
+
+
+def vertex_sums(
+    values: Float[Tensor, "m k"], faces: Int[Tensor, "m 3"], count: int
+) -> Float[Tensor, "n k"]:
+    """Sum of what its faces have, of each of ``count`` vertices."""
+    total = values.new_zeros(count, values.shape[1])
+    for corner in faces.unbind(1):
+        total.index_add_(0, corner, values)
+    return total
