@@ -3,9 +3,12 @@
 A wrong world need not lie off the epipolar lines: two parts that are joined with a wrong turn let
 all matches between them lie near a circle through both cameras (a horopter), where any turn does.
 But where a turn alone explains the matches in both coordinates, hardly another one can be true.
+And of a building whose sides look alike, more frames may match falsely than are joined in truth
+(Heinly et al. 2014); but frames that follow one another show the same side.
 """
 
 from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from geogs.evaluation.rotation_errors import rotation_angle
 from geogs.geometry.nearest_rotation import nearest_rotation
+from geogs_photos.photo_pairs import FOLLOWING
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
 MOST = 0.5
@@ -23,7 +27,30 @@ MOST = 0.5
 TURN = 20.0
 """Degrees by which poses may turn otherwise than a turn that explains a pair by itself: beyond what
 a step to the side does of which all that is seen is equally far."""
+OF_FOLLOWING = 10
+"""Times that matches of frames that follow one another count."""
+_FIRST = 1000
+"""Times that they do where a cut is looked for: it goes through others, however many, where it can,
+rather than around single frames that few hold."""
 _ROUNDS = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """What the matches of two pictures say of their poses."""
+
+    one: int
+    other: int
+    """Their places among the pictures."""
+    matches: int
+    """That speak for the poses; negative where as many speak against them."""
+    is_following: bool = False
+    """Whether they follow one another in a video."""
+
+    @property
+    def weight(self) -> int:
+        """How much it counts."""
+        return self.matches * (OF_FOLLOWING if self.is_following else 1)
 
 
 def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
@@ -32,15 +59,10 @@ def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
     The other pictures lose their poses: which of two parts is where it should be, nobody knows.
     With pictures ``known`` from elsewhere it is the part that holds these, which stay together.
     """
-    images = sorted(image.image_id for image in model.images.values() if image.has_pose)
+    images = _placed(model)
     first = next((k for k, number in enumerate(images) if number in known), None)
     place = {n: first if first is not None and n in known else k for k, n in enumerate(images)}
-    votes = [
-        (place[pair.one], place[pair.other], speaks_for(pair))
-        for pair in verified_matches(model, database, images)
-        if place[pair.one] != place[pair.other]
-    ]
-    parts = undivided(len(images), votes)
+    parts = undivided(len(images), _votes(model, database, place))
     kept = max(parts, key=lambda part: (first in part, len(part)), default=[])
     for number in images:
         if place[number] not in kept:
@@ -48,9 +70,31 @@ def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
     return model
 
 
+def false_pairs(model: Any, database: Path) -> list[tuple[int, int]]:
+    """Pairs of pictures that speak for poses across the borders of the parts that others part."""
+    images = _placed(model)
+    votes = _votes(model, database, {number: k for k, number in enumerate(images)})
+    part_of = {k: n for n, part in enumerate(undivided(len(images), votes)) for k in part}
+    across = [v for v in votes if v.matches > 0 and part_of[v.one] != part_of[v.other]]
+    return [(images[v.one], images[v.other]) for v in across]
+
+
+def _placed(model: Any) -> list[int]:
+    return sorted(image.image_id for image in model.images.values() if image.has_pose)
+
+
+def _votes(model: Any, database: Path, place: dict[int, int]) -> list[Vote]:
+    """Of all pairs of pictures with places of their own."""
+    return [
+        Vote(place[p.one], place[p.other], speaks_for(p), abs(p.other - p.one) <= FOLLOWING)
+        for p in verified_matches(model, database, place)
+        if place[p.one] != place[p.other]
+    ]
+
+
 def speaks_for(pair: PairMatches) -> int:
     """Matches that speak for the poses of a pair; negative where as many speak against them."""
-    by_poses = pair.epipolar() <= MAX_ERROR
+    by_poses = (pair.epipolar() <= MAX_ERROR) & pair.in_front()
     R, off = turn_alone(*pair.rays)
     by_turn = pair.focal * off <= MAX_ERROR
     if by_turn.mean() >= MOST and rotation_angle(R[None], pair.T[None, :3, :3])[0] > TURN:
@@ -74,18 +118,21 @@ def turn_alone(
     return R, off
 
 
-def undivided(count: int, votes: Sequence[tuple[int, int, int]]) -> list[list[int]]:
+def undivided(count: int, votes: Sequence[Vote]) -> list[list[int]]:
     """Parts of ``count`` pictures between which more speaks against their poses than for them.
 
-    A pair of ``votes`` (one, other, matches for them, or negative against) that contradicts is
-    parted by the minimum cut of what speaks for all (Ford and Fulkerson 1956), if across that cut
-    more speaks against.
+    A pair of ``votes`` that contradicts is parted by the minimum cut of what speaks for all (Ford
+    and Fulkerson 1956), if across that cut more speaks against.
     """
     parts, open_parts = list[list[int]](), [list(range(count))]
     while open_parts:
         part = open_parts.pop()
         own = {k: place for place, k in enumerate(part)}
-        inside = [(own[i], own[j], n) for i, j, n in votes if i in own and j in own]
+        inside = [
+            Vote(own[v.one], own[v.other], v.matches, v.is_following)
+            for v in votes
+            if v.one in own and v.other in own
+        ]
         sides = _parted(len(part), inside)
         if sides is None:
             parts.append(part)
@@ -94,14 +141,12 @@ def undivided(count: int, votes: Sequence[tuple[int, int, int]]) -> list[list[in
     return parts
 
 
-def _parted(count: int, votes: Sequence[tuple[int, int, int]]) -> np.ndarray | None:
+def _parted(count: int, votes: Sequence[Vote]) -> np.ndarray | None:
     """Which pictures are on one side of the first cut that is to be made; none where none is."""
-    against = sorted((n, i, j) for i, j, n in votes if n < 0)
-    joins = _graph(count, ((i, j, n) for i, j, n in votes if n > 0))
-    for _, i, j in against:
-        side = _reached(joins, i, j)
-        across = sum(n for a, b, n in votes if side[a] != side[b])
-        if across < 0:
+    joins = _graph(count, (v for v in votes if v.matches > 0))
+    for vote in sorted((v for v in votes if v.matches < 0), key=lambda v: v.weight):
+        side = _reached(joins, vote.one, vote.other)
+        if sum(v.weight for v in votes if side[v.one] != side[v.other]) < 0:
             return side
     return None
 
@@ -115,7 +160,11 @@ def _reached(joins: csr_array, source: int, sink: int) -> np.ndarray:
     return side
 
 
-def _graph(count: int, joins: Iterable[tuple[int, int, int]]) -> csr_array:
-    rows = [(a, b, n) for i, j, n in joins for a, b in ((i, j), (j, i))]
+def _graph(count: int, joins: Iterable[Vote]) -> csr_array:
+    rows = [
+        (a, b, v.matches * (_FIRST if v.is_following else 1))
+        for v in joins
+        for a, b in ((v.one, v.other), (v.other, v.one))
+    ]
     one, other, weight = np.array(rows, np.int32).reshape(-1, 3).T
     return csr_array(coo_array((weight, (one, other)), shape=(count, count)))

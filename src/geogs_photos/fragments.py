@@ -1,9 +1,11 @@
 """What is tried where incremental mapping of a video falls into parts, or leaves frames out.
 
-Global mapping (rotation averaging, global positioning, adjustment; Pan et al. 2024) takes all pairs
-at once. It comes second, as it takes twice the time of incremental mapping and places neither more
-nor better what that places whole. At last matches are verified once more with the focal length of
-the largest part, which short parts cannot tell, and mapped incrementally.
+Where matches contradict a world, those that joined it falsely, as sides of a building do that look
+alike, are left out, and the rest is mapped once more. Global mapping (rotation averaging, global
+positioning, adjustment; Pan et al. 2024) takes all pairs at once. It comes next, as it takes twice
+the time of incremental mapping and places neither more nor better what that places whole. At last
+matches are verified once more with the focal length of the largest part, which short parts cannot
+tell, and mapped incrementally.
 """
 
 import shutil
@@ -16,7 +18,7 @@ from jaxtyping import Bool, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from geogs_photos.contradictions import undisputed
+from geogs_photos.contradictions import false_pairs, undisputed
 from geogs_photos.database import SharedCamera
 from geogs_photos.incremental_mapping import (
     LEAST_POINTS,
@@ -52,14 +54,21 @@ def rejoined(
         threads: to compute with.
         progress: called with a stage and its finished part; what it raises ends the work.
     """
+    known = [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
+    false = false_pairs(parts[0], database) if parts else []
     best = _believed(parts, database)
-    is_known = all(camera.is_known for camera in cameras)
+    if false and _placed(best) < WHOLE * count:
+        again, database = _without(
+            false, database, count, known, seed, threads,
+            lambda f: progress("finding poses again", f),
+        )  # fmt: skip
+        best = max(best, _believed(again, database), key=_placed)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
-        once = _globally(database, is_known, seed, threads)
+        once = _globally(database, bool(known), seed, threads)
         best = max(best, _believed(once, database), key=_placed)
         progress("finding poses globally", 1.0)
-    if best and _placed(best) < WHOLE * count and not is_known:
+    if best and _placed(best) < WHOLE * count and not known:
         again = _with_camera_of(
             best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
         )
@@ -132,6 +141,28 @@ def _believed(parts: Sequence[Any], database: Path) -> list[Any]:
 
 def _placed(parts: Sequence[Any]) -> int:
     return len(placed_images(parts[0])) if parts else 0
+
+
+def _without(
+    pairs: Sequence[tuple[int, int]],
+    database: Path,
+    count: int,
+    known: Sequence[int],
+    seed: int,
+    threads: int,
+    progress: Callable[[float], None],
+) -> tuple[list[Any], Path]:
+    """Parts by incremental mapping where some pairs do not match, and the database that says so."""
+    own = database.with_name("without.db")
+    shutil.copy(database, own)
+    opened = load_colmap().Database.open(own)
+    try:
+        for one, other in pairs:
+            opened.delete_two_view_geometry(one, other)
+            opened.delete_matches(one, other)  # or they would be verified once more
+    finally:
+        opened.close()
+    return put_together(own, own.with_name("without"), count, known, seed, threads, progress), own
 
 
 def _globally(database: Path, is_known: bool, seed: int, threads: int) -> list[Any]:

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
-from geogs.geometry.epipolar import epipolar_distance, homogeneous
+from geogs.geometry.epipolar import epipolar_distance, homogeneous, in_front_of_both
 from geogs_photos.incremental_mapping import world_to_camera
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -33,6 +33,10 @@ class PairMatches:
     def epipolar(self) -> Float64[np.ndarray, "n"]:
         """Distances of the matches from the epipolar geometry of the poses, pixels."""
         return self.focal * epipolar_distance(self.T, np.eye(3), *self.rays)
+
+    def in_front(self) -> Bool[np.ndarray, "n"]:
+        """Whether what was matched lies in front of both cameras, or too far to tell."""
+        return in_front_of_both(self.T, *self.rays, MAX_ERROR / self.focal)
 
 
 def verified_matches(

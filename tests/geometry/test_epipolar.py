@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.geometry.epipolar import epipolar_distance, homogeneous
+from geogs.geometry.epipolar import epipolar_distance, homogeneous, in_front_of_both
 
 
 def pose(R: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -40,3 +40,33 @@ def test_cameras_in_one_place_are_told_by_the_rotation():
     one, two = homogeneous(np.array([[0.1, 0.2]])), homogeneous(second[None])
     off = epipolar_distance(pose(R, np.zeros(3)), np.eye(3), one, two)
     assert off == pytest.approx(0.01)
+
+
+def test_a_twisted_pair_sees_behind_a_camera_though_on_its_epipolar_lines():
+    """Depths against least squares of each match; the twisted pair turns half about the line."""
+    random = np.random.default_rng(1)
+    t = np.array([0.6, 0.1, -0.2])
+    true = pose(Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), t)
+    half = Rotation.from_rotvec(np.pi * t / np.linalg.norm(t)).as_matrix()
+    points = random.uniform([-1, -1, 2], [1, 1, 5], (40, 3))
+    moved = points @ true[:3, :3].T + t
+    moved[30:, 2] *= random.uniform(0.2, 3.0, 10)  # false matches: any depths
+    one, two = points / points[:, 2:], moved / moved[:, 2:]
+    for T, is_true in ((true, True), (pose(half @ true[:3, :3], t), False)):
+        assert epipolar_distance(T, np.eye(3), one, two)[:30].max() < 1e-9
+        found = in_front_of_both(T, one, two, 1e-3)
+        for a, b, in_front in zip(one, two, found, strict=True):
+            rays = np.stack([T[:3, :3] @ a, -b], -1)
+            depths = np.linalg.lstsq(rays, -t, rcond=None)[0]
+            assert in_front == (depths > 0).all()
+        assert (found[:30] == is_true).all()
+
+
+def test_what_is_far_away_lies_in_front_whatever_the_noise():
+    R = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
+    one = homogeneous(np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2)))
+    two = one @ R.T
+    two = two / two[:, 2:] + np.random.default_rng(1).uniform(-1e-3, 1e-3, (50, 3)) * [1, 1, 0]
+    T = pose(R, np.array([1.0, 0.0, 0.0]))
+    assert in_front_of_both(T, one, two, 2e-3).all()
+    assert not in_front_of_both(T, one, two, 1e-6).all()

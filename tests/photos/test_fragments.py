@@ -41,33 +41,39 @@ class Part:
 
 
 @pytest.mark.parametrize(
-    ("first", "globally", "again", "best", "tried"),
+    ("first", "false", "without", "globally", "again", "best", "tried"),
     [
-        ([95], [], [], 95, []),  # whole enough
-        ([60, 35], [98], [], 98, ["globally"]),
-        ([60, 35], [40], [92], 92, ["globally", "again"]),
-        ([60, 35], [65], [30], 65, ["globally", "again"]),  # of three the largest
-        ([], [], [], None, ["globally"]),
-        ([], [70], [80], 80, ["globally", "again"]),
+        ([95], [(1, 2)], [], [], [], 95, []),  # whole enough
+        ([60, 35], [], [], [98], [], 98, ["globally"]),
+        ([60, 35], [], [], [40], [92], 92, ["globally", "again"]),
+        ([60, 35], [], [], [65], [30], 65, ["globally", "again"]),  # of all the largest
+        ([60, 35], [(1, 2)], [97], [], [], 97, ["without"]),
+        ([60, 35], [(1, 2)], [70], [60], [60], 70, ["without", "globally", "again"]),
+        ([], [], [], [], [], None, ["globally"]),
+        ([], [], [], [70], [80], 80, ["globally", "again"]),
     ],
 )
-def test_of_three_ways_the_one_that_puts_most_into_one(
-    monkeypatch, first, globally, again, best, tried
+def test_of_all_ways_the_one_that_puts_most_into_one(
+    monkeypatch, first, false, without, globally, again, best, tried
 ):
     asked = []
 
     def by_way(name: str, sizes: list[int]):
-        def way(*_: object) -> list[Part]:
+        def way(*given: object) -> list[Part]:
             asked.append(name)
+            assert Path("pruned" if false and name != "without" else "all") in given
             return [Part(n) for n in sizes]
 
         return way
 
+    by_rest = by_way("without", without)
     monkeypatch.setattr(fragments, "believed", lambda part, _: part)
+    monkeypatch.setattr(fragments, "false_pairs", lambda *_: false)
+    monkeypatch.setattr(fragments, "_without", lambda *given: (by_rest(*given), Path("pruned")))
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
     parts = [Part(n) for n in first]
-    found = rejoined(parts, Path("none"), 100, [CAMERA], 0, 1, lambda *_: None)
+    found = rejoined(parts, Path("all"), 100, [CAMERA], 0, 1, lambda *_: None)
     assert asked == tried
     assert (found[0].frames if found else None) == best
 
@@ -126,7 +132,7 @@ def test_a_reconstruction_of_nothing_stays_nothing():
 
 @pytest.mark.system
 def test_each_way_places_a_room(monkeypatch):
-    """Incremental mapping is taken to have failed; the two others place all by themselves."""
+    """Incremental mapping is taken to have failed; the others place all by themselves."""
     pytest.importorskip("pycolmap")
     room = render_room(9, 3, 320, 240)
     frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(room.images))
@@ -138,6 +144,8 @@ def test_each_way_places_a_room(monkeypatch):
         found = {"globally": fragments._globally(given[0], False, 0, 1)}
         arguments = (parts[0], given[0], 9, 0, 1, lambda _: None)
         found["again"] = fragments._with_camera_of(*arguments)
+        rest = fragments._without([(1, 2), (4, 9)], given[0], 9, [], 0, 1, lambda _: None)
+        found["without"] = rest[0]
         for way in found.values():
             assert way[0].num_reg_images() == 9
             images = sorted(way[0].images.values(), key=lambda image: image.name)

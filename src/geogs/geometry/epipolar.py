@@ -1,7 +1,7 @@
 """How far matches lie from the epipolar geometry of two views whose poses are known."""
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 
 def epipolar_distance(
@@ -31,6 +31,30 @@ def epipolar_distance(
     value = (two * line_two).sum(axis=1)
     slope = (line_two[:, :2] ** 2).sum(axis=1) + (line_one[:, :2] ** 2).sum(axis=1)
     return np.abs(value) / np.sqrt(slope.clip(1e-24))
+
+
+def in_front_of_both(
+    T: Float64[np.ndarray, "4 4"],
+    one: Float64[np.ndarray, "n 3"],
+    two: Float64[np.ndarray, "n 3"],
+    unsure: float,
+) -> Bool[np.ndarray, "n"]:
+    """Whether rays come nearest to each other in front of both cameras (cheirality).
+
+    The epipolar geometry is the same where a camera is turned half around the line to the other
+    (Hartley and Zisserman, 9.6.3).
+
+    Args:
+        T: from the first camera to the second.
+        one: rays of the first view.
+        two: those that they were found at in the second.
+        unsure: angle, radians, below which rays count as parallel: what they see is far away.
+    """
+    a, b = one @ T[:3, :3].T, two
+    aa, bb, ab = ((x * y).sum(axis=1) for x, y in ((a, a), (b, b), (a, b)))
+    at, bt = a @ T[:3, 3], b @ T[:3, 3]
+    in_front = (ab * bt >= bb * at) & (aa * bt >= ab * at)
+    return in_front | (ab >= np.cos(unsure) * np.sqrt(aa * bb))
 
 
 def homogeneous(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
