@@ -27,8 +27,9 @@ MOST = 0.5
 TURN = 20.0
 """Degrees by which poses may turn otherwise than a turn that explains a pair by itself: beyond what
 a step to the side does of which all that is seen is equally far."""
-OF_FOLLOWING = 10
-"""Times that matches of frames that follow one another count."""
+OF_FOLLOWING = 20
+"""Times that matches of frames that follow one another count: any number of 5 to 100 cuts the walks
+that were tried alike (docs/photographs.md)."""
 _FIRST = 1000
 """Times that they do where a cut is looked for: it goes through others, however many, where it can,
 rather than around single frames that few hold."""
