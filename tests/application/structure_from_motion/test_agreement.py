@@ -47,3 +47,15 @@ def test_only_frames_count_that_both_place():
     half = np.arange(40) % 2 == 0
     some = Trajectory(other.timestamps[half], other.T_wc[half], other.tracked[half])
     assert not turn_alike(walk(), some)
+
+
+@pytest.mark.parametrize(("turn", "alike"), [(25.0, True), (35.0, False)])
+def test_a_single_joint_of_two_parts_that_turns_otherwise_is_noticed(turn: float, alike: bool):
+    R = Rotation.from_euler("y", turn, degrees=True).as_matrix()
+    other, single = walk(), walk()
+    other.T_wc[20:, :3] = R @ other.T_wc[20:, :3]
+    assert turn_alike(walk(), other) is alike
+    single.T_wc[20, :3] = R @ single.T_wc[20, :3]
+    assert turn_alike(walk(), single)
+    lost = np.arange(40) != 20
+    assert turn_alike(walk(), Trajectory(other.timestamps, other.T_wc, lost))
