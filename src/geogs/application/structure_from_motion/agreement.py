@@ -7,6 +7,7 @@ one that turns much otherwise just between two frames joins its parts wrongly th
 """
 
 import numpy as np
+from jaxtyping import Float64
 
 from geogs.evaluation.rotation_errors import relative_rotation_error, rotation_angle
 from geogs.types import Trajectory
@@ -20,28 +21,37 @@ TOLERANCE = 1.0
 OF_TURN = 0.15
 """... and part of the turn: focal lengths that differ so much turn so differently."""
 JOINT = 30.0
-"""Degrees by which a frame and the next may not turn otherwise, if those around them do as well: a
-single frame in a wrong place is no joint."""
+"""Degrees by which no two frames that follow one another may turn otherwise."""
 
 
 def turn_alike(first: Trajectory, second: Trajectory) -> bool:
-    """Whether most pairs of frames are turned alike by both, or there are too few of them, and
-    nowhere a frame and the next quite differently.
+    """Whether most pairs of frames are turned alike by both, or there are too few of them.
 
     Frames are known by their times; those count whose places both know.
     """
     known = first.of("tracked"), second.of("tracked")
-    times, *rows = np.intersect1d(*(k.timestamps for k in known), return_indices=True)
-    R = [k.T_wc[row, :3, :3] for k, row in zip(known, rows, strict=True)]
-    number = np.searchsorted(first.timestamps, times)
-    begin = np.flatnonzero(number[3:] - number[:-3] == 3)
-    around = relative_rotation_error(R[1], R[0], begin, begin + 3)
-    between = relative_rotation_error(R[1], R[0], begin + 1, begin + 2)
-    if (np.minimum(around, between) > JOINT).any():
-        return False
+    _, R = _common(*known)
     begin = np.arange(len(R[0]) - APART)
     if len(begin) < FEWEST:
         return True
     apart = relative_rotation_error(R[1], R[0], begin, begin + APART)
     allowed = TOLERANCE + OF_TURN * rotation_angle(R[0][begin], R[0][begin + APART])
     return bool((apart <= allowed).mean() > 0.5)
+
+
+def is_joined_otherwise(tracked: Trajectory, sharp: Trajectory) -> bool:
+    """Whether two sharp frames, of which the second is the next, are turned quite otherwise than
+    tracking, which lost none between them, saw it."""
+    times, R = _common(tracked.of("tracked"), sharp)
+    number = np.searchsorted(tracked.timestamps, times)
+    lost = np.cumsum([state != "tracked" for state in tracked.states])[number]
+    begin = np.flatnonzero(np.diff(lost) == 0)
+    return bool((relative_rotation_error(R[1], R[0], begin, begin + 1) > JOINT).any())
+
+
+def _common(
+    first: Trajectory, second: Trajectory
+) -> tuple[Float64[np.ndarray, "n"], list[Float64[np.ndarray, "n 3 3"]]]:
+    """Times of the frames of both, and their orientations by each."""
+    times, *rows = np.intersect1d(first.timestamps, second.timestamps, return_indices=True)
+    return times, [k.T_wc[row, :3, :3] for k, row in zip((first, second), rows, strict=True)]

@@ -17,7 +17,7 @@ from geogs.application.results.verdict import (
     Verdict,
 )
 from geogs.application.run_settings import RunSettings
-from geogs.application.structure_from_motion.agreement import turn_alike
+from geogs.application.structure_from_motion.agreement import is_joined_otherwise, turn_alike
 from geogs.application.structure_from_motion.completion import LostFrames, as_seen
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
@@ -155,9 +155,7 @@ class TrackedOrPlaced(Work):
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
         found = placed.judged()
-        is_other = tracked is not None and not turn_alike(
-            self._tracked.scene.trajectory(), placed.trajectory
-        )
+        is_other = tracked is not None and self._turns_otherwise(placed)
         is_taken = is_better(found, tracked) and not is_other
         say(
             f"Structure from motion places {_placed_part(found):.0%} of the frames, tracking "
@@ -167,6 +165,10 @@ class TrackedOrPlaced(Work):
         )
         placed.scene.instead_of = _in_words(tracked)
         return placed if is_taken else None
+
+    def _turns_otherwise(self, placed: "PlacedOffline") -> bool:
+        was, sharp = self._tracked.scene.trajectory(), placed.scene.keyframe_trajectory()
+        return not turn_alike(was, placed.trajectory) or is_joined_otherwise(was, sharp)
 
     def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
         """Map the placed frames; false where nothing came of it."""
