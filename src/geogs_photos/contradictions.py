@@ -27,9 +27,9 @@ MOST = 0.5
 TURN = 20.0
 """Degrees by which poses may turn otherwise than a turn that explains a pair by itself: beyond what
 a step to the side does of which all that is seen is equally far."""
-OF_FOLLOWING = 20
-"""Times that matches of frames that follow one another count: any number of 5 to 100 cuts the walks
-that were tried alike (docs/photographs.md)."""
+OF_FOLLOWING = 200
+"""Times that matches of frames that follow one another count; those that speak for the poses twice
+that, as few false ones are among many true ones anywhere (docs/photographs.md)."""
 _FIRST = 1000
 """Times that they do where a cut is looked for: it goes through others, however many, where it can,
 rather than around single frames that few hold."""
@@ -51,7 +51,9 @@ class Vote:
     @property
     def weight(self) -> int:
         """How much it counts."""
-        return self.matches * (OF_FOLLOWING if self.is_following else 1)
+        if not self.is_following:
+            return self.matches
+        return OF_FOLLOWING * (2 * self.matches if self.matches > 0 else self.matches)
 
 
 def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:

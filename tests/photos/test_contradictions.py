@@ -81,13 +81,16 @@ def test_the_cut_is_where_more_speaks_against_the_poses():
     assert undivided(6, [Vote(0, 1, -3)]) != [[0, 1, 2, 3, 4, 5]]
 
 
-def test_frames_that_follow_one_another_outvote_sides_that_look_alike():
+@pytest.mark.parametrize(
+    ("corner", "sides"), [((-31, 0), 2), ((-31, 10), 2), ((-31, 16), 1), ((-8, 0), 1), ((40, 0), 1)]
+)
+def test_frames_that_follow_one_another_outvote_sides_that_look_alike(corner, sides):
     """Round a building: its sides 0 to 4 and 5 to 9 look alike, and few matches pass the corner."""
     along = [Vote(k, k + 1, 40, True) for k in range(9) if k != 4]
-    alike = [Vote(k, k + 5, 60) for k in range(5)]
-    for corner, parts in ((-16, [range(5), range(5, 10)]), (-14, [range(10)]), (40, [range(10)])):
-        found = undivided(10, [*along, *alike, Vote(4, 5, corner, True)])
-        assert sorted(map(sorted, found)) == [list(part) for part in parts]
+    alike = [Vote(k, k + 5, 400) for k in range(5)]
+    passing = [Vote(4, 5, corner[0], True), Vote(3, 6, corner[1], True)]
+    parts = sorted(map(sorted, undivided(10, [*along, *alike, *passing])))
+    assert parts == ([list(range(10))] if sides == 1 else [list(range(5)), list(range(5, 10))])
 
 
 def test_the_smaller_part_of_a_broken_world_loses_its_poses(monkeypatch):
