@@ -10,7 +10,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.matching.two_view import _pose_of, agreement, best_two_view, two_view
-from geogs.tracking.start.initialise import placed_after
+from geogs.tracking.start.initialise import has_moved_surely, placed_after
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
@@ -92,3 +92,26 @@ def test_without_parallax_there_is_no_pair_to_start_from() -> None:
     depth = torch.full((SampleGrid(CAMERA).size,), 3.0)
     turned = [_flow(depth, pose(0.0, yaw=0.05 * k)) for k in range(1, 5)]
     assert best_two_view(CAMERA, turned, 2.0) is None
+
+
+@pytest.mark.parametrize("focal", [0.95, 1.0, 1.05])
+def test_a_rotation_seen_through_another_focal_length_is_no_parallax(focal: float) -> None:
+    """An essential matrix explains what that adds, with more than four pixels of parallax."""
+    grid = SampleGrid(CAMERA)
+    K = CAMERA.matrix().numpy() @ np.diag([focal, focal, 1.0])
+    R = cv2.Rodrigues(np.array([0.02, 0.3, 0.0]))[0]
+    rays = np.c_[grid.pixels.double().numpy(), np.ones(grid.size)] @ (K @ R @ np.linalg.inv(K)).T
+    noise = np.random.default_rng(0).normal(0, 0.1, (grid.size, 2))
+    pixels = torch.from_numpy(rays[:, :2] / rays[:, 2:] + noise).float()[None]
+    match = FlowMatch(pixels, 50 * grid.inside(pixels).float()[..., None].expand_as(pixels))
+    view = two_view(CAMERA, match)
+    assert view is None or not has_moved_surely(grid, match, view.T_ji)
+
+
+def test_a_step_beside_a_turn_is_parallax() -> None:
+    depth = torch.from_numpy(render(pose(0.0))[1][4:-3:8, 4:-3:8].reshape(-1).copy()).float()
+    match = _flow(depth, pose(0.1, 0.05, 0.1, 0.02))
+    match = FlowMatch(match.pixels, match.weight * 100)
+    view = two_view(CAMERA, match)
+    assert view is not None
+    assert has_moved_surely(SampleGrid(CAMERA), match, view.T_ji)

@@ -71,12 +71,22 @@ def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | N
     moved = relative_pose(grid.camera, pair)
     if moved is not None:
         T_ji = torch.from_numpy(moved[0])
-        off = epipolar_squares(grid, pair, T_ji)
-        if gric(rotated.squares, 2, 3) > gric(off, 3, 5):
+        if has_moved(grid, pair, rotated, T_ji):
             return TwoViewRotation(T_ji[:3, :3], rotated.deviation, False)
     if rotated.agreeing < AGREEING:
         return None
     return TwoViewRotation(rotated.R, rotated.deviation, True)
+
+
+def has_moved(
+    grid: SampleGrid, match: FlowMatch, rotated: RotationFit, T_ji: Float[Tensor, "4 4"]
+) -> bool:
+    """Whether a flow (one edge, on the CPU) speaks for a relative pose, not for a rotation alone.
+
+    ``rotated`` is the rotation that fits it best.
+    """
+    off = epipolar_squares(grid, match, T_ji)
+    return gric(rotated.squares, 2, 3) > gric(off, 3, 5)
 
 
 def gric(squares: Float64[np.ndarray, "n"], dimension: int, parameters: int) -> float:

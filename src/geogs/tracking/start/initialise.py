@@ -6,6 +6,7 @@ dense bundle adjustment with re-measured flow polishes the whole.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from enum import Enum
 from itertools import pairwise
 
@@ -25,12 +26,16 @@ from geogs.tracking.matching.photometric_check import MIN_NCC, PhotometricCheck,
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.tracking.matching.two_view import TwoView, best_two_view
+from geogs.tracking.matching.two_view_rotation import fit_rotation, has_moved
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
 MIN_PARALLAX = 0.005
 """Motion that rotation does not explain, needed to try to start, of the long edge."""
+MODEL_ERROR = 0.01
+"""What focal length, lens and rows may be off by turns a rotation into parallax: deviation of a
+match that the camera's model leaves, of how far it has moved."""
 MAX_DEVIATION = 0.2
 """The map is started when the depths of its first keyframes are known to this, in ``LEAST_KNOWN``
 of their cells: relative standard deviation by what matches and poses leave open."""
@@ -58,8 +63,9 @@ class Attempt(Enum):
 def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> Attempt:
     """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
 
-    It fails if they show no parallax, if matches and poses leave their depths open
-    (``MAX_DEVIATION``), or if the images of two that follow each other do not correlate where
+    It fails if they show no parallax, or none that a rotation of the camera would not explain as
+    well (:mod:`geogs.tracking.matching.two_view_rotation`), if matches and poses leave their depths
+    open (``MAX_DEVIATION``), or if the images of two that follow each other do not correlate where
     poses and depths put them (``MIN_NCC``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
@@ -69,7 +75,7 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     # Poses are guessed on the CPU.
     flows = [f.on_cpu() for f in flows]
     best = best_two_view(camera, flows, MIN_PARALLAX * camera.long_edge)
-    if best is None:
+    if best is None or not has_moved_surely(SampleGrid(camera), flows[best[0]], best[1].T_ji):
         return Attempt.FAILED
     _place_all(graph, flows, best)
     for rounds in (range(FORGIVING), range(FORGIVING, ROUNDS)):
@@ -81,6 +87,16 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     if deviation > MAX_DEVIATION or not _passes_photometric_check(graph):
         return Attempt.FAILED
     return Attempt.STARTED
+
+
+def has_moved_surely(grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]) -> bool:
+    """Whether a flow (one edge, on the CPU) speaks for a relative pose, not for a rotation alone,
+    with matches as unsure as the camera's model leaves them."""
+    moved = (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
+    weight = match.weight / (1 + match.weight * (MODEL_ERROR * moved).square())
+    unsure = replace(match, weight=weight)
+    rotated = fit_rotation(grid, unsure)
+    return rotated is None or has_moved(grid, unsure, rotated, T_ji)
 
 
 def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, TwoView]) -> None:
