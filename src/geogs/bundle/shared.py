@@ -12,7 +12,7 @@ results depend on it.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar, cast
 
 import torch
@@ -41,6 +41,9 @@ OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
+GPU_CHUNK = 256
+"""Edges that are linearised at once on a GPU, where Python's own time counts: there one thread with
+all of them is faster than several with few each."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ class SharedSchur(DenseSchur):
     floor = 1e-6
 
     def __init__(self, problem: BundleProblem, options: BundleOptions) -> None:
+        if problem.pixels.is_cuda:
+            options = replace(options, chunk=GPU_CHUNK)
         super().__init__(problem, SharedFlow(), options)
 
     def linearise(self, state: BundleState) -> LinearBundle:
@@ -139,43 +144,44 @@ class SharedFlow:
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
         """As in the protocol; each with the diagonal of its equations, its depths being fixed."""
-        for frame, e in sources_within(problem.source):
-            yield _source(problem, state, options, frame, e)
+        i, j, block = problem.source, problem.target, cast(ProjectingBlock, state.block)
+        p = block.linearise(state.T_cw, i, j, state.inverse_depth[i])
+        r, weight = weighed_residuals(p, problem.pixels, problem.weight, options.huber)
+        w, J, Jd = weight.mT[:, None], p.jacobian, p.depth_jacobian
+        wJ, wd = J * w, Jd * w[:, 0]
+        H = (wJ.flatten(2) @ J.flatten(2).mT).double().cpu()
+        v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
+        E, curvature, pull = (wJ * Jd[:, None]).sum(2), (wd * Jd).sum(1), (wd * r.mT).sum(1)
+        adjoint = se3_adjoint(relative_motion(state.T_cw, i, j))
+        residual = edge_residual(r, weight)
+        for frame, e in sources_within(i):
+            information = curvature[e].sum(0)
+            depth = DepthEquations(
+                torch.cat([E[e, :6].flatten(0, 1), E[e, 6:].sum(0)]),
+                damped_curvature(information, options.depth_damping),
+                pull[e].sum(0),
+                information,
+            )
+            poses = torch.cat([j[e], i[e][:1]])
+            hessian, gradient = _with_shared(H[e], v[e])
+            edges = RelativeEdges(
+                poses, hessian, gradient, len(block.free), depth, adjoint=adjoint[e]
+            )
+            yield SourceFlow(frame, edges, residual[e], edges.chained()[0].diagonal())
 
 
-def _source(
-    problem: BundleProblem, state: BundleState, options: BundleOptions, frame: int, e: slice
-) -> SourceFlow:
-    source, targets = problem.source[e], problem.target[e]
-    block = cast(ProjectingBlock, state.block)
-    shared = len(block.free)
-    p = block.linearise(state.T_cw, source, targets, state.inverse_depth[source])
-    r, weight = weighed_residuals(p, problem.pixels[e], problem.weight[e], options.huber)
-    w, J, Jd = weight.mT[:, None], p.jacobian, p.depth_jacobian
-    wJ = J * w
-    H = (wJ.flatten(2) @ J.flatten(2).mT).double().cpu()
-    v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
-    E = (wJ * Jd[:, None]).sum(2)
-    wd = Jd * w[:, 0]
-    information, b = (wd * Jd).sum((0, 1)), (wd * r.mT).sum((0, 1))
-    # Relative motions of the edges, then the unknowns that they share.
-    at = 6 * len(targets)
-    hessian = torch.zeros(at + shared, at + shared, dtype=torch.float64)
+def _with_shared(
+    H: Float[Tensor, "e b b"], v: Float[Tensor, "e b"]
+) -> tuple[Float[Tensor, "c c"], Float[Tensor, "c"]]:
+    """Equations of the relative motions of some edges, then of the unknowns that they share, from
+    those of each edge, of its motion and the shared unknowns."""
+    at, shared = 6 * len(H), H.shape[1] - 6
+    hessian = H.new_zeros(at + shared, at + shared)
     hessian[:at, :at] = torch.block_diag(*H[:, :6, :6])
     hessian[:at, at:] = H[:, :6, 6:].reshape(at, shared)
     hessian[at:, :at] = hessian[:at, at:].mT
     hessian[at:, at:] = H[:, 6:, 6:].sum(0)
-    gradient = torch.cat([v[:, :6].reshape(-1), v[:, 6:].sum(0)])
-    depth = DepthEquations(
-        torch.cat([E[:, :6].flatten(0, 1), E[:, 6:].sum(0)]),
-        damped_curvature(information, options.depth_damping),
-        b,
-        information,
-    )
-    poses = torch.cat([targets, source[:1]])
-    adjoint = se3_adjoint(relative_motion(state.T_cw, source, targets))
-    edges = RelativeEdges(poses, hessian, gradient, shared, depth, adjoint=adjoint)
-    return SourceFlow(frame, edges, edge_residual(r, weight), edges.chained()[0].diagonal())
+    return hessian, torch.cat([v[:, :6].reshape(-1), v[:, 6:].sum(0)])
 
 
 def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:

@@ -82,7 +82,7 @@ def test_finds_the_focal_length_of_a_rendered_room():
     guess = CAMERA.with_focal(1.5 * CAMERA.fx)
     grid = SampleGrid(guess)
     operator = build_operator(TrackingConfig(operator="classical"), grid)
-    gatherer = ViewGatherer(iter(frames(path)), grid, operator)
+    gatherer = ViewGatherer((f.image for f in frames(path)), grid, operator)
     gatherer.gather([], len(path), lambda: None)
     asked: list[None] = []
     matches = distant_flows(grid, operator, gatherer.views, lambda: asked.append(None))

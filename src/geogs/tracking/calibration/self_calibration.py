@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool
@@ -20,6 +21,9 @@ from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
 
+LONG_EDGE = 512
+"""Pixels of the images that are matched, at most, whatever the run tracks on: what the limits of
+parallax and of matched cells were chosen at (docs/calibration.md)."""
 STRETCHES = 4
 """Stretches of the video that are used, at most, each after the one before it: bounds the time."""
 CONFIDENT = 0.01
@@ -61,16 +65,21 @@ def self_calibrate(
 ) -> SelfCalibration:
     """Estimate the focal length, k1 and k2 if ``radial``, of the camera that took ``frames``.
 
-    Aspect and principal point of ``camera`` are believed, its focal length is only one of several
-    to start from. Flow is measured by the operator without a network. Stretch after stretch of the
-    video is used until all together are confident; where none of them tells, the epipolar geometry
-    of distant pairs of their views is asked. ``report`` is called with the fraction done;
-    what it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black
-    where ``black_is_masked``.
+    ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
+    is only one of several to start from. Flow is measured by the operator without a network.
+    Stretch after stretch of the video is used until all together are confident; where none of them
+    tells, the epipolar geometry of distant pairs of their views is asked. ``report`` is called with
+    the fraction done; what it raises passes through. Outside a ``mask`` nothing is matched, nor
+    what is quite black where ``black_is_masked``.
     """
-    grid = SampleGrid(camera, device)
+    small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
+    size = small.width, small.height
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    grid = SampleGrid(small, device)
     operator = build_operator(TrackingConfig(operator="classical"), grid, mask, black_is_masked)
-    gatherer = ViewGatherer(iter(frames), grid, operator)
+    images = (cv2.resize(f.image, size, interpolation=cv2.INTER_AREA) for f in frames)
+    gatherer = ViewGatherer(images, grid, operator)
     estimates: list[Estimate] = []
     failure = ""
     for n in range(STRETCHES):
@@ -85,13 +94,13 @@ def self_calibrate(
     if found is None or not found.deviation < UNRELIABLE:
         asked = _part_of(report, STRETCHES)
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
-        by_pairs = view_graph_estimate(camera, flows)
+        by_pairs = view_graph_estimate(small, flows)
         if by_pairs is not None and by_pairs.deviation < UNRELIABLE:
             found = by_pairs
     if found is None:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
-    return _verdict(camera, found, gatherer.frames)
+    return _verdict(camera, small, found, gatherer.frames)
 
 
 def _ask(stretch: Stretch) -> Estimate | str:
@@ -110,14 +119,15 @@ def _part_of(report: Report, n: int) -> Report:
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
 
 
-def _verdict(guess: Camera, found: Estimate, frames: int) -> SelfCalibration:
-    """The estimate, or why it is not believed."""
+def _verdict(guess: Camera, small: Camera, found: Estimate, frames: int) -> SelfCalibration:
+    """The estimate on images of ``small``, for those of the guess, or why it is not believed."""
     if not found.deviation < UNRELIABLE:
         failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
         return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
     k1, k2 = found.lens.k1, found.lens.k2
     bends = k1 != 0 or k2 != 0
+    camera = guess.with_focal(guess.fx * found.camera.fx / small.fx)
     return SelfCalibration(
-        found.camera, (k1, k2) if bends else None, found.deviation,
+        camera, (k1, k2) if bends else None, found.deviation,
         found.deviations[1:] if bends else None, found.keyframes, frames,
     )  # fmt: skip

@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.config import TrackingConfig
@@ -13,7 +14,7 @@ from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, follow_flow
 from geogs.tracking.matching.sparse_features import guided_flows
-from geogs.types import FlowMatch, Frame
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
 
@@ -37,8 +38,11 @@ class View:
 class ViewGatherer:
     """Takes keyframes by image motion alone, which needs no focal length."""
 
-    def __init__(self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator) -> None:
-        self._frames, self._grid, self._operator = frames, grid, operator
+    def __init__(
+        self, images: Iterator[UInt8[np.ndarray, "h w 3"]], grid: SampleGrid, operator: FlowOperator
+    ) -> None:
+        """``images`` of the grid's size."""
+        self._images, self._grid, self._operator = images, grid, operator
         self._config = TrackingConfig()
         self._chain = ChainedPositions()
         self.views: list[View] = []
@@ -60,13 +64,13 @@ class ViewGatherer:
         views = list(views)
         edge = self._grid.camera.long_edge
         while len(views) < count and not self.is_over:
-            frame = next(self._frames, None)
-            if frame is None:
+            image = next(self._images, None)
+            if image is None:
                 self._is_read = True
                 break
             self.frames += 1
             tick()
-            encoded = self._operator.encode(frame.image)
+            encoded = self._operator.encode(image)
             if self._operator.texture(encoded) < MIN_TEXTURE:
                 continue
             step = None
