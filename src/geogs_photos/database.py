@@ -29,6 +29,11 @@ class SharedCamera:
     """Whether it is to stay as it is."""
 
 
+def known_cameras(cameras: Sequence[SharedCamera]) -> list[int]:
+    """Numbers in the database of those that stay as they are."""
+    return [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
+
+
 @dataclass(frozen=True, slots=True)
 class Entry:
     """A picture in the database; its number there is its place plus one."""

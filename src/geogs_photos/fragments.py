@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from geogs_photos.contradictions import false_pairs, undisputed
-from geogs_photos.database import SharedCamera
+from geogs_photos.database import SharedCamera, known_cameras
 from geogs_photos.incremental_mapping import (
     LEAST_POINTS,
     largest_first,
@@ -54,7 +54,8 @@ def rejoined(
         threads: to compute with.
         progress: called with a stage and its finished part; what it raises ends the work.
     """
-    known = [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
+    known = known_cameras(cameras)
+    is_known = len(known) == len(cameras)
     false = false_pairs(parts[0], database) if parts else []
     best = _believed(parts, database)
     if false and _placed(best) < WHOLE * count:
@@ -65,10 +66,10 @@ def rejoined(
         best = max(best, _believed(again, database), key=_placed)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
-        once = _globally(database, bool(known), seed, threads)
+        once = _globally(database, is_known, seed, threads)
         best = max(best, _believed(once, database), key=_placed)
         progress("finding poses globally", 1.0)
-    if best and _placed(best) < WHOLE * count and not known:
+    if best and _placed(best) < WHOLE * count and not is_known:
         again = _with_camera_of(
             best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
         )

@@ -14,7 +14,13 @@ from geogs.io.sources.formats.colmap import mask_beside
 from geogs.io.sources.known_intrinsics import calibration_from_exif, resolve_intrinsics
 from geogs.io.sources.posed.stored_pictures import read_picture
 from geogs.threads import thread_map, worker_count
-from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
+from geogs_photos.database import (
+    Entry,
+    SharedCamera,
+    known_cameras,
+    match_pairs,
+    write_database,
+)
 from geogs_photos.incremental_mapping import put_together, refine
 from geogs_photos.photo_features import MAX_FEATURES, PhotoFeatures, find_features
 from geogs_photos.photo_pairs import Pairs, choose_pairs
@@ -120,9 +126,8 @@ def structure_of(
     threads = worker_count()
     write_database(database, cameras, entries)
     kept = match_pairs(database, entries, pairs, seed, threads, lambda f: progress("matching", f))
-    known = [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
     parts = put_together(
-        database, database.with_name("models"), len(entries), known, seed, threads,
+        database, database.with_name("models"), len(entries), known_cameras(cameras), seed, threads,
         lambda f: progress("finding poses", f),
     )  # fmt: skip
     return parts, kept

@@ -41,9 +41,9 @@ OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
-GPU_CHUNK = 256
-"""Edges that are linearised at once on a GPU, where Python's own time counts: there one thread with
-all of them is faster than several with few each."""
+GPU_OPTIONS = replace(OPTIONS, chunk=256)
+"""On a GPU, where Python's own time counts: one thread with all edges is faster than several with
+few each."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,6 @@ class SharedSchur(DenseSchur):
     floor = 1e-6
 
     def __init__(self, problem: BundleProblem, options: BundleOptions) -> None:
-        if problem.pixels.is_cuda:
-            options = replace(options, chunk=GPU_CHUNK)
         super().__init__(problem, SharedFlow(), options)
 
     def linearise(self, state: BundleState) -> LinearBundle:

@@ -37,7 +37,7 @@ def in_front_of_both(
     T: Float64[np.ndarray, "4 4"],
     one: Float64[np.ndarray, "n 3"],
     two: Float64[np.ndarray, "n 3"],
-    unsure: float,
+    unsure: float = 0.0,
 ) -> Bool[np.ndarray, "n"]:
     """Whether rays come nearest to each other in front of both cameras (cheirality).
 
@@ -53,8 +53,8 @@ def in_front_of_both(
     a, b = one @ T[:3, :3].T, two
     aa, bb, ab = ((x * y).sum(axis=1) for x, y in ((a, a), (b, b), (a, b)))
     at, bt = a @ T[:3, 3], b @ T[:3, 3]
-    in_front = (ab * bt >= bb * at) & (aa * bt >= ab * at)
-    return in_front | (ab >= np.cos(unsure) * np.sqrt(aa * bb))
+    in_front = (ab * bt > bb * at) & (aa * bt > ab * at)
+    return in_front | (ab > np.cos(unsure) * np.sqrt(aa * bb))
 
 
 def homogeneous(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

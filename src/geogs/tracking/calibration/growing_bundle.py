@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.shared import SharedResult, solve_shared
+from geogs.bundle.shared import GPU_OPTIONS, OPTIONS, SharedResult, solve_shared
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View
@@ -135,7 +135,8 @@ class GrowingBundle:
     def adjust(self, radial: bool) -> bool:
         """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
         block = LensBlock(self.lens, self.grid.pixels, radial=radial)
-        result = solve_shared(self.problem(), block)
+        options = GPU_OPTIONS if self.grid.on_gpu else OPTIONS
+        result = solve_shared(self.problem(), block, options)
         if not result.finite:
             return False
         self.result, self.lens = result, result.block.lens

@@ -4,11 +4,10 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.epipolar import epipolar_distance, homogeneous
+from geogs.geometry.epipolar import epipolar_distance, homogeneous, in_front_of_both
 from geogs.io.sources.posed.conventions import Poses, conventions_for
 from geogs.io.sources.posed.matching import MatchedPair, Matcher
 from geogs.io.sources.posed.posed_source import PosedSource
@@ -110,22 +109,9 @@ def fit_of(T_cw: Poses, pairs: list[MatchedPair], camera: Camera) -> Fit:
         T = T_cw[pair.second] @ np.linalg.inv(T_cw[pair.first])
         one, two = (homogeneous(p) for p in (pair.pixels_first, pair.pixels_second))
         errors.append(np.median(epipolar_distance(T, K_inverse, one, two)))
-        in_front.append(_part_in_front(T, one @ K_inverse.T, two @ K_inverse.T))
+        in_front.append(in_front_of_both(T, one @ K_inverse.T, two @ K_inverse.T).mean())
     long_edge = max(camera.width, camera.height)
     return Fit(float(np.median(errors)) / long_edge, float(np.median(in_front)))
-
-
-def _part_in_front(
-    T: Float64[np.ndarray, "4 4"], one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"]
-) -> float:
-    """Part of the ray pairs that come closest to each other in front of both cameras."""
-    rotated, t = one @ T[:3, :3].T, T[:3, 3]
-    # Least squares of z1 rotated + t = z2 two, by its two normal equations.
-    a, b, c = (rotated**2).sum(1), (rotated * two).sum(1), (two**2).sum(1)
-    determinant = (a * c - b * b).clip(1e-15)
-    p, q = -(rotated @ t), two @ t
-    z_one, z_two = (p * c + q * b) / determinant, (p * b + q * a) / determinant
-    return float(((z_one > 0) & (z_two > 0)).mean())
 
 
 def _words(fit: Fit, camera: Camera) -> str:
