@@ -17,8 +17,8 @@ from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import FrameMotion
 from geogs.tracking.start.start_up import MIN_KEYFRAMES
 from geogs.types import Frame
-from geogs.world.edges import edge_matches
-from geogs.world.frames import RelativeRotation
+from geogs.world.edges import Pair, edge_matches
+from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.keyframes import Keyframe
 
 CULL_DISTANCE = 0.009
@@ -66,13 +66,23 @@ class LocalMapping:
         """Make a located frame a keyframe, with the depths that its anchor gives it."""
         anchor = self.keyframes[motion.keyframe]
         keyframe = self.map.add(frame, encoded, motion.T_cw)
-        T = motion.T_cw @ se3_inverse(anchor.T_cw)
-        keyframe.inverse_depth, keyframe.information = grid_fields(self.keyframes.grid).transfer(
-            T, anchor.inverse_depth, anchor.information
-        )
+        self._carry_depths(anchor, keyframe)
         if self.segment.is_metric:
             self.map.sensor.join(keyframe, frame.depth)
         return keyframe
+
+    def extend_back(self, record: FrameRecord, id: int, motion: FrameMotion) -> None:
+        """Make a located frame, which was the keyframe ``id`` before the map was started, the
+        earliest keyframe, linked to those after it and adjusted with them."""
+        keyframe = self.map.restore(record, id, motion.T_cw)
+        self._carry_depths(self.keyframes[motion.keyframe], keyframe)
+        ids, fixed = self.keyframes.ids, {*self.segment.fixed}
+        self._connect(ids[1:PROXIMITY_WINDOW], ids[:1], (keyframe.id, motion.keyframe))
+        self._carry_moving(motion.keyframe, keyframe)
+        self._adjust(
+            [k for k in ids[: self.config.window] if k not in fixed and k != ids[-1]],
+            [k for k in ids[: self.config.window + DEEPER] if k not in fixed],
+        )
 
     def update(
         self,
@@ -86,23 +96,34 @@ class LocalMapping:
         ``anchor`` is the keyframe at which it was located; without ``culls`` none goes.
         """
         self.map.complete(keyframe, rotations)
-        self._connect(keyframe.id, anchor)
+        ids = self.keyframes.ids
+        self._connect(ids[-1:], ids[-PROXIMITY_WINDOW:-1], (anchor, keyframe.id))
+        self._carry_moving(anchor, keyframe)
+        self._adjust(self.active, self.deep)
+        self.map.odometry.update_scale()
+        return self._cull() if culls else ()
+
+    def _carry_depths(self, anchor: Keyframe, keyframe: Keyframe) -> None:
+        T = keyframe.T_cw @ se3_inverse(anchor.T_cw)
+        keyframe.inverse_depth, keyframe.information = grid_fields(self.keyframes.grid).transfer(
+            T, anchor.inverse_depth, anchor.information
+        )
+
+    def _carry_moving(self, anchor: int, keyframe: Keyframe) -> None:
+        """What moves in the anchor moves in a keyframe that has been measured against it."""
         (pixels,), (weight,) = edge_matches(
             self.keyframes.grid, [self.graph.edges[keyframe.id, anchor]]
         )
         moving = self.keyframes[anchor].moving
         keyframe.moving = propagated(self.keyframes.grid, moving, pixels, weight)
-        self._adjust()
-        self.map.odometry.update_scale()
-        return self._cull() if culls else ()
 
-    def _connect(self, id: int, anchor: int) -> None:
-        """Measure a new keyframe against the one it was located at, and its neighbours."""
-        ids = self.keyframes.ids
+    def _connect(self, later: Sequence[int], earlier: Sequence[int], located: Pair) -> None:
+        """Measure a new keyframe, the only one of the later or of the earlier, against the one it
+        was located at, and its neighbours."""
         pairs = proximity_pairs(
             self.keyframes,
-            [id],
-            ids[-PROXIMITY_WINDOW:-1],
+            later,
+            earlier,
             self.graph.pairs,
             RADIUS,
             1,
@@ -115,11 +136,10 @@ class LocalMapping:
         there, back = frame_distances(self.keyframes, broken + [p[::-1] for p in broken]).chunk(2)
         unseen = {p for p, d in zip(broken, (there + back).tolist(), strict=True) if d == torch.inf}
         pairs = [p for p in pairs if p not in unseen]
-        self.graph.measure({*pairs, (anchor, id)}, fine=False)
+        self.graph.measure({*pairs, located}, fine=False)
 
-    def _adjust(self) -> None:
+    def _adjust(self, poses: Sequence[int], depths: Sequence[int]) -> None:
         """Rounds of bundle adjustment, with flow measured anew where poses have moved."""
-        poses, depths = self.active, self.deep
         moving, deep, priors = set(poses), set(depths), self.map.priors
         for n in range(ROUNDS):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]

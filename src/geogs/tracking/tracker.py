@@ -25,8 +25,8 @@ from geogs.tracking.locate.localiser import SegmentLocaliser
 from geogs.tracking.locate.orientation_follower import OrientationFollower
 from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
 from geogs.tracking.matching.flow_chain import MIN_TEXTURE
-from geogs.tracking.start.early_frames import locate_early_frames
 from geogs.tracking.start.start_up import StartUp
+from geogs.tracking.track_back import track_back
 from geogs.types import Frame, Trajectory
 from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -261,7 +261,7 @@ class Tracker:
         """The map has just been started."""
         self.map.odometry.update_scale()
         keyframes = self.keyframes
-        locate_early_frames(self.map.recorder, keyframes, self._localiser.locator)
+        track_back(self.local, self._localiser.locator)
         self.segment.status.last = LastFrame.at(keyframes[keyframes.ids[-1]])
 
     def _lose(self, frame: Frame, rotations: Sequence[RelativeRotation] = ()) -> TrackResult:

@@ -1,6 +1,7 @@
 """All keyframes of a run, by stable id: what was seen, from where, and how far it is."""
 
 import copy
+from bisect import insort
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, cast
@@ -46,7 +47,7 @@ class Keyframe:
     """
 
     id: Id
-    """Stable: never reused, increasing in time."""
+    """Stable: never another frame's, increasing in time."""
     frame_index: Number
     timestamp: float
     """Seconds."""
@@ -309,11 +310,14 @@ class KeyframeSet:
         image: UInt8[np.ndarray, "h w 3"],
         encoded: Any,
         T_cw: Float[Tensor, "4 4"],
+        id: int | None = None,
     ) -> Keyframe:
-        """Append a new keyframe with unit inverse depth and no information."""
+        """Add a keyframe with unit inverse depth and no information; the latest, but where it was
+        one before, of that ``id``, and was removed."""
         table, grid = self.table, self.table.grid
         table.forget_removed()
-        id, table.next_id = table.next_id, table.next_id + 1
+        if id is None:
+            id, table.next_id = table.next_id, table.next_id + 1
         ones = torch.ones(grid.size, device=grid.device)
         keyframe = Keyframe(id, frame_index, timestamp, ones, 0 * ones)
         table.arrays.put("image", id, image, recent=True)
@@ -330,7 +334,7 @@ class KeyframeSet:
         keyframe.table = self.table
         self.table.keyframes[keyframe.id] = keyframe
         self.table.set_of[keyframe.id] = self
-        self.members.append(keyframe.id)
+        insort(self.members, keyframe.id)
 
     def absorb(self, other: "KeyframeSet") -> None:
         """Take over the keyframes of another set, which are in this one's world already."""

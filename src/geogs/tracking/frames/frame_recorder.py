@@ -128,16 +128,17 @@ class FrameRecorder:
         if record is not None:
             self._let_wait(record, removed)
 
-    def take_unplaced(self) -> list[tuple[FrameRecord, Any]]:
-        """Frames that wait without a keyframe to be relative to, and their encoded images.
+    def keyframe_restored(self, record: FrameRecord, keyframe: Keyframe) -> None:
+        """A frame whose keyframe was given up is one again."""
+        eye = torch.eye(4, dtype=torch.float64)
+        record.anchor, record.T_rel, record.scale = keyframe.id, eye, keyframe.scale
+        record.observations = []
+        self._stop_waiting([record])
 
-        They wait no longer.
-        """
+    def unplaced(self) -> list[FrameRecord]:
+        """Frames that wait without a keyframe to be relative to, earliest first."""
         ids = {*self._keyframes.ids}
-        without = [r for r in self._waiting if r.anchor not in ids]
-        taken = [(r, self._encoded(r)) for r in without]
-        self._stop_waiting(without)
-        return taken
+        return [r for r in self._waiting if r.anchor not in ids]
 
     def place(
         self, record: FrameRecord, anchor: int, T_rel: Float[Tensor, "4 4"], match: FlowMatch
@@ -204,7 +205,8 @@ class FrameRecorder:
             record.forget_image()
         self._waiting = [r for r in self._waiting if r.image is not None]
 
-    def _encoded(self, record: FrameRecord) -> Any:
+    def encoded(self, record: FrameRecord) -> Any:
+        """The flow operator's form of the image of a frame that waits."""
         if record.encoded is None:
             assert record.image is not None, "a frame that does not wait has no image"
             record.encoded = self._operator.encode(record.image)
@@ -216,7 +218,7 @@ class FrameRecorder:
         forward, backward = grid_fields(self._keyframes.grid).reproject(keyframes, poses)
         there, _ = self._operator.measure(
             [k.encoded for k in keyframes],
-            [self._encoded(r) for r, _ in jobs],
+            [self.encoded(r) for r, _ in jobs],
             forward,
             backward,
             fine=False,

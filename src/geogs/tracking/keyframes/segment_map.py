@@ -16,7 +16,7 @@ from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.keyframes.keyframe_depth_sensor import KeyframeDepthSensor
 from geogs.tracking.keyframes.monocular_priors import KeyframePriors
 from geogs.types import Frame
-from geogs.world.frames import RelativeRotation
+from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.keyframes import Keyframe
 from geogs.world.segments import VideoSegment
 
@@ -67,6 +67,17 @@ class SegmentMap:
             self.graph.remove_keyframe(id)
             self.recorder.keyframe_forgotten(self.keyframes.remove(id))
         return tuple(ids)
+
+    def restore(self, record: FrameRecord, id: int, T_cw: Float[Tensor, "4 4"]) -> Keyframe:
+        """Make the frame of a keyframe that was given up a keyframe again, by the id it had."""
+        assert record.image is not None, "a frame that does not wait has no image"
+        encoded = self.recorder.encoded(record)
+        keyframe = self.keyframes.add(
+            record.index, record.timestamp, record.image, encoded, T_cw, id
+        )
+        self.priors.ask(keyframe)
+        self.recorder.keyframe_restored(record, keyframe)
+        return keyframe
 
     def finalise(self, ids: Sequence[int]) -> tuple[int, ...]:
         """Let keyframes be removed no more; returns those that could be until now."""

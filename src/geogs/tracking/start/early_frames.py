@@ -1,14 +1,11 @@
-"""Poses of the frames from before a map was started."""
+"""Poses of the frames between the keyframes of a start."""
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
-from geogs.tracking.frames.frame_recorder import FrameRecorder
 from geogs.tracking.frames.rotation_averaging import orientations
-from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator
-from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
@@ -24,7 +21,7 @@ def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
     """
     ordered = list(keyframes)
     indices = [k.frame_index for k in ordered]
-    oriented = _oriented(log, keyframes)
+    oriented = oriented_frames(log, keyframes)
     for record in log.records:
         if record.anchor is None or record.anchor not in keyframes:
             continue
@@ -41,37 +38,7 @@ def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
                 record.anchor = None
 
 
-def locate_early_frames(
-    recorder: FrameRecorder, keyframes: KeyframeSet, locator: FrameLocator
-) -> None:
-    """Locate the frames that have no pose between the keyframes of a start, the latest first.
-
-    Each is searched for where the camera was at the nearest time that is known, with the
-    orientation that relative rotations say.
-    """
-    waiting = recorder.take_unplaced()
-    candidates = list(keyframes)
-    if not waiting or not candidates:
-        return
-    oriented = _oriented(recorder.log, keyframes)
-    centres = {k.frame_index: se3_inverse(k.T_cw)[:3, 3] for k in candidates}
-    for record, encoded in reversed(waiting):
-        record.anchor, R = None, oriented.get(record.index)
-        if R is None:
-            continue
-        nearest = min(centres, key=lambda index: abs(index - record.index))
-        guess = torch.eye(4, dtype=torch.float64)
-        guess[:3, :3], guess[:3, 3] = R, -R @ centres[nearest]
-        for keyframe in visible_keyframes(candidates, guess):
-            motion = locator.locate(keyframe, encoded, guess, is_expected=False)
-            if motion is not None and motion.known >= MIN_KNOWN:
-                T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)
-                recorder.place(record, keyframe.id, T_rel, motion.match)
-                centres[record.index] = se3_inverse(motion.T_cw)[:3, 3]
-                break
-
-
-def _oriented(log: FrameLog, keyframes: KeyframeSet) -> dict[int, Float64[Tensor, "3 3"]]:
+def oriented_frames(log: FrameLog, keyframes: KeyframeSet) -> dict[int, Float64[Tensor, "3 3"]]:
     """World to camera of frames that rotations link to keyframes, by the index of the frame."""
     return orientations(
         {r.index: r.rotations for r in log.records},

@@ -1,0 +1,80 @@
+"""Frames from before a map was started, tracked backwards from its keyframes."""
+
+from typing import Any
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
+from geogs.tracking.local_mapping import LocalMapping
+from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion
+from geogs.tracking.locate.visible_keyframes import visible_keyframes
+from geogs.tracking.start.early_frames import oriented_frames
+from geogs.world.keyframes import Keyframe, KeyframeSet
+
+
+def track_back(local: LocalMapping, locator: FrameLocator) -> None:
+    """Locate the frames that have no pose between the keyframes of a start, the latest first.
+
+    Each is searched for where the camera was at the nearest time that is known, with the
+    orientation that relative rotations say. Those that were keyframes of attempts which failed
+    become keyframes again by the rule by which frames do: else all would hang on a keyframe that
+    sees them at its border, and what they show would have no depth.
+    """
+    recorder, keyframes = local.map.recorder, local.keyframes
+    waiting = recorder.unplaced()
+    if not waiting:
+        return
+    oriented = oriented_frames(recorder.log, keyframes)
+    placed = {k.frame_index: k.T_cw for k in keyframes}
+    # Of the frames on a keyframe that was given up the earliest was that keyframe.
+    given_up = {r.anchor: r for r in reversed(waiting) if r.anchor is not None}
+    for record in reversed(waiting):
+        guess = placed[min(placed, key=lambda index: abs(index - record.index))]
+        if record.index in oriented:
+            guess = _turned(guess, oriented[record.index])
+        was, record.anchor = record.anchor, None
+        motion = _located(keyframes, locator, record.index, recorder.encoded(record), guess)
+        if motion is None:
+            continue
+        placed[record.index] = motion.T_cw
+        is_earliest = record.index < next(iter(keyframes)).frame_index
+        if was is not None and given_up[was] is record and is_earliest and _is_far(local, motion):
+            local.extend_back(record, was, motion)
+        else:
+            T_rel = motion.T_cw @ se3_inverse(keyframes[motion.keyframe].T_cw)
+            recorder.place(record, motion.keyframe, T_rel, motion.match)
+
+
+def _is_far(local: LocalMapping, motion: FrameMotion) -> bool:
+    """Whether a frame is far enough from the keyframe it was located at to become one."""
+    long_edge = local.keyframes.grid.camera.long_edge
+    return calls_for_keyframe(local.config, long_edge, motion.flow, motion.overlap, motion.parallax)
+
+
+def _located(
+    keyframes: KeyframeSet,
+    locator: FrameLocator,
+    index: int,
+    encoded: Any,
+    guess: Float64[Tensor, "4 4"],
+) -> FrameMotion | None:
+    """A frame at the keyframe nearest in time, or at those that see most from the guess."""
+    candidates = list(keyframes)
+    nearest = min(candidates, key=lambda k: abs(k.frame_index - index))
+    tried = list[Keyframe]()
+    for keyframe in (nearest, *visible_keyframes(candidates, guess)):
+        if keyframe not in tried:
+            motion = locator.locate(keyframe, encoded, guess, is_expected=False)
+            if motion is not None and motion.known >= MIN_KNOWN:
+                return motion
+            tried.append(keyframe)
+    return None
+
+
+def _turned(T_cw: Float64[Tensor, "4 4"], R: Float64[Tensor, "3 3"]) -> Float64[Tensor, "4 4"]:
+    """The pose of a camera in the same place with another orientation."""
+    turned = T_cw.clone()
+    turned[:3, :3], turned[:3, 3] = R, R @ T_cw[:3, :3].mT @ T_cw[:3, 3]
+    return turned
