@@ -1,6 +1,9 @@
 """What compiled kernels compute depends on nothing that was compiled or called before them."""
 
 import importlib
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -86,3 +89,40 @@ def test_a_compiled_kernel_contains_its_parts(forced):
     (code,) = kernel.inspect_llvm().values()
     calls = [line for line in code.splitlines() if "call" in line and "better_half" in line]
     assert bool(calls) is not forced
+
+
+TWICE = """
+import hashlib, os, sys
+import numpy as np
+from geogs.depth.edge_kernels import resolve_edges
+
+def resolved():
+    random, f = np.random.default_rng(0), np.float32
+    rho = np.where(random.random((24, 40)) < 0.5, 1, 0.7) * random.uniform(0.98, 1, (24, 40))
+    slopes = random.normal(0, 1e-3, (2, 24, 40))
+    maps = [m.astype(f) for m in (rho, *slopes, random.random((24, 40)))]
+    guide, costs = (random.random(s).astype(f) for s in ((3, 24, 40), (24, 40, 16)))
+    settings = [f(x) for x in (50, 0.015, 0.02, 2)]
+    new = [np.empty_like(m) for m in maps]
+    resolve_edges(0, 24, *maps, guide, costs, f(0.5), f(0.04), 4, *settings, 3, f(0.9), *new)
+    assert (new[0] != maps[0]).sum() > 50
+    return hashlib.sha256(b"".join(m.tobytes() for m in new)).hexdigest()
+
+for _ in range(2):
+    child = os.fork()
+    if not child:
+        print(resolved(), sum(resolve_edges.stats.cache_hits.values()), flush=True)
+        os._exit(0)
+    os.waitpid(child, 0)
+"""
+
+
+@pytest.mark.system
+def test_a_kernel_rounds_alike_just_compiled_and_from_the_disk(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", TWICE]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    compiled, from_disk = map(str.split, done.stdout.splitlines())
+    assert (compiled[1], from_disk[1]) == ("0", "1")
+    assert compiled[0] == from_disk[0]
