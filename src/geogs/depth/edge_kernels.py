@@ -7,12 +7,15 @@ The kernel releases the interpreter lock and does the rows from the first to bef
 import numpy as np
 from numba import njit
 
+from geogs.kernel_parts import inlined
+
 _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+_PART = inlined(_FAST)
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _cost_at(costs, first, spacing, rho):
     """Matching cost of one pixel, interpolated between planes; at the ends the last one's."""
     last = costs.shape[0] - 1
@@ -21,7 +24,7 @@ def _cost_at(costs, first, spacing, rho):
     return costs[k] + (place - np.float32(k)) * (costs[k + 1] - costs[k])
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _add_sides(
     y, v, dx, first, last, rho, slope_x, slope_y, confidence, guide, contrast, apart, sums
 ):
@@ -56,7 +59,7 @@ def _add_sides(
         near_sum[x] += of_near * value
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _around(y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, samples):
     """Planes of the pixels around, extended to (x, y), with their weights; how many there are.
 
@@ -79,7 +82,7 @@ def _around(y, x, rho, slope_x, slope_y, confidence, guide, reach, contrast, sam
     return count
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _mode(samples, count, low, high, start, width, rounds, mode):
     """Mean plane of the samples with inverse depth between ``low`` and ``high`` near their mode.
 

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from geogs.depth.sampling_kernels import fetch_pairs
+from geogs.kernel_parts import inlined
 
 BLOCK = 16
 """Planes matched before their costs are transposed into the volume: one cache line of float32."""
@@ -19,9 +20,10 @@ OUTSIDE = np.float32(1.2)
 """Cost of a sample outside the neighbour, a little more than that of no likeness (1)."""
 
 _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+_PART = inlined(_FAST)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _warp_row(pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fraction_v, top, low):
     """Sample an image where row ``y`` of the plane of inverse depth ``rho`` projects.
 
@@ -62,7 +64,7 @@ def _warp_row(pairs, a, b, rho, y, radius, warped, lowest, index, fraction_u, fr
         warped[radius + count + i] = warped[radius + count - 1]
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _row_sums(reference, warped, radius, ones, squares, products):
     """Sums of b, b^2 and a b over 2 radius + 1 columns; rows have ``radius`` repeats a side."""
     for x in range(ones.shape[0]):
@@ -78,7 +80,7 @@ def _row_sums(reference, warped, radius, ones, squares, products):
             products[x] += b * reference[x + i]
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _column_sums(rows, first, radius, out):
     """Sums of 2 radius + 1 rows from the ``first`` on."""
     r0, r1, r2 = rows[first], rows[first + 1], rows[first + 2]
@@ -90,7 +92,7 @@ def _column_sums(rows, first, radius, out):
             out[x] += row[x]
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
     """1 - NCC from the window sums, inserted into the sorted smallest costs ``best`` (keep, w).
 
@@ -111,14 +113,14 @@ def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
             sum_b[x] = max(b, c)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _count_inside(lowest, seen):
     """One more where the sample lies in the image."""
     for x in range(seen.shape[0]):
         seen[x] += np.int32(lowest[x] < OUTSIDE)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _mean_of_better_half(sorted_costs, seen, least, out):
     """Mean of the smallest costs: half as many as ``seen`` neighbours, rounded up, or ``least``."""
     keep, w = sorted_costs.shape
@@ -133,7 +135,7 @@ def _mean_of_better_half(sorted_costs, seen, least, out):
         out[x] /= np.float32(max((seen[x] + np.int32(1)) >> np.int32(1), least))
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _transpose(block, count, volume, start):
     """volume[x, start + k] = block[k, x] for k below ``count``."""
     for x in range(volume.shape[0]):
@@ -199,7 +201,7 @@ def match_planes(first, last, reference, mean, scale, pairs, a, b, planes, radiu
                 _transpose(block[i], count, volume[y0 + i], start)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _likeness_of_row(guide, y, v, dx, contrast, weights):
     """1 / (1 + contrast |dI|^2)^2 of the pixels of row ``y`` and those (dx, v - y) away; 0 where
     that is none."""
@@ -278,7 +280,7 @@ def pull_to_prior(first, last, volume, planes, prior, weight, tolerance):
                     cost[k] += pull * min(abs(planes[k] * inverse - one) / tolerance, one)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _follow_path(cost, previous, small, large, current):
     """One step of Hirschmueller's Eq. 13 (without the constant): costs along one path.
 

@@ -10,13 +10,15 @@ import numpy as np
 from numba import njit
 
 from geogs.depth.sampling_kernels import fetch_pairs
+from geogs.kernel_parts import inlined
 
 _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+_PART = inlined(_FAST)
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _place_row(pairs, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, du, dv, inside):
     """Where the samples of one row lie in an image, and how they move with inverse depth.
 
@@ -50,7 +52,7 @@ def _place_row(pairs, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, du,
         dv[x] = (b1 - cv * b2) * inverse
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _add_samples_of_row(reference, weight, top, low, fu, fv, du, dv, sums):
     """Weighted first and second moments of reference a with sample b and its derivative g by
     inverse depth, and of these: b, g, bb, gg, ab, ag, bg. ``top`` and ``low`` are the samples'
@@ -122,7 +124,7 @@ def photometric_step(
             step[y, x] = total[0, x] / (total[1, x] + np.float32(1e-6))
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _accumulate_own(reference, weight, own):
     """Weighted first and second moments of reference a, the same for all neighbours."""
     sw, sa, saa = own[0], own[1], own[2]
@@ -133,7 +135,7 @@ def _accumulate_own(reference, weight, own):
         saa[x] += m * p * p
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _add_neighbour(own, sums, inside, floor, total):
     """NCC of one neighbour, its derivative and Gauss-Newton curvature, added with its weight."""
     for x in range(inside.shape[0]):
@@ -214,7 +216,7 @@ def fit_planes(
             support[y, x] = sums[0, x]
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _add_samples(
     rho, slope_x, slope_y, confidence, guide, y, yy, dx, first, last, contrast, tolerance, sums
 ):
@@ -242,7 +244,7 @@ def _add_samples(
         t4[x] += m * r * fx
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def _add_row(row, fy, sums):
     """The moments by x of a row that is ``fy`` away, as moments by both."""
     for x in range(row.shape[1]):

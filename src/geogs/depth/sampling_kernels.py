@@ -8,7 +8,9 @@ compiler turns into vector instructions.
 import numpy as np
 from numba import njit
 
-_FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+from geogs.kernel_parts import inlined
+
+_PART = inlined({"nogil": True, "fastmath": True, "error_model": "numpy"})
 
 
 def pixel_pairs(images: np.ndarray) -> np.ndarray:
@@ -21,7 +23,7 @@ def pixel_pairs(images: np.ndarray) -> np.ndarray:
     return pairs.view(np.uint64)[..., 0]
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def fetch_pairs(pairs, index, top, low):
     """The pairs (h, w) at the flat indices of a row of samples, and those one row below."""
     flat, down = pairs.ravel(), np.uint32(pairs.shape[1])

@@ -195,6 +195,7 @@ def slow_planes(x, y, value, weight, rng):
     return planes
 
 
+@pytest.mark.system  # compiles what is kept nowhere by itself
 def test_planes_are_those_of_the_slow_fit():
     """A corner with noise and outliers, weighted unevenly."""
     random = np.random.default_rng(5)
@@ -243,6 +244,7 @@ def test_rims_and_parts_are_those_of_opencv(seed):
     assert np.array_equal(told > 0, expected)
 
 
+@pytest.mark.system  # compiles what is kept nowhere by itself
 def test_no_plane_of_too_little():
     inverse, random = wall().ravel(), np.random.default_rng(0)
     x, y = (U / 160 - 0.5).ravel(), (V / 120 - 0.5).ravel()

@@ -6,12 +6,15 @@ Arrays are float32 and C-contiguous; every kernel releases the interpreter lock.
 import numpy as np
 from numba import njit
 
+from geogs.kernel_parts import inlined
+
 _FAST = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 """NaN must compare as NaN."""
+_PART = inlined(_FAST)
 ZERO = np.float32(0)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def goes_on(planes, v, u, dy, dx, farthest, most):
     """Inverse depth of the plane of pixel (v + dy, u + dx) at (v, u), or 0 where it is none that
     lies between ``farthest`` and ``most``. ``planes`` (3, h, w): inverse depth and its slopes."""

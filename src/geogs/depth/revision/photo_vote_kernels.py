@@ -7,12 +7,15 @@ about. Arrays are float32 and C-contiguous; every kernel releases the interprete
 import numpy as np
 from numba import njit
 
+from geogs.kernel_parts import inlined
+
 _FAST = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 """NaN must compare as NaN."""
+_PART = inlined(_FAST)
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def project_row(T, lens, y, depth, place):
     """Where a neighbour sees the pixels of row ``y`` of a depth map: ``place`` (2, w) receives u
     and v, and NaN for both where that is behind the neighbour.
@@ -34,7 +37,7 @@ def project_row(T, lens, y, depth, place):
         v[x] = fy * (t10 * px + t11 * py + t12 * z0 + t13) * inverse + cy
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def grey_at(image, u, v):
     """Bilinear grey value at (u, v); NaN outside."""
     height, width = image.shape
@@ -64,7 +67,7 @@ def grey_differences(reference, images, T, lens, depth, differences):
                 differences[n, y, x] = seen - reference[y, x]
 
 
-@njit(**_FAST)
+@njit(**_PART)
 def better_half(costs, count):
     """Mean of the lower half, rounded up, of the first ``count`` costs; 1 of none. Sorts them."""
     if count == 0:

@@ -10,8 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from geogs.kernel_parts import inlined
+
 _EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
-_FAST = {**_EXACT, "fastmath": {"contract", "nsz", "reassoc"}}
+_FAST_PART = inlined({**_EXACT, "fastmath": {"contract", "nsz", "reassoc"}})
+_PART = inlined(_EXACT)
+"""Of what contains one that is fast."""
 
 
 class PlaneRules(NamedTuple):
@@ -224,7 +228,7 @@ def solved(sums, damping, x, y, z):
     )
 
 
-@njit(**_FAST)
+@njit(**_FAST_PART)
 def explained(x, y, value, weight, tolerance, a, b, c):
     """Weight of what lies on the plane a x + b y + c."""
     total = 0.0
@@ -234,7 +238,7 @@ def explained(x, y, value, weight, tolerance, a, b, c):
     return total
 
 
-@njit(**_EXACT)
+@njit(**_PART)
 def best_sample(x, y, value, weight, uniform, tolerance):
     """The plane through three of the pixels on which most of the weight lies, and that weight,
     negative if there is none.
@@ -259,7 +263,7 @@ def best_sample(x, y, value, weight, uniform, tolerance):
     return best, most
 
 
-@njit(**_EXACT)
+@njit(**_PART)
 def fit_plane(x, y, value, weight, uniform, rules):
     """The plane that most of the weight lies on, by samples of three, and fitted to that; what lies
     on it; and xx, xy, x, yy, y and 1 summed over these by weight. Not one where they are too few.
@@ -283,7 +287,7 @@ def fit_plane(x, y, value, weight, uniform, rules):
     return (a, b, c), on, sums
 
 
-@njit(**_EXACT)
+@njit(**_PART)
 def segment_planes(x, y, value, weight, draws, rules):
     """The planes that explain what is known of a segment, that of most first: coefficients of x, y
     and 1 (p, 3) and covariances of these, the number of the plane, from 1 on, that each pixel lies

@@ -9,11 +9,15 @@ hence no ``nnan``.
 import numpy as np
 from numba import njit
 
-PART = {
+from geogs.kernel_parts import inlined
+
+KERNEL = {
+    "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
+PART = inlined(KERNEL)
 ZERO, HALF, ONE, TWO, HUGE = (np.float32(v) for v in (0, 0.5, 1, 2, 1e30))
 
 
@@ -123,7 +127,7 @@ def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
         geometry[4, x] = gy * (qy - py * qz) * inverse
 
 
-@njit(cache=True, **PART)
+@njit(**KERNEL)
 def warp_rows(
     first, last, depth, rows, row_share, columns, column_share, reference, target, target_depth,
     lenses, T, settings, warped, slope, mask, extra, loss,
@@ -166,7 +170,7 @@ def warp_rows(
         loss[y] = settings.l1 / settings.huber * total
 
 
-@njit(cache=True, **PART)
+@njit(**KERNEL)
 def correlate_rows(first, last, reference, warped, mask, half, settings, fields, loss):
     """L_ncc of windows centred in rows ``first <= y < last`` and what their pixels need of it.
 
@@ -244,7 +248,7 @@ def window_sums(y, fields, half, line, sums):
                 sums[c, x] += line[c, x + k]
 
 
-@njit(cache=True, **PART)
+@njit(**KERNEL)
 def depth_gradient_rows(
     first, last, rows, row_share, columns, column_share, reference, warped, slope, mask, half,
     settings, fields, g_image, g_depth,
@@ -295,7 +299,7 @@ def depth_gradient_rows(
             g_depth[first + r, columns[1, x]] += f * pull[r, x]
 
 
-@njit(cache=True, **PART)
+@njit(**KERNEL)
 def pose_gradient_rows(first, last, g_image, extra, lenses, T, g_T):
     """d loss / d T (12 numbers of the 3x4 matrix) of each row ``first <= y < last``."""
     fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]

@@ -9,11 +9,15 @@ compile. NaN must compare as NaN, hence no ``nnan``.
 import numpy as np
 from numba import njit
 
-PART = {
+from geogs.kernel_parts import inlined
+
+KERNEL = {
+    "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},
 }
+PART = inlined(KERNEL)
 ZERO, ONE, HUGE = np.float32(0), np.float32(1), np.float32(1e30)
 
 
@@ -183,7 +187,7 @@ def smoothness_terms(clean, r, gradient, y, settings, scale, pull):
     return total
 
 
-@njit(cache=True, **PART)
+@njit(**KERNEL)
 def single_view_rows(
     first, last, depth, normal, alpha, spread, edge, gradient, prior, confidence, prior_normal,
     settings, scale, scratch, loss, g_depth, g_normal, g_alpha, g_spread,

@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 
+from geogs.kernel_parts import inlined
 from geogs.splat.cpu.layout import (
     BLUR,
     CENTER_X,
@@ -43,7 +44,7 @@ def sort_by_digit(keys, order, shift, starts, sorted_keys, sorted_order):
         starts[d] += 1
 
 
-@numba.njit(**{**PER_DISK, "cache": False})
+@numba.njit(**inlined(PER_DISK))
 def rows_within(outline, left, right):
     """Lowest and highest y of an outline's part with left <= x <= right."""
     lowest, highest = np.inf, -np.inf

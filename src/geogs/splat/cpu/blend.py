@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 
+from geogs.kernel_parts import inlined
 from geogs.splat.cpu.layout import (
     HALF,
     LANES,
@@ -39,7 +40,7 @@ from geogs.splat.cpu.layout import (
     exp_minus,
 )
 
-_INLINE = {**PER_PIXEL, "cache": False}
+_PART = inlined(PER_PIXEL)
 # State planes. Offsets are unsigned, so that the compiler need not handle negative indices.
 (
     _X, _Y, _LIGHT, _MOMENT, _NORMAL_X, _NORMAL_Y, _NORMAL_Z, _DISTORTION, _MEDIAN, _LAST,
@@ -52,20 +53,20 @@ CHECK_EVERY = 16
 """List entries after which the runs worth visiting are looked up again."""
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def reference_depth(records, lists, first, last):
     """Depth from which a tile's sums are measured, to keep their digits: the middle disk's."""
     return ONE / records[lists[(first + last) // 2], WC]
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def common_runs(runs, k, first_run, last_run):
     """The runs first..last that list entry k reaches, within first_run..last_run."""
     first = max(runs[k, 0], first_run)
     return np.uint64(first), np.uint64(max(min(runs[k, 1], last_run), first))
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
     """Blend one disk into the runs first..last of a tile; returns the sum of its weights.
 
@@ -111,7 +112,7 @@ def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
     return shown
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def live_runs(state):
     """First and last (exclusive) run in which some pixel still takes light."""
     first, last = _RUNS, 0
@@ -124,7 +125,7 @@ def live_runs(state):
     return first, last
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def clear_state(state, left, top, width, height):
     """Untouched pixels with full light; those outside the image take none."""
     state[:] = ZERO
@@ -135,7 +136,7 @@ def clear_state(state, left, top, width, height):
             state[_LIGHT + j] = ONE if (left + col < width) & (top + row < height) else -ONE
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def write_maps(state, left, top, z_reference, depth, normal, alpha, distortion, median_depth):
     """A tile's state into the image."""
     height, width = depth.shape

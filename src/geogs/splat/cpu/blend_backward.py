@@ -3,6 +3,7 @@
 import numba
 import numpy as np
 
+from geogs.kernel_parts import inlined
 from geogs.splat.cpu.blend import CHECK_EVERY, common_runs, reference_depth
 from geogs.splat.cpu.layout import (
     G_CLAMPED,
@@ -54,7 +55,7 @@ from geogs.splat.cpu.layout import (
     exp_minus,
 )
 
-_INLINE = {**PER_PIXEL, "cache": False}
+_PART = inlined(PER_PIXEL)
 (
     _X, _Y, _LIGHT, _MOMENT, _LAST, _BEHIND, _SIGNS, _SIGNED_Z,
     _D_CONSTANT, _D_Z, _D_NORMAL_X, _D_NORMAL_Y, _D_NORMAL_Z, _D_DISTORTION,
@@ -65,7 +66,7 @@ _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def meet_disk(state, first, last, r, rank, inverse_near):
     """Where one disk is seen by the runs first..last of a tile, as the forward pass has it.
 
@@ -98,7 +99,7 @@ def meet_disk(state, first, last, r, rank, inverse_near):
         state[_BLUR + j] = ZERO if on_plane else ONE
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
     """Take one disk out of the runs first..last of a tile; ``g`` receives its gradients.
 
@@ -167,7 +168,7 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
     g[G_NX], g[G_NY], g[G_NZ] = s_nx, s_ny, s_nz
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def load_state(state, saved, left, top, d_depth, d_normal, d_alpha, d_distortion):
     """A tile's final state and the losses' gradients of its maps.
 
@@ -195,7 +196,7 @@ def load_state(state, saved, left, top, d_depth, d_normal, d_alpha, d_distortion
                 state[_D_DISTORTION + j] = TWO * d_distortion[y, x]
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def last_of_runs(state, last_of):
     """Rank of the last disk blended in each run; returns the largest."""
     most = ZERO
@@ -208,7 +209,7 @@ def last_of_runs(state, last_of):
     return int(most)
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def blended_runs(last_of, rank):
     """First and last (exclusive) run that blends some disk of at least this rank."""
     first, last = _RUNS, 0

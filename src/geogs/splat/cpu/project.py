@@ -9,6 +9,7 @@ import math
 import numba
 import numpy as np
 
+from geogs.kernel_parts import inlined
 from geogs.splat.cpu.layout import (
     BLUR,
     CENTER_X,
@@ -45,17 +46,17 @@ from geogs.splat.cpu.layout import (
     Z_NEAREST,
 )
 
-_INLINE = {**PER_DISK, "cache": False}
+_PART = inlined(PER_DISK)
 _SQRT_HALF = math.sqrt(0.5)
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def dot(a, b):
     """a . b"""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def rotate(T, v):
     """R v for the left 3 x 3 block of T."""
     return (
@@ -65,7 +66,7 @@ def rotate(T, v):
     )
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def axes_of(w, x, y, z):
     """Columns of the rotation matrix of a unit quaternion."""
     return (
@@ -75,7 +76,7 @@ def axes_of(w, x, y, z):
     )
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def unit_quaternion(quaternion, i):
     """The normalised quaternion of disk i, and 1 / norm."""
     w, x, y, z = (
@@ -88,7 +89,7 @@ def unit_quaternion(quaternion, i):
     return (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm), inverse_norm
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def place(position, i, T):
     """Disk i's position in the world and in the camera."""
     p = (np.float64(position[i, 0]), np.float64(position[i, 1]), np.float64(position[i, 2]))
@@ -96,7 +97,7 @@ def place(position, i, T):
     return p, (c[0] + T[0, 3], c[1] + T[1, 3], c[2] + T[2, 3])
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def bounded_facing(normal, center):
     """n . c kept away from zero, and whether it had to be."""
     facing = dot(normal, center)
@@ -106,7 +107,7 @@ def bounded_facing(normal, center):
     return facing, False
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def pixel_range(low, high, count):
     """Pixels first..last of a line of ``count`` whose centres lie between low and high."""
     low = min(max(low - MARGIN, -1.0), float(count))
@@ -114,7 +115,7 @@ def pixel_range(low, high, count):
     return max(math.ceil(low), 0), min(math.floor(high) + 1, count)
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     """Where the disk can have at least ``MIN_ALPHA``; false if that has no bounds.
 
@@ -146,7 +147,7 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     return True
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def box_of(outline, width, height):
     """Pixels (x0, x1, y0, y1) within an outline."""
     x, y, blur = outline[CENTER_X], outline[CENTER_Y], outline[BLUR]
@@ -157,13 +158,13 @@ def box_of(outline, width, height):
     return x0, x1, y0, y1
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def sigmoid(x):
     """1 / (1 + exp(-x))"""
     return 1 / (1 + math.exp(-np.float64(x)))
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def is_usable(position, quaternion, log_scale, opacity_logit, i):
     """Whether disk i's numbers are finite, its quaternion not zero and its scales sensible."""
     total = position[i, 0] + position[i, 1] + position[i, 2] + opacity_logit[i]

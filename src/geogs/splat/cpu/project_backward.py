@@ -5,6 +5,7 @@ import math
 import numba
 import numpy as np
 
+from geogs.kernel_parts import inlined
 from geogs.splat.cpu.layout import (
     G_CLAMPED,
     G_MX,
@@ -33,11 +34,11 @@ from geogs.splat.cpu.layout import (
 )
 from geogs.splat.cpu.project import axes_of, bounded_facing, dot, place, rotate, unit_quaternion
 
-_INLINE = {**PER_DISK, "cache": False}
+_PART = inlined(PER_DISK)
 _SQRT_HALF = math.sqrt(0.5)
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def rotate_back(T, v):
     """R^T v"""
     return (
@@ -47,7 +48,7 @@ def rotate_back(T, v):
     )
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def add_outer(matrix, a, b):
     """matrix += a b^T"""
     for r in range(3):
@@ -55,7 +56,7 @@ def add_outer(matrix, a, b):
             matrix[r, k] += a[r] * b[k]
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def quaternion_gradient(q, inverse_norm, a, b, n):
     """Through the rotation matrix, given the gradients of its columns, and the normalisation."""
     w, x, y, z = q
@@ -73,7 +74,7 @@ def quaternion_gradient(q, inverse_norm, a, b, n):
     )
 
 
-@numba.njit(**_INLINE)
+@numba.njit(**_PART)
 def record_backward(record, g, axes, c, ku, kv, intrinsics):
     """Gradients of the camera-frame tangents, normal and centre from the pixels' sums ``g``.
 
