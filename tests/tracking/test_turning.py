@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 
 from geogs.config import Config, TrackingConfig
 from geogs.errors import TrackingLost
@@ -97,6 +98,32 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
     for (before, attempt), (now, _) in pairwise(attempts[:-1]):
         assert now == before + 1 or attempt is Attempt.FAR_OFF or now < before
         assert now >= 1.25 * before or attempt is not Attempt.FAR_OFF or now < before
+
+
+def test_a_start_does_not_believe_what_a_failed_one_held_for_moving(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """That was judged by wrong poses: four fifths of the cells, behind a truck on a street."""
+    shares = []
+
+    def tried(graph, config, flows):
+        shares.append(0.0)
+        if len(shares) == 1:
+            for keyframe in graph.keyframes:
+                keyframe.moving = torch.ones(graph.keyframes.grid.size, dtype=torch.bool)
+            return Attempt.FAILED
+        found = initialise(graph, config, flows)
+        judged = [k.moving for k in graph.keyframes]
+        shares[-1] = max(1.0 if m is None else float(m.float().mean()) for m in judged)
+        return found
+
+    monkeypatch.setattr(start_up, "initialise", tried)
+    path = sideways(12)
+    segments, results = run(frames(path))
+    assert results[-1].state is TrackState.TRACKING
+    assert shares[1] < 0.1
+    trajectory = segments.trajectory()
+    assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.3
 
 
 def test_nothing_known_is_still_an_error():

@@ -107,6 +107,8 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
     segment = graph.keyframes
     chosen, view = best
     keyframes, fields = list(segment), grid_fields(segment.grid)
+    for keyframe in keyframes:
+        keyframe.moving = None  # what a failed attempt held for moving was judged by wrong poses
     first = keyframes[0]
     device, grid = segment.grid.device, SampleGrid(segment.grid.camera)
     first.T_cw, known = torch.eye(4, dtype=torch.float64), view.good
