@@ -74,8 +74,6 @@ class BundleResult:
     information: Float[Tensor, "n p"]
     """Sum over a frame's edges of w |dp/dd|^2 before the last step, and the information of what was
     measured beside the matches."""
-    residual: Float[Tensor, "e"]
-    """Root of the robustly weighted mean squared residual of each edge in pixels."""
     finite: bool
     block: SharedBlock | None = None
     """The shared unknowns of a problem that has some."""

@@ -23,7 +23,6 @@ from geogs.bundle.dense import DenseSchur, LinearBundle
 from geogs.bundle.flow_term import (
     SourceFlow,
     damped_curvature,
-    edge_residual,
     matched_cost,
     weighed_residuals,
 )
@@ -150,7 +149,6 @@ class SharedFlow:
         v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
         E, curvature, pull = (wJ * Jd[:, None]).sum(2), (wd * Jd).sum(1), (wd * r.mT).sum(1)
         adjoint = se3_adjoint(relative_motion(state.T_cw, i, j))
-        residual = edge_residual(r, weight)
         for frame, e in sources_within(i):
             information = curvature[e].sum(0)
             depth = DepthEquations(
@@ -164,7 +162,7 @@ class SharedFlow:
             edges = RelativeEdges(
                 poses, hessian, gradient, len(block.free), depth, adjoint=adjoint[e]
             )
-            yield SourceFlow(frame, edges, residual[e], edges.chained()[0].diagonal())
+            yield SourceFlow(frame, edges, edges.chained()[0].diagonal())
 
 
 def _with_shared(
