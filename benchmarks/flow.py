@@ -103,9 +103,14 @@ def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
     matches = operator.measure(first, second, *start)
     pixels, weight = (torch.cat([getattr(m, k) for m in matches]) for k in ("pixels", "weight"))
     deviation = torch.where(weight > 0, weight.rsqrt(), torch.inf)
-    dense = [
-        operator.dense(a, b, None if cold else s.numpy())
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    flows = (
+        operator._dense(a, b, None if cold else s.numpy(), True)
         for a, b, s in zip([*first, *second], [*second, *first], batch.start, strict=True)
+    )
+    dense = [
+        np.stack([flow.at(np.stack(row, -1), 0.0) for row in zip(u, v, strict=True)])
+        for flow in flows
     ]
     return cell_errors(batch, pixels, deviation, torch.from_numpy(np.stack(dense)))
 

@@ -15,6 +15,9 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import cv2
 import numpy as np
@@ -23,8 +26,11 @@ import torch
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
 from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import ViewConstants
+from oracles.multi_view_reference import multi_view_loss
+from oracles.single_view_reference import single_view_loss
 
 RENDER = Camera(280.0, 280.0, 159.5, 119.5, 320, 240)
 PHOTO = RENDER.resized(640, 480)

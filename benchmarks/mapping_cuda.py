@@ -12,10 +12,13 @@ Times are medians between CUDA events, in turns; those of kernels are sums from 
 import argparse
 import json
 import statistics
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
 import torch
@@ -26,7 +29,6 @@ from geogs.config import LossAblation, LossConfig, MappingConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.depth_maps import normals_from_depth
 from geogs.geometry.lie import se3_inverse
-from geogs.losses import multi_view_loss, single_view_loss
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.cuda.trainer import CudaTrainer
@@ -44,6 +46,8 @@ from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
+from oracles.multi_view_reference import multi_view_loss
+from oracles.single_view_reference import single_view_loss
 
 FRAMES_APART = 6
 """Frames between two views on the path."""

@@ -5,10 +5,7 @@ import torch
 
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
-from geogs.losses.single_view import (
-    OUTSIDE,
-    ViewConstants,
-)
+from geogs.losses.single_view import OUTSIDE, ViewConstants
 
 CAMERA = Camera(11.0, 12.0, 5.2, 4.1, 12, 10)
 

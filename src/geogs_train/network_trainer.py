@@ -1,15 +1,45 @@
 """One training run of a network: steps, running mean of the weights, exact resume."""
 
 import math
-from typing import Any
+from collections.abc import Callable
+from dataclasses import Field, fields, replace
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
 from geogs_train.course import Course, Worker
-from geogs_train.step_graph import StepGraph
 from geogs_train.training_options import TrainingSchedule
+
+Batch = TypeVar("Batch")
+
+WARM_UP = 3
+"""Steps taken before the recording, so that libraries have chosen their kernels."""
+
+
+class StepGraph(Generic[Batch]):
+    """Loss and gradients of batches of one size; the gradients are added where they lie."""
+
+    def __init__(self, work: Callable[[Batch], Float[Tensor, ""]], batch: Batch) -> None:
+        own = {f.name: getattr(batch, f.name).clone() for f in _tensors(batch)}
+        self._batch: Batch = replace(batch, **own)  # type: ignore[type-var]
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP):
+                work(self._batch)
+        torch.cuda.current_stream().wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            self._loss = work(self._batch)
+
+    def __call__(self, batch: Batch) -> Float[Tensor, ""]:
+        """Run on another batch of the same size; the loss is overwritten by the next call."""
+        for f in _tensors(batch):
+            getattr(self._batch, f.name).copy_(getattr(batch, f.name))
+        self._graph.replay()
+        return self._loss
 
 
 class NetworkTrainer:
@@ -109,3 +139,7 @@ def _flat_gradient(parameters: list[nn.Parameter]) -> Float[Tensor, "n"]:
         p.grad = flat.as_strided(p.shape, p.stride(), at)
         at += p.numel()
     return flat
+
+
+def _tensors(batch: Any) -> list[Field[Any]]:
+    return [f for f in fields(batch) if isinstance(getattr(batch, f.name), Tensor)]

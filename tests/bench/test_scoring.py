@@ -25,8 +25,8 @@ from geogs_bench.results.record import (
     write_json,
 )
 from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.room_scores import with_short_edges
 from geogs_bench.scoring.scores import scored
-from geogs_bench.scoring.tessellation import with_short_edges
 from geogs_bench.tables.benchmark_report import markdown, write_report
 from lit_rooms import lit_room
 

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from bundle_scenes import CAMERA
-from geogs.bundle.fields import CpuFields
+from geogs.bundle.fields import GridFields
 from geogs.world.grid import SampleGrid
 
 
 def test_fill_keeps_known_values_and_bridges_holes():
     grid = SampleGrid(CAMERA)
-    fields = CpuFields(grid)
+    fields = GridFields(grid)
     values = 1 + 0.01 * grid.pixels[:, 0]
     known = torch.ones(grid.size)
     known[25:28] = 0

@@ -3,7 +3,7 @@
 import torch
 
 from bundle_scenes import disturbed, scene
-from geogs.bundle.motion_only import CpuMotion
+from geogs.bundle.motion_only import MotionSolver
 from geogs.bundle.problem import MotionProblem
 
 
@@ -20,6 +20,6 @@ def test_motion_only_recovers_poses():
         truth.pixels[edges],
         truth.weight[edges],
     )
-    T, residual = CpuMotion(grid).solve(problem, iterations=10)
+    T, residual = MotionSolver(grid).solve(problem, iterations=10)
     torch.testing.assert_close(T, truth.T_cw[2:], rtol=0, atol=1e-5)
     assert float(residual.norm(dim=-1).max()) < 0.01

@@ -47,7 +47,6 @@ def test_steps_are_those_of_the_dense_solver(chunk, damped):
     torch.testing.assert_close(fast.T_cw, slow.T_cw, rtol=0, atol=1e-6)
     torch.testing.assert_close(fast.inverse_depth, slow.inverse_depth, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(fast.information, slow.information, rtol=1e-4, atol=1e-3)
-    torch.testing.assert_close(fast.residual, slow.residual, rtol=1e-4, atol=1e-5)
     assert torch.equal(fast.T_cw[:2], problem.T_cw[:2])
 
 

@@ -5,9 +5,13 @@ import pytest
 from scipy.io import savemat
 
 from geogs.errors import InputError
-from geogs.evaluation.surfaces.dtu_errors import evaluate_dtu, read_dtu_reference
+from geogs.evaluation.surfaces.dtu_errors import (
+    dense_points,
+    evaluate_dtu,
+    read_dtu_reference,
+    thin,
+)
 from geogs.evaluation.surfaces.surface import Surface
-from geogs.evaluation.surfaces.thinning import dense_points, thin
 from geogs.io.writers.ply_writer import write_mesh
 from surface_shapes import joined, plane
 

@@ -16,7 +16,6 @@ from geogs.geometry.lie import (
     sim3_adjoint,
     sim3_exp,
     sim3_inverse,
-    sim3_inverse_jacobian,
     sim3_left_jacobian,
     sim3_log,
     sim3_scale,
@@ -26,7 +25,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop import matched_edges, pose_graph
 from geogs.loop.closure import ClosingQuestion, LoopClosure, close_loops
 from geogs.loop.consistency import AGREEMENT, consistent_loops, cycle_errors
-from geogs.loop.graph_terms import BlockEquations, GraphState
+from geogs.loop.graph_terms import GraphState
 from geogs.loop.matched_edges import MatchedEdges, MatchTerm
 from geogs.loop.pose_graph import (
     PoseGraph,
@@ -580,52 +579,3 @@ def test_a_metric_map_keeps_its_scales():
     error = (se3_inverse(after) - se3_inverse(d.truth))[:, :3, 3].norm(dim=1).max()
     before = (se3_inverse(d.T_cw) - se3_inverse(d.truth))[:, :3, 3].norm(dim=1).max()
     assert float(error) < 0.7 * float(before)
-
-
-@dataclass(frozen=True)
-class Anchors:
-    """A kind of measurement of its own: similarities of some keyframes, known from elsewhere."""
-
-    keyframe: torch.Tensor
-    S: torch.Tensor
-    weight: float
-
-    def linearise(self, state: GraphState) -> "LinearAnchors":
-        return LinearAnchors(self, state)
-
-    def errors(self, S: torch.Tensor) -> torch.Tensor:
-        """log(S_k S^-1); a step of the keyframe enters from the left."""
-        return sim3_log(S[self.keyframe] @ sim3_inverse(self.S))
-
-
-@dataclass(frozen=True)
-class LinearAnchors:
-    term: Anchors
-    state: GraphState
-
-    def equations(self, damping: float) -> BlockEquations:
-        e, k = self.term.errors(self.state.S), self.term.keyframe
-        J = sim3_inverse_jacobian(e)
-        gradient = torch.zeros(len(self.state.S), 7, dtype=F64)
-        gradient.index_add_(0, k, -self.term.weight * (J.mT @ e[..., None])[..., 0])
-        return BlockEquations(k, k, self.term.weight * J.mT @ J, gradient)
-
-    def cost(self, state: GraphState) -> float:
-        return self.term.weight * float(self.term.errors(state.S).square().sum())
-
-    def depth_step(self, xi: torch.Tensor, damping: float) -> None:
-        return None
-
-
-def test_another_term_counts_as_relative_poses_do():
-    d = drive()
-    known = torch.tensor([KEYFRAMES // 2, KEYFRAMES - 1])
-    anchors = Anchors(known, d.units[known], 1e9)
-    fixed = torch.arange(KEYFRAMES) < 1
-    error = {}
-    for name, terms in (("with", (anchors,)), ("without", ())):
-        result = solve(PoseGraph(d.T_cw, d.odometry, fixed, terms=terms))
-        off = sim3_log(result.S @ sim3_inverse(d.units))[:, :3].norm(dim=1)
-        error[name] = float(off.mean()), float(off[known].max())
-    assert error["with"][1] < 1e-3
-    assert error["with"][0] < 0.25 * error["without"][0]

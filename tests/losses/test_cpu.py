@@ -10,9 +10,13 @@ import torch
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses import PhotoView, kernel_settings, multi_view, multi_view_loss, single_view_loss
+from geogs.losses import kernel_settings
 from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.multi_view import PhotoView
 from loss_scenes import ALL_TERMS, random_view
+from oracles import multi_view_reference
+from oracles.multi_view_reference import multi_view_loss
+from oracles.single_view_reference import single_view_loss
 
 SMALL = Camera(70.0, 71.0, 39.3, 30.2, 80, 60)
 BIG = SMALL.resized(160, 120)
@@ -111,7 +115,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
     config = LossConfig(
         l1_weight=1.0, l1_huber=0.02, l1_cut=0.2, ncc_patch=7, ncc_texture=1e-4
     )  # fmt: skip
-    for module in (multi_view, kernel_settings):
+    for module in (multi_view_reference, kernel_settings):
         monkeypatch.setattr(module, "NCC_MIN_VARIANCE", 1e-4)
     for d in (full, odd):
         (fast,) = leaves(d)

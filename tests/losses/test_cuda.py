@@ -17,10 +17,12 @@ from cuda_emulator import use_emulator
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
 from geogs.losses.cuda import ViewTable, WindowLosses, window_losses
-from geogs.losses.single_view import MIN_ALPHA
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import MIN_ALPHA, ViewConstants
 from loss_scenes import random_view
+from oracles.multi_view_reference import multi_view_loss
+from oracles.single_view_reference import single_view_loss
 
 UNIT, SHARE = 1.7, 0.5
 NOTHING = LossConfig(

@@ -10,14 +10,10 @@ from geogs.config import LossConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
-from geogs.losses.multi_view import (
-    PhotoView,
-    enlarge_depth,
-    multi_view_loss,
-    occlusion_mask,
-    warp,
-)
-from geogs.losses.photometric import MIN_COVERAGE, ssim
+from geogs.losses.kernel_settings import MIN_COVERAGE
+from geogs.losses.multi_view import PhotoView, enlarge_depth
+from oracles.multi_view_reference import multi_view_loss, occlusion_mask, warp
+from oracles.photometric_reference import ssim
 
 CAMERA = Camera(50.0, 52.0, 23.3, 19.1, 48, 40)
 NORMAL, DISTANCE = torch.tensor([0.2, -0.1, -1.0]).double(), 2.0

@@ -5,7 +5,8 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from geogs.losses.photometric import NCC_VARIANCE_FLOOR, ncc, robust_l1, ssim
+from geogs.losses.kernel_settings import NCC_VARIANCE_FLOOR
+from oracles.photometric_reference import ncc, robust_l1, ssim
 
 
 def images(seed: int, *shape: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,22 +8,18 @@ import torch
 
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
-from geogs.losses.single_view import (
-    MIN_ALPHA,
-    OUTSIDE,
-    ViewConstants,
+from geogs.losses.single_view import MIN_ALPHA, OUTSIDE, ViewConstants, edge_strength, gradient_norm
+from loss_scenes import ALL_TERMS, CAMERA, random_view
+from oracles.single_view_reference import (
     depth_l1,
     depth_smoothness,
     distortion,
-    edge_strength,
-    gradient_norm,
     normal_consistency,
     normal_l1,
     opacity,
     silhouette,
     single_view_loss,
 )
-from loss_scenes import ALL_TERMS, CAMERA, random_view
 
 
 def plane_depth(normal: torch.Tensor, distance: float, camera: Camera) -> torch.Tensor:

@@ -10,7 +10,6 @@ from geogs.config import LossConfig, PriorConfig
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.losses.cpu import fused_single_view
-from geogs.losses.single_view import single_view_loss
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
 from geogs.priors.monocular_prior import PriorMaps
@@ -20,6 +19,7 @@ from geogs.tracking.keyframes.monocular_priors import KeyframePriors
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from keyframe_samples import Sample, segment_of, views_of
+from oracles.single_view_reference import single_view_loss
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(48), WORKING)

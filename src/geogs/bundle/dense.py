@@ -70,8 +70,6 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
             system.add(term.hyper_edges(state))
         for source in sources:
             self.information[source.frame] = source.information
-        if sources:
-            self.residual = torch.cat([source.residual for source in sources])
         return LinearBundle(state, system, sources)
 
     def flow_cost(self, state: BundleState) -> float:

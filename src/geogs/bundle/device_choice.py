@@ -5,13 +5,11 @@ from collections.abc import Sequence
 from jaxtyping import Int
 from torch import Tensor
 
+from geogs.bundle.fields import GridFields
+from geogs.bundle.keyframe_pairs import KeyframePairs
+from geogs.bundle.motion_only import MotionSolver
 from geogs.bundle.problem import BundleProblem, StreamedProblem
-from geogs.bundle.protocols import (
-    BundleSolver,
-    GridFields,
-    KeyframePairs,
-    MotionSolver,
-)
+from geogs.bundle.protocols import BundleSolver
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
@@ -44,9 +42,7 @@ def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> Mo
         from geogs.bundle.cuda.motion_only import CudaMotion
 
         return CudaMotion(grid, cells)
-    from geogs.bundle.motion_only import CpuMotion
-
-    return CpuMotion(grid, cells)
+    return MotionSolver(grid, cells)
 
 
 def grid_fields(grid: SampleGrid) -> GridFields:
@@ -55,9 +51,7 @@ def grid_fields(grid: SampleGrid) -> GridFields:
         from geogs.bundle.cuda.fields import CudaFields
 
         return CudaFields(grid)
-    from geogs.bundle.fields import CpuFields
-
-    return CpuFields(grid)
+    return GridFields(grid)
 
 
 def keyframe_pairs(keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> KeyframePairs:
@@ -66,6 +60,4 @@ def keyframe_pairs(keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) 
         from geogs.bundle.cuda.keyframe_pairs import CudaPairs
 
         return CudaPairs(keyframes, directed)
-    from geogs.bundle.keyframe_pairs import CpuPairs
-
-    return CpuPairs(keyframes, directed)
+    return KeyframePairs(keyframes, directed)

@@ -12,8 +12,8 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 
-class CpuFields:
-    """Works on the fields of one grid."""
+class GridFields:
+    """What works on fields over the cells of a grid, on the CPU."""
 
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
@@ -21,7 +21,11 @@ class CpuFields:
     def fill(
         self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
     ) -> Float[Tensor, "*n p"]:
-        """As in the protocol."""
+        """Values where confidence is positive; elsewhere the mean of their surroundings.
+
+        Push and pull: confidence-weighted means over growing blocks, taken from the finest level
+        that has any confidence near. Without any confidence the plain mean of a field is returned.
+        """
         rows = (x.reshape(-1, self.grid.size) for x in (values, confidence))
         filled = [self._fill(*pair) for pair in zip(*rows, strict=True)]
         return torch.stack(filled).reshape(values.shape)
@@ -43,7 +47,10 @@ class CpuFields:
         inverse_depth: Float[Tensor, "p"],
         information: Float[Tensor, "p"],
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """As in the protocol."""
+        """Inverse depth and information of frame i as seen from frame j; nearest surface wins.
+
+        Cells that nothing falls on are filled from their surroundings and have no information.
+        """
         grid = self.grid
         R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
         z = (grid.rays @ R.mT + inverse_depth[:, None] * t)[:, 2]
@@ -62,7 +69,10 @@ class CpuFields:
     def reproject(
         self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
     ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-        """As in the protocol."""
+        """Cells of each keyframe in a frame at ``T_cw``, and cells of that frame in the keyframe.
+
+        The frame has no depth of its own; it borrows the keyframe's.
+        """
         both = [self._reproject(k, T) for k, T in zip(keyframes, T_cw, strict=True)]
         return torch.stack([there for there, _ in both]), torch.stack([back for _, back in both])
 

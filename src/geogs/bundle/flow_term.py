@@ -34,8 +34,6 @@ class SourceFlow:
     frame: int
     edges: HyperEdge
     """With equations of the source's depths."""
-    residual: Float[Tensor, "k"]
-    """Residual of each edge, as in ``BundleResult``."""
     diagonal: Float[Tensor, "c"] | None = None
     """Diagonal of the chained equations before any depth is eliminated, where it is asked for."""
 
@@ -80,7 +78,7 @@ class PinholeFlow:
         coupling = (wJ * p.depth_jacobian.mT[:, None]).sum(2)
         curvature = (w * p.depth_jacobian.square()).sum(-1)
         depth_gradient = (w * p.depth_jacobian * r).sum(-1)
-        adjoint, residual = se3_adjoint(T_ji), edge_residual(r, w)
+        adjoint = se3_adjoint(T_ji)
         for frame, e in sources_within(i):
             c = curvature[e].sum(0)
             depth = DepthEquations(
@@ -92,7 +90,7 @@ class PinholeFlow:
             poses = torch.cat([j[e], j.new_tensor([frame])])
             block, g = torch.block_diag(*H[e]), v[e].reshape(-1)
             edges = RelativeEdges(poses, block, g, depth=depth, adjoint=adjoint[e])
-            yield SourceFlow(frame, edges, residual[e])
+            yield SourceFlow(frame, edges)
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
         """As in the protocol."""
@@ -166,14 +164,6 @@ def normal_equations(
     right = torch.cat([J.flatten(2), residual.mT.flatten(1)[:, None]], 1)
     both = (left @ right.mT).double()
     return both[..., :6], both[..., 6]
-
-
-def edge_residual(
-    residual: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
-) -> Float[Tensor, "e"]:
-    """Root of the weighted mean squared residual of each edge in pixels."""
-    total = weight.sum((1, 2)).clamp(min=1e-12)
-    return ((weight * residual.square()).sum((1, 2)) / total * 2).sqrt()
 
 
 def damped_curvature(curvature: Float[Tensor, "p"], fraction: float) -> Float[Tensor, "p"]:

@@ -14,8 +14,8 @@ LEAST_OVERLAP = 0.2
 """A pair of which no more than this fraction of the cells falls into the other image is far."""
 
 
-class CpuPairs:
-    """Pairs (source, target) of keyframe ids."""
+class KeyframePairs:
+    """Directed pairs (source, target) of keyframes, by their present poses and inverse depths."""
 
     def __init__(self, keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> None:
         self.grid = keyframes.grid
@@ -24,19 +24,24 @@ class CpuPairs:
         self.inverse_depth = keyframes.inverse_depths([e[0] for e in directed])
 
     def project(self) -> Float[Tensor, "e p 2"]:
-        """As in the protocol."""
+        """Where the cells of the sources fall in the targets."""
         grid = self.grid
         return project(grid.camera, grid.rays, self.motion, self.inverse_depth).pixels
 
     def moved(
         self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e"]:
-        """As in the protocol."""
+        """Median distance in pixels of the matched cells from where they fell before."""
         moved = (self.project() - before).norm(dim=-1)
         return moved.masked_fill(~(weight[..., 0] > 0), torch.nan).nanmedian(dim=1).values
 
     def distances(self, rotation_weight: float, step: int = 2) -> Float[Tensor, "e"]:
-        """As in the protocol."""
+        """DROID-SLAM's distance in pixels; infinite at little overlap.
+
+        Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the
+        rest) over every ``step``-th of the cells that stay in front of the target; infinite where
+        less than 3/4 do or where less than a fifth falls into the image.
+        """
         grid, T = self.grid, self.motion
         keep = torch.zeros(grid.height, grid.width, dtype=torch.bool)
         keep[::step, ::step] = True

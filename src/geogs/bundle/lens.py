@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import CellProjection, motion_rows, relative_motion, seen_from_targets
-from geogs.bundle.terms import SharedProjection
 from geogs.geometry.camera import Camera
 
 _NEWTON_STEPS = 8
@@ -44,6 +43,16 @@ class RadialLens:
         """Of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
         ``_LEAST_SLOPE``."""
         return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=_LEAST_SLOPE)
+
+
+@dataclass(frozen=True)
+class SharedProjection(CellProjection):
+    """A projection with its first derivatives."""
+
+    jacobian: Float[Tensor, "e c 2 p"]
+    """d pixel / d (xi of the motion to the target, left perturbation; the block's unknowns)."""
+    depth_jacobian: Float[Tensor, "e 2 p"]
+    """d pixel / d inverse depth of the source."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +89,7 @@ class LensBlock:
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "e p"],
     ) -> CellProjection:
-        """As in the protocol."""
+        """Where the cells of the sources fall in the targets; depths are those of the sources."""
         T_ji = relative_motion(T_cw, source, target)
         y, valid, z = seen_from_targets(self.rays.rays, T_ji, inverse_depth)
         return CellProjection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
@@ -92,7 +101,7 @@ class LensBlock:
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "e p"],
     ) -> SharedProjection:
-        """As in the protocol."""
+        """:meth:`project` with its derivatives."""
         lens, rays, T_ji = self.lens, self.rays, relative_motion(T_cw, source, target)
         y, valid, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
         x, c, q = y[..., :2] / z[..., None], lens.camera, 1 / z

@@ -13,8 +13,11 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 
-class CpuMotion:
-    """Solver for some cells of a grid, or for all of them."""
+class MotionSolver:
+    """What finds the poses of frames seen from keyframes that stay as they are, on the CPU.
+
+    Matches are those of some cells of a grid, or of all of them.
+    """
 
     def __init__(self, grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> None:
         self.grid = grid
@@ -23,7 +26,7 @@ class CpuMotion:
     def solve(
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-        """As in the protocol."""
+        """Poses, each adjusted on its own, and the residuals of the edges at those poses."""
         camera, rays, d, frame = self.grid.camera, self.rays, problem.inverse_depth, problem.frame
         to_source = se3_inverse(problem.T_source)
 
@@ -56,7 +59,16 @@ class CpuMotion:
         huber: float,
         limit: float,
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
-        """As in the protocol."""
+        """Pose of a frame against one keyframe, and what says whether it is right.
+
+        Cells without information do not count. Returns the pose; the motion from the keyframe to
+        it; and in one tensor the fraction of the cells that are matched, that whose residual is
+        below ``limit`` pixels, the medians over the matched of the residual, of the motion and of
+        its parallax (the motion from where the camera's rotation alone takes a cell), in pixels,
+        which are not numbers where nothing is matched, the fraction of the cells that have
+        information, and of those that are matched and have known depth
+        (``Keyframe.has_known_depth``). On a GPU all stays there, and nothing waits.
+        """
         informed = keyframe.information > 0
         placed = keyframe.has_known_depth & (weight[:, 0] > 0)
         weight = weight * informed[:, None]

@@ -28,7 +28,6 @@ class SchurBundle(ABC, Generic[P, L]):
         self.problem, self.options = problem, options
         self.information = problem.known_before()
         """As in ``BundleResult``, where the problem was linearised last."""
-        self.residual = problem.inverse_depth.new_zeros(len(problem.source))
 
     @abstractmethod
     def linearise(self, state: BundleState) -> L:
@@ -74,9 +73,7 @@ class SchurBundle(ABC, Generic[P, L]):
         cost = self.cost if o.lowers_cost else None
         solution = minimise(self.problem.start, self.linearise, self.step, o.policy, cost)
         s = solution.state
-        return BundleResult(
-            s.T_cw, s.inverse_depth, self.information, self.residual, solution.finite, s.block
-        )
+        return BundleResult(s.T_cw, s.inverse_depth, self.information, solution.finite, s.block)
 
 
 def stepped(

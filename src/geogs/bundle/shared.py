@@ -13,7 +13,7 @@ results depend on it.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar, cast
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -23,19 +23,17 @@ from geogs.bundle.dense import DenseSchur, LinearBundle
 from geogs.bundle.flow_term import (
     SourceFlow,
     damped_curvature,
-    edge_residual,
     matched_cost,
     weighed_residuals,
 )
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import relative_motion
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.terms import BundleState, ProjectingBlock
+from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, minimise
 from geogs.geometry.lie import se3_adjoint, se3_inverse
-
-B = TypeVar("B", bound=ProjectingBlock)
 
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
@@ -47,10 +45,10 @@ few each."""
 
 
 @dataclass(frozen=True)
-class SharedResult(Generic[B]):
+class SharedResult:
     """The adjusted problem, and how well the block is known."""
 
-    block: B
+    block: LensBlock
     T_cw: Float[Tensor, "n 4 4"]
     inverse_depth: Float[Tensor, "n p"]
     information: Float[Tensor, "n p"]
@@ -65,10 +63,10 @@ class SharedResult(Generic[B]):
 
 def solve_shared(
     problem: BundleProblem,
-    block: B,
+    block: LensBlock,
     options: BundleOptions = OPTIONS,
     least_decrease: float = LEAST_DECREASE,
-) -> SharedResult[B]:
+) -> SharedResult:
     """Adjust all free poses, all inverse depths and the block; every frame's depth is free.
 
     The covariance is cluster-robust (Liang and Zeger's sandwich):
@@ -89,7 +87,7 @@ def solve_shared(
     state, linear = found.state, found.linear or shared.linearise(found.state)
     covariance = _covariance(linear)
     return SharedResult(
-        cast(B, state.block),
+        cast(LensBlock, state.block),
         state.T_cw,
         state.inverse_depth,
         shared.information,
@@ -134,7 +132,7 @@ class SharedFlow:
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
         """As in the protocol."""
-        source, block = problem.source, cast(ProjectingBlock, state.block)
+        source, block = problem.source, cast(LensBlock, state.block)
         p = block.project(state.T_cw, source, problem.target, state.inverse_depth[source])
         return matched_cost(p, problem.pixels, problem.weight, huber)
 
@@ -142,7 +140,7 @@ class SharedFlow:
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
         """As in the protocol; each with the diagonal of its equations, its depths being fixed."""
-        i, j, block = problem.source, problem.target, cast(ProjectingBlock, state.block)
+        i, j, block = problem.source, problem.target, cast(LensBlock, state.block)
         p = block.linearise(state.T_cw, i, j, state.inverse_depth[i])
         r, weight = weighed_residuals(p, problem.pixels, problem.weight, options.huber)
         w, J, Jd = weight.mT[:, None], p.jacobian, p.depth_jacobian
@@ -151,7 +149,6 @@ class SharedFlow:
         v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
         E, curvature, pull = (wJ * Jd[:, None]).sum(2), (wd * Jd).sum(1), (wd * r.mT).sum(1)
         adjoint = se3_adjoint(relative_motion(state.T_cw, i, j))
-        residual = edge_residual(r, weight)
         for frame, e in sources_within(i):
             information = curvature[e].sum(0)
             depth = DepthEquations(
@@ -165,7 +162,7 @@ class SharedFlow:
             edges = RelativeEdges(
                 poses, hessian, gradient, len(block.free), depth, adjoint=adjoint[e]
             )
-            yield SourceFlow(frame, edges, residual[e], edges.chained()[0].diagonal())
+            yield SourceFlow(frame, edges, edges.chained()[0].diagonal())
 
 
 def _with_shared(

@@ -63,9 +63,8 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
             # The coupling with the depths is most of it, and not needed again.
             return [replace(s, edges=s.edges.without_coupling()) for s in sources]
 
-        for chunk, sources in zip(self.chunks, _few_at_a_time(work, self.chunks), strict=True):
+        for sources in _few_at_a_time(work, self.chunks):
             self.system.add(source.edges for source in sources)
-            self.residual[chunk] = torch.cat([source.residual for source in sources])
             for source in sources:
                 self.information[source.frame] = source.information
 

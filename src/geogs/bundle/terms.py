@@ -18,7 +18,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.hyper_edge import HyperEdge
-from geogs.bundle.projection import CellProjection
 
 B = TypeVar("B", bound="SharedBlock")
 
@@ -74,16 +73,6 @@ class PoseTerm(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class SharedProjection(CellProjection):
-    """A projection with its first derivatives."""
-
-    jacobian: Float[Tensor, "e c 2 p"]
-    """d pixel / d (xi of the motion to the target, left perturbation; the block's unknowns)."""
-    depth_jacobian: Float[Tensor, "e 2 p"]
-    """d pixel / d inverse depth of the source."""
-
-
 @runtime_checkable
 class SharedBlock(Protocol):
     """Unknowns that a whole problem shares, at their present values; never changed in place."""
@@ -100,29 +89,4 @@ class SharedBlock(Protocol):
 
     def moved(self: B, step: Float[Tensor, "m"]) -> B:
         """After a step of all unknowns, zero for those that are no variables."""
-        ...
-
-
-@runtime_checkable
-class ProjectingBlock(SharedBlock, Protocol):
-    """Unknowns that projections depend on: a lens."""
-
-    def project(
-        self,
-        T_cw: Float[Tensor, "n 4 4"],
-        source: Int[Tensor, "e"],
-        target: Int[Tensor, "e"],
-        inverse_depth: Float[Tensor, "e p"],
-    ) -> CellProjection:
-        """Where the cells of the sources fall in the targets; depths are those of the sources."""
-        ...
-
-    def linearise(
-        self,
-        T_cw: Float[Tensor, "n 4 4"],
-        source: Int[Tensor, "e"],
-        target: Int[Tensor, "e"],
-        inverse_depth: Float[Tensor, "e p"],
-    ) -> SharedProjection:
-        """:meth:`project` with its derivatives."""
         ...

@@ -1,12 +1,10 @@
-"""The terms of a Sim(3) pose graph: what a kind of measurement says of keyframes' similarities.
+"""What a term of a Sim(3) pose graph, relative poses or dense matches, is given and gives.
 
-A new kind is one class with :meth:`GraphTerm.linearise`, entered in ``PoseGraph.terms``. Inverse
-depths that a term has along with the similarities it eliminates itself. The graph is solved on the
-CPU, also where the tracker is on a GPU.
+Inverse depths that a term has along with the similarities it eliminates itself. The graph is solved
+on the CPU, also where the tracker is on a GPU.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -40,29 +38,3 @@ class BlockEquations:
         rigid[6] = 0
         block = self.block * rigid[:, None] * rigid
         return BlockEquations(self.row, self.column, block, self.gradient * rigid)
-
-
-@runtime_checkable
-class LinearTerm(Protocol):
-    """A term linearised at one state."""
-
-    def equations(self, damping: float) -> BlockEquations:
-        """Over the keyframes; depths resist by ``damping`` relative to their curvature, too."""
-        ...
-
-    def cost(self, state: GraphState) -> float:
-        """At any state, over the residuals that count where it was linearised."""
-        ...
-
-    def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> Float[Tensor, "n p"] | None:
-        """Change of the inverse depths after a step of the keyframes; none if it has none."""
-        ...
-
-
-@runtime_checkable
-class GraphTerm(Protocol):
-    """Residuals of keyframes' similarities."""
-
-    def linearise(self, state: GraphState) -> LinearTerm:
-        """At a state."""
-        ...

@@ -65,7 +65,7 @@ class MatchTerm:
     edges: MatchedEdges
 
     def linearise(self, state: GraphState) -> "LinearMatches":
-        """As in the protocol."""
+        """At a state, which has inverse depths."""
         edges, d = self.edges, state.inverse_depth
         assert d is not None
         sources: list[LinearSource] = []
@@ -133,7 +133,7 @@ class LinearMatches:
     """Cells in front of their target; only these count."""
 
     def equations(self, damping: float) -> BlockEquations:
-        """As in the protocol."""
+        """Over the keyframes; depths resist by ``damping`` relative to their curvature, too."""
         index = torch.zeros(0, dtype=torch.long)
         gradient = torch.zeros(self.keyframes, 7, dtype=torch.float64)
         rows, columns, blocks = [index], [index], [gradient.new_zeros(0, 7, 7)]
@@ -164,7 +164,7 @@ class LinearMatches:
         return FACTOR * total
 
     def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> Float[Tensor, "n p"]:
-        """As in the protocol."""
+        """Change of the inverse depths after a step of the keyframes."""
         delta = torch.zeros_like(self.edges.inverse_depth)
         for source in self.sources:
             relative = xi[source.targets, :6] - source.adjoint @ xi[source.source]

@@ -27,8 +27,8 @@ from geogs.geometry.lie import (
     sim3_small_adjoint,
 )
 from geogs.loop.block_system import BlockSystem
-from geogs.loop.graph_terms import BlockEquations, GraphState, GraphTerm, LinearTerm
-from geogs.loop.matched_edges import MatchedEdges, MatchTerm
+from geogs.loop.graph_terms import BlockEquations, GraphState
+from geogs.loop.matched_edges import LinearMatches, MatchedEdges, MatchTerm
 from geogs.types import PoseCorrection
 from geogs.world.loops import RelativePoses
 
@@ -64,8 +64,6 @@ class PoseGraph:
     matches: MatchedEdges | None = None
     is_metric: bool = False
     """Whether no unit drifts, so that all scales stay what they are at the start."""
-    terms: tuple[GraphTerm, ...] = ()
-    """What else is known of the similarities."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def solve(graph: PoseGraph) -> PoseGraphResult:
     Every step lowers the cost at its stage; the result is deterministic.
     """
     matches, relative = graph.matches, RelativeTerm.of(graph.relative)
-    others = [*([] if matches is None else [MatchTerm(matches)]), *graph.terms]
+    others = [] if matches is None else [MatchTerm(matches)]
     depth = None if matches is None else matches.inverse_depth
     state = GraphState(graph.start.double(), depth)
     problem = _Problem(graph)
@@ -192,7 +190,7 @@ class RelativeTerm:
         return torch.where(self.relative.is_loop, weight, torch.ones_like(weight))
 
     def linearise(self, state: GraphState) -> "LinearRelative":
-        """As in the protocol."""
+        """At a state."""
         return LinearRelative(self, state.S)
 
 
@@ -204,7 +202,7 @@ class LinearRelative:
     S: Float[Tensor, "n 4 4"]
 
     def equations(self, damping: float) -> BlockEquations:
-        """As in the protocol."""
+        """Over the keyframes."""
         relative = self.term.relative
         e = relative_errors(self.S, relative)
         J_i, J_j = relative_jacobians(relative, e)
@@ -225,8 +223,8 @@ class LinearRelative:
         robust = torch.where(term.relative.is_loop, limit * square / (limit + square), square)
         return float(robust.sum())
 
-    def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> None:
-        """None."""
+
+LinearTerm = LinearRelative | LinearMatches
 
 
 def _cost(state: GraphState, linear: Sequence[LinearTerm]) -> float:
@@ -239,7 +237,7 @@ class _Problem:
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
-        self.terms: list[GraphTerm] = []
+        self.terms: list[RelativeTerm | MatchTerm] = []
         self._system: BlockSystem | None = None
         """Solver of the last step; the next has the same blocks."""
 
@@ -250,7 +248,7 @@ class _Problem:
     def step(
         self, state: GraphState, linear: Sequence[LinearTerm], damping: float
     ) -> Step[GraphState] | None:
-        """As in the protocol."""
+        """As the loop asks for it."""
         parts = [term.equations(damping) for term in linear]
         if self.graph.is_metric:
             parts = [part.without_scale() for part in parts]
@@ -260,9 +258,8 @@ class _Problem:
         S = torch.where(self.graph.fixed[:, None, None], state.S, retract(xi, state.S))
         d = state.inverse_depth
         if d is not None:
-            steps = (term.depth_step(xi, damping) for term in linear)
-            d = sum((step for step in steps if step is not None), d)
-            d = d.clamp(*INVERSE_DEPTHS)
+            matches = (term for term in linear if isinstance(term, LinearMatches))
+            d = sum((term.depth_step(xi, damping) for term in matches), d).clamp(*INVERSE_DEPTHS)
         return Step(GraphState(S, d))
 
     def _solve(

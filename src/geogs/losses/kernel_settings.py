@@ -10,8 +10,14 @@ import numpy as np
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.multi_view import MIN_DEPTH_RATIO, occlusion_tolerance
-from geogs.losses.photometric import MIN_COVERAGE, NCC_MIN_VARIANCE, NCC_VARIANCE_FLOOR
 from geogs.losses.single_view import MIN_ALPHA, NORMAL_EPSILON, SMOOTHNESS_ETA
+
+# Keeps the correlation finite on flat windows; grey variance, far below the texture threshold.
+NCC_VARIANCE_FLOOR = 1e-5
+NCC_MIN_VARIANCE = 1e-8
+"""Windows of the reference with less grey variance have no texture to correlate."""
+MIN_COVERAGE = 0.7
+"""Windows of which a smaller fraction is valid are left out: little is left to compare."""
 
 
 class SingleViewSettings(NamedTuple):

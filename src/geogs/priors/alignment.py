@@ -1,7 +1,5 @@
 """From any kind of prior to a positive inverse depth in the tracker's unit."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -20,23 +18,15 @@ _CUT = 2.0
 """Deviations at which a cell counts a quarter (Geman and McClure's weight)."""
 
 
-@dataclass(frozen=True)
-class AlignedPrior:
-    """A prior as inverse depth in the tracker's unit."""
-
-    inverse_depth: Float[Tensor, "p"]
-    """0 where unknown."""
-    deviation: float
-    """Robust deviation of its ratio to the tracker's inverse depth where both are known."""
-
-
 def align_inverse_depth(
     values: Float[Tensor, "p"],
     kind: DepthKind,
     inverse_depth: Float[Tensor, "p"],
     weight: Float[Tensor, "p"],
-) -> AlignedPrior | None:
-    """The prior with that scale (and shift, where its kind has one) that fits the tracker best.
+) -> Float[Tensor, "p"] | None:
+    """The prior as inverse depth in the tracker's unit; 0 where unknown.
+
+    With that scale (and shift, where its kind has one) that fits the tracker best.
 
     A scale alone is the weighted median ratio. Scale and shift minimise the weighted relative
     error by reweighted least squares (Geman and McClure), begun at the best line through the
@@ -67,12 +57,9 @@ def align_inverse_depth(
             line = torch.where(line > 0, 1 / line, 0.0)
         aligned = torch.where(finite, line, 0.0)
     aligned = _without_far(aligned)
-    both = known & (aligned > 0)
-    if int(both.sum()) < MIN_CELLS:
+    if int((known & (aligned > 0)).sum()) < MIN_CELLS:
         return None
-    ratio = inverse_depth[both].double() / aligned[both]
-    spread = 1.4826 * _weighted_median((ratio - 1).abs(), weight[both].double())
-    return AlignedPrior(aligned.to(inverse_depth), float(spread))
+    return aligned.to(inverse_depth)
 
 
 def _robust_line(

@@ -16,12 +16,13 @@ from geogs.evaluation.surfaces.visibility import cull_mesh
 from geogs.geometry.camera import Camera
 from geogs_bench.data.benchmark_scene import Truth
 from geogs_bench.results.record import SurfaceScore
-from geogs_bench.scoring.tessellation import with_short_edges
 
 _CULLING_POSES = 200
 """About so many true poses decide what the camera saw."""
 _LONGEST_EDGE = 0.05
 """Metres; coarser true meshes are cut into smaller triangles."""
+
+_MOST_FACES = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -105,3 +106,27 @@ def in_cm(weighting: Literal["area", "vertices"], scores: ReconstructionScores) 
         accuracy_median=scores.accuracy_median_cm,
         completeness_median=scores.completeness_median_cm,
     )
+
+
+def with_short_edges(mesh: Surface, longest: float) -> Surface:
+    """The same surface, triangles halved across their longest edge until none is too long.
+
+    Halving keeps thin triangles few. Neighbours that are halved across their common edge share
+    the new corner; a neighbour that is not keeps that edge whole.
+    """
+    vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
+    while True:
+        corners = vertices[faces]
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
+        long = np.flatnonzero(lengths.max(1) > longest)
+        if not len(long) or len(faces) + len(long) > _MOST_FACES:
+            return Surface(vertices, faces)
+        # Turn each triangle so that its longest edge is the one from a to b.
+        order = lengths[long].argmax(1)[:, None] + np.arange(3)
+        a, b, c = np.take_along_axis(faces[long], order % 3, axis=1).T
+        key = np.minimum(a, b) * len(vertices) + np.maximum(a, b)
+        _, first, middle = np.unique(key, return_index=True, return_inverse=True)
+        middle = middle.reshape(-1) + len(vertices)
+        vertices = np.concatenate([vertices, (vertices[a[first]] + vertices[b[first]]) / 2])
+        faces[long] = np.stack([a, middle, c], 1)
+        faces = np.concatenate([faces, np.stack([middle, b, c], 1)])

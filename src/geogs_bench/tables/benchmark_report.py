@@ -10,12 +10,12 @@ from geogs.evaluation.pages.page import (
     TextSection,
     write_page,
 )
+from geogs.evaluation.pages.plots import new_figure, save_figure
 from geogs.io.writers.atomic import write_text
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.published import PAPER
 from geogs_bench.results.record import Record, write_json
 from geogs_bench.scoring.score_pictures import PICTURES
-from geogs_bench.tables.error_curves import plot_curves
 from geogs_bench.tables.result_tables import Table, published_tables, result_tables
 
 
@@ -76,3 +76,28 @@ def _write_page(
 
 def _section(table: Table) -> TableSection:
     return TableSection(table.title, table.header, table.rows, table.note)
+
+
+def plot_curves(path: Path, records: Sequence[Record]) -> bool:
+    """Chamfer distance over seconds, a panel for each scene; false if no record has a curve."""
+    scenes = list(dict.fromkeys(record.scene for record in records if record.curve))
+    if not scenes:
+        return False
+    figure = new_figure(5.5 * len(scenes), 4.2)
+    for column, scene in enumerate(scenes):
+        plot = figure.add_subplot(1, len(scenes), column + 1)
+        for record in (r for r in records if r.scene == scene and r.curve):
+            seconds = [point.seconds for point in record.curve]
+            errors = [point.surface.chamfer for point in record.curve]
+            plot.plot(seconds, errors, "o-", ms=4, label=_label(record))
+        unit = next(r.curve[0].surface.unit for r in records if r.scene == scene and r.curve)
+        plot.set(title=scene, xlabel="seconds", ylabel=f"chamfer distance ({unit})")
+        plot.set_yscale("log")
+        plot.grid(alpha=0.3, which="both")
+        plot.legend()
+    save_figure(figure, path)
+    return True
+
+
+def _label(record: Record) -> str:
+    return " ".join(part for part in (record.provenance.command, record.variant) if part)

@@ -11,6 +11,7 @@ from geogs_bench.results.record import (
     Record,
     StageName,
     StageScore,
+    SurfaceScore,
     Weighting,
 )
 
@@ -41,36 +42,30 @@ _RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
 _POSED: tuple[StageName, ...] = ("depth fusion", "final")
 
 
-def trajectory(stage: StageName, name: str) -> Value:
-    """A field of the score of a stage's trajectory."""
+def _of(found: Callable[[Record], object], name: str, factor: float | None = None) -> Value:
+    """A field of what is found in a record, times ``factor``; none where nothing is."""
 
     def value(record: Record) -> float | None:
-        scored = record.stage(stage)
-        return getattr(scored.trajectory, name) if scored and scored.trajectory else None
+        scored = found(record)
+        number: float | None = None if scored is None else getattr(scored, name)
+        return number if number is None or factor is None else factor * number
 
     return value
+
+
+def trajectory(stage: StageName, name: str) -> Value:
+    """A field of the score of a stage's trajectory."""
+    return _of(lambda record: (scored := record.stage(stage)) and scored.trajectory, name)
 
 
 def surface(stage: StageName, weighting: Weighting, measure: str) -> Value:
     """A field of the score of a stage's surface."""
-
-    def value(record: Record) -> float | None:
-        scored = record.stage(stage)
-        found = scored.surface(weighting) if scored else None
-        return None if found is None else getattr(found, measure)
-
-    return value
+    return _of(lambda record: (s := record.stage(stage)) and s.surface(weighting), measure)
 
 
 def figure(part: Literal["cost", "motion", "photo"], name: str, factor: float = 1.0) -> Value:
     """A field of a part of a record, times ``factor``."""
-
-    def value(record: Record) -> float | None:
-        scored = getattr(record, part)
-        found = None if scored is None else getattr(scored, name)
-        return None if found is None else factor * found
-
-    return value
+    return _of(lambda record: getattr(record, part), name, factor)
 
 
 def trajectory_layout(published: PublishedTable | None = None) -> Layout:
@@ -233,12 +228,7 @@ def place_layouts() -> tuple[Layout, ...]:
 
 def place(kind: Place, name: str) -> Value:
     """A field of the scores of a kind of place."""
-
-    def value(record: Record) -> float | None:
-        scored = record.place(kind)
-        return None if scored is None else getattr(scored, name)
-
-    return value
+    return _of(lambda record: record.place(kind), name)
 
 
 def result_layout() -> Layout:
@@ -248,17 +238,14 @@ def result_layout() -> Layout:
         return record.stages[-1] if record.stages else None
 
     def field(measure: str, *weightings: Weighting) -> Value:
-        def value(record: Record) -> float | None:
+        def scored(record: Record) -> SurfaceScore | None:
             stage = last(record)
-            found = [s for w in weightings if stage and (s := stage.surface(w))]
-            return getattr(found[0], measure) if found else None
+            found = (s for w in weightings if stage and (s := stage.surface(w)))
+            return next(found, None)
 
-        return value
+        return _of(scored, measure)
 
-    def last_ate(record: Record) -> float | None:
-        stage = last(record)
-        return stage.trajectory.ate if stage and stage.trajectory else None
-
+    last_ate = _of(lambda record: (stage := last(record)) and stage.trajectory, "ate")
     surfaces: tuple[Weighting, Weighting] = ("area", "points")
     return Layout(
         "Results",

@@ -84,7 +84,7 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     seen = start + forward * draw.log_uniform(0.8, 4.0, b, k)[..., None]
     jitter = draw.normal(0.1, b, k, v, 3) * shaken
     R = R0[:, :, None] @ rotation_matrix((steps + jitter) * move.spin[:, :, None])
-    R = _keep_in_view(R, centre, seen, R0, start, move.hold)
+    R = _keep_in_view(R, centre, seen, start, move.hold)
     return Paths(R, centre, draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
 
 
@@ -121,7 +121,6 @@ def _keep_in_view(
     R: Float[Tensor, "b k v 3 3"],
     centre: Float[Tensor, "b k v 3"],
     seen: Float[Tensor, "b k 3"],
-    R0: Float[Tensor, "b k 3 3"],
     start: Float[Tensor, "b k 3"],
     hold: Float[Tensor, "b k"],
 ) -> Float[Tensor, "b k v 3 3"]:

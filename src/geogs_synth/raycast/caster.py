@@ -1,16 +1,9 @@
-"""What casters of rays at batches of rooms do; one for the CPU, one for CUDA."""
+"""What casters of rays at batches of rooms find, on the CPU and by CUDA."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from geogs_synth.camera.camera_batch import CameraBatch
-from geogs_synth.raycast.rays import Hit
-from geogs_synth.scene.rooms import Rooms
-from geogs_synth.scene.solids import SolidBatch
-from geogs_synth.textures.pyramids import TextureBank
 
 MARGIN = 1.5e-3
 """Metres before a point within which nothing hides it, since it lies on a solid itself."""
@@ -40,25 +33,3 @@ class FlowTruth:
     """In the image, and nothing hides it there."""
     valid: Bool[Tensor, "b h w"]
     """In front of the camera; elsewhere the pixels mean nothing."""
-
-
-@runtime_checkable
-class RoomCaster(Protocol):
-    """Casts rays at batches of rooms."""
-
-    def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:
-        """What every view sees."""
-        ...
-
-    def flow(
-        self, solids: SolidBatch, views: CameraBatch, points: Float[Tensor, "b h w 3"], view: int
-    ) -> FlowTruth:
-        """Where points of the world are in a view."""
-        ...
-
-    def first_hit(
-        self, size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
-        direction: Float[Tensor, "b m 3"],
-    ) -> Hit:  # fmt: skip
-        """The first thing that each ray from inside a room meets."""
-        ...

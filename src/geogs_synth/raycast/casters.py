@@ -2,11 +2,10 @@
 
 import torch
 
-from geogs_synth.raycast.caster import RoomCaster
 from geogs_synth.raycast.cpu_caster import CpuCaster
 from geogs_synth.raycast.cuda_caster import CudaCaster
 
 
-def caster_for(device: torch.device) -> RoomCaster:
+def caster_for(device: torch.device) -> CpuCaster:
     """Casts rays at rooms whose tensors are on the device."""
     return CudaCaster() if device.type == "cuda" else CpuCaster()

@@ -21,7 +21,7 @@ _CHUNK = 2048
 
 
 class CpuCaster:
-    """Renders in the precision of the rooms and views."""
+    """Casts rays at batches of rooms, in the precision of the rooms and views."""
 
     def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:
         """What every view sees."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from geogs.gpu.kernels import kernels_for
 from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.raycast.caster import MARGIN, FlowTruth, RenderedRooms
+from geogs_synth.raycast.cpu_caster import CpuCaster
 from geogs_synth.raycast.rays import Hit
 from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, packed_solids
 from geogs_synth.scene.solids import SolidBatch
@@ -18,7 +19,7 @@ SOURCE = Path(__file__).with_name("rooms.cu")
 _BLOCK = (16, 8)
 
 
-class CudaCaster:
+class CudaCaster(CpuCaster):
     """Renders by the kernels of ``rooms.cu``."""
 
     def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:

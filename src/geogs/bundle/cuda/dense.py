@@ -217,9 +217,7 @@ class CudaDenseBundle:
         memory = found.state.memory.cpu()
         T = memory[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
         finite = found.finite and int(memory[-1:].view(torch.int32)[0]) == 0
-        return BundleResult(
-            T, found.state.inverse_depth, w.edges.information, w.edges.residual, finite
-        )
+        return BundleResult(T, found.state.inverse_depth, w.edges.information, finite)
 
     def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
         """That of the last problem, if it is the same: edges are adjusted in rounds."""

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.cuda.linear_edges import block_size
+from geogs.bundle.fields import GridFields
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
@@ -27,16 +28,13 @@ def _pyramid_size(grid: SampleGrid) -> int:
     return total
 
 
-class CudaFields:
-    """Works on the fields of one grid."""
-
-    def __init__(self, grid: SampleGrid) -> None:
-        self.grid = grid
+class CudaFields(GridFields):
+    """Works on the fields of one grid on the GPU."""
 
     def fill(
         self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
     ) -> Float[Tensor, "*n p"]:
-        """As in the protocol, all fields in one launch."""
+        """As on the CPU, all fields in one launch."""
         values, confidence = values.contiguous(), confidence.contiguous()
         out, size = torch.empty_like(values), _pyramid_size(self.grid)
         count = out.numel() // self.grid.size
@@ -52,7 +50,7 @@ class CudaFields:
         inverse_depth: Float[Tensor, "p"],
         information: Float[Tensor, "p"],
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """As in the protocol."""
+        """As on the CPU."""
         first = torch.zeros(1, dtype=torch.long)
         depth, propagated = self._propagate(
             T_ji[None], torch.eye(4).to(T_ji)[None], first, inverse_depth[None], information[None],
@@ -63,7 +61,7 @@ class CudaFields:
     def reproject(
         self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
     ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-        """As in the protocol."""
+        """As on the CPU."""
         rows = {k.id: k for k in keyframes}
         slot = {id: n for n, id in enumerate(rows)}
         return self._propagate(

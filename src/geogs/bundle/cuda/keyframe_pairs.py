@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.cuda.linear_edges import block_size
+from geogs.bundle.keyframe_pairs import KeyframePairs
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.keyframes import KeyframeSet
@@ -15,7 +16,7 @@ from geogs.world.keyframes import KeyframeSet
 SOURCE = Path(__file__).with_name("pairs.cu")
 
 
-class CudaPairs:
+class CudaPairs(KeyframePairs):
     """Pairs (source, target) of keyframe ids, on the device."""
 
     def __init__(self, keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> None:
@@ -32,7 +33,7 @@ class CudaPairs:
         return len(self.source)
 
     def project(self) -> Float[Tensor, "e p 2"]:
-        """As in the protocol."""
+        """As on the CPU."""
         grid, c = self.grid, self.grid.camera
         pixels = self.inverse_depth.new_empty(len(self), grid.size, 2)
         self._kernel("project_pairs")(
@@ -44,7 +45,7 @@ class CudaPairs:
     def moved(
         self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e"]:
-        """As in the protocol."""
+        """As on the CPU."""
         grid, c = self.grid, self.grid.camera
         median = self.inverse_depth.new_empty(len(self))
         self._kernel("moved_pairs")(
@@ -55,7 +56,7 @@ class CudaPairs:
         return median
 
     def distances(self, rotation_weight: float, step: int = 2) -> Float[Tensor, "e"]:
-        """As in the protocol."""
+        """As on the CPU."""
         grid, c = self.grid, self.grid.camera
         distance = self.inverse_depth.new_empty(len(self))
         self._kernel("pair_distances")(

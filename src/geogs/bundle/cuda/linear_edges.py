@@ -99,7 +99,6 @@ class LinearisedEdges:
         self.coupling = depth.new_empty(6 * edges * cells)
         self.per_edge = depth.new_empty(2, edges * cells)
         """Curvature and gradient of the depths of each edge's source, by it alone."""
-        self.residual = depth.new_zeros(edges)
         self.information = torch.zeros_like(depth)
         self.depths = depth.new_empty(2, depth.numel())
         """Inverse damped curvature and gradient of all depths."""
@@ -128,7 +127,7 @@ class LinearisedEdges:
         self.kernels["linearise_edges"](
             len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
             self.cells, c.fx, c.fy, c.cx, c.cy, options.huber, self.motion, self.normal,
-            self.coupling, curvature, gradient, self.residual,
+            self.coupling, curvature, gradient,
         )  # fmt: skip
         damping, *measured = terms.arguments
         self.kernels["sum_sources"](

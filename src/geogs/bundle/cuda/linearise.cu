@@ -9,7 +9,7 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float2* pixels, const float2* weight, const float* rays, int cells, float fx, float fy,
     float cx, float cy, float huber, double* motion, double* normal, float* coupling,
-    float* curvature, float* gradient, float* residual) {
+    float* curvature, float* gradient) {
   __shared__ Motion T_ji;
   __shared__ double sums[32];
   size_t e = blockIdx.x;
@@ -32,8 +32,6 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
     LinearCell c = linearise_cell(camera, pose, rays, p, inverse_depth[(size_t)i * cells + p],
                                   pixels[e * cells + p], weight[e * cells + p], huber);
     add_normal_equations(c, v);
-    v[27] += c.wx * c.rx * c.rx + c.wy * c.ry * c.ry;
-    v[28] += c.wx + c.wy;
     float wx = c.wx * c.dx, wy = c.wy * c.dy;
     curvature[e * cells + p] = wx * c.dx + wy * c.dy;
     gradient[e * cells + p] = wx * c.rx + wy * c.ry;
@@ -43,7 +41,6 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
   }
   block_sums(v, sums);
   if (threadIdx.x < 27) normal[NORMAL_STRIDE * e + threadIdx.x] = sums[threadIdx.x];
-  if (threadIdx.x == 0) residual[e] = sqrtf((float)(sums[27] / fmax(sums[28], 1e-12) * 2));
 }
 
 // Huber's cost of the matched cells of an edge, in variances; one behind its target is `behind`

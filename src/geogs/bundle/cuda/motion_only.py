@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.cuda.linear_edges import block_size, edges_by_frame
+from geogs.bundle.motion_only import MotionSolver
 from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
@@ -19,7 +20,7 @@ MOST_THREADS = 512
 """Threads of a block, at most: the launch bound of these kernels."""
 
 
-class CudaMotion:
+class CudaMotion(MotionSolver):
     """Solver for some cells of a grid, or for all of them.
 
     Poses and ``frame`` of a problem may be on the CPU; poses are returned where they were given.
@@ -32,7 +33,7 @@ class CudaMotion:
     def solve(
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-        """As in the protocol."""
+        """As on the CPU."""
         T_cw, d, frame, c = (
             problem.T_cw,
             problem.inverse_depth,
@@ -61,7 +62,7 @@ class CudaMotion:
         huber: float,
         limit: float,
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
-        """As in the protocol."""
+        """As on the CPU."""
         grid, c, known = self.grid, self.grid.camera, keyframe.information
         device, threads = known.device, block_size(grid.size, MOST_THREADS)
         # Both poses in one piece; behind them what is found.

@@ -102,7 +102,6 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
             blocks.index_add_(0, chunk.mirrored_to, found[chunk.mirrored].mT.flatten(1))
             pull.index_add_(0, chunk.pulled_to, vectors[chunk.pulled])
             self.information[chunk.sources.to(d.device)] = edges.information
-            self.residual[chunk.edges] = edges.residual
         system.add_sums(blocks.cpu().reshape(-1, 6, 6), pull.cpu())
         for term in self.problem.pose_terms:
             system.add(term.hyper_edges(state))

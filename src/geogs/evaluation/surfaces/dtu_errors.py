@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
-from geogs.evaluation.surfaces.thinning import dense_points, thin
 from geogs.io.mat_reader import read_mat
 from geogs.threads import on_one_torch_thread
 
@@ -172,3 +171,35 @@ def _read_mat(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     if any(name not in content for name in names):
         raise InputError(f"{path} lacks {', '.join(names)}, which DTU's files hold.")
     return content
+
+
+def thin(points: Float[np.ndarray, "n 3"], radius: float) -> Bool[np.ndarray, "n"]:
+    """Which points stay when each, in order, removes all later ones at most ``radius`` away.
+
+    A removed point removes none. Takes time in proportion to the points.
+    """
+    from geogs.evaluation.surfaces.thinning_kernels import thin_in_order
+
+    kept = np.zeros(len(points), bool)
+    # From the middle, cell numbers stay small whatever the frame.
+    centred = points - points.mean(0) if len(points) else points
+    thin_in_order(np.ascontiguousarray(centred, np.float64), radius, kept)
+    return kept
+
+
+def dense_points(mesh: Surface, spacing: float) -> Float[np.ndarray, "n 3"]:
+    """All vertices, then a regular grid of points inside every triangle.
+
+    With edges u and v from the first corner the grid has floor(|u| / s) by floor(|v| / s) cells,
+    s being ``spacing`` times sqrt(|u| |v| / |u x v|), so that a cell's area is about the squared
+    spacing; the points are the centres of the cells, where they are in the triangle. Source: the
+    Python version of DTU's evaluation that comes with 2DGS.
+    """
+    from geogs.evaluation.surfaces.thinning_kernels import grid_samples
+
+    vertices = np.ascontiguousarray(mesh.vertices, np.float64)
+    faces = np.ascontiguousarray(mesh.faces, np.int64)
+    count = grid_samples(vertices, faces, spacing, np.empty((0, 3)))
+    samples = np.empty((count, 3))
+    grid_samples(vertices, faces, spacing, samples)
+    return np.concatenate([vertices, samples])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from geogs.io.sources.formats import (
     arkitscenes,
@@ -21,16 +22,13 @@ from geogs.io.sources.formats import (
 )
 from geogs.io.sources.formats.image_files import Place
 from geogs.io.sources.layouts import Layout
-from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.io.sources.reader import Reader
 
+R = TypeVar("R")
 
-def _whole(open_folder: Callable[[Path], Reader]) -> Callable[[Place], Reader]:
+
+def _whole(open_folder: Callable[[Path], R]) -> Callable[[Place], R]:
     """For a layout with images of one camera."""
-    return lambda place: open_folder(place.folder)
-
-
-def _posed(open_folder: Callable[[Path], PosedSet]) -> Callable[[Place], PosedSet]:
     return lambda place: open_folder(place.folder)
 
 
@@ -52,55 +50,55 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(
         "TUM RGB-D", tum.is_tum, _whole(tum.open_tum), ("rgb",),
         ("groundtruth.txt", "depth.txt"), "rgb.txt with the times and names of its images",
-        _posed(tum.open_posed_tum),
+        _whole(tum.open_posed_tum),
     ),
     Layout(
         "ICL-NUIM", icl_nuim.is_associated, _whole(icl_nuim.open_associated), ("rgb",),
         ("*.gt.freiburg",), "associations.txt with the names of its images",
-        _posed(icl_nuim.open_posed_associated),
+        _whole(icl_nuim.open_posed_associated),
     ),
     Layout(
         "7-Scenes", seven_scenes.is_seven_scenes, _whole(seven_scenes.open_seven_scenes), (),
         ("frame-*.pose.txt", "seq-*/frame-*.pose.txt", "seq-*.zip"),
-        "frame-000000.color.png with the images", _posed(seven_scenes.open_posed_seven_scenes),
+        "frame-000000.color.png with the images", _whole(seven_scenes.open_posed_seven_scenes),
     ),
     Layout(
         "Replica", replica.is_replica, _whole(replica.open_replica), (), ("traj.txt",),
-        "results with frame000000.jpg and so on", _posed(replica.open_posed_replica),
+        "results with frame000000.jpg and so on", _whole(replica.open_posed_replica),
     ),
     Layout(
         "ScanNet", scannet.is_scannet, _whole(scannet.open_scannet), ("color",), ("*.sens",),
         "color with the images (export them from the .sens first)",
-        _posed(scannet.open_posed_scannet),
+        _whole(scannet.open_posed_scannet),
     ),
     Layout(
-        "EuRoC or TUM-VI", asl.is_asl, asl.open_asl, asl.PICTURES,
+        "EuRoC or TUM-VI", None, asl.open_asl, asl.PICTURES,
         ("mav0", "cam0/data.csv", "data.csv"), "mav0/cam0/data with the images",
         asl.open_posed_asl,
     ),
     Layout(
-        "KITTI odometry", kitti.is_kitti_odometry, kitti.open_kitti_odometry, kitti.ODOMETRY,
+        "KITTI odometry", None, kitti.open_kitti_odometry, kitti.ODOMETRY,
         ("times.txt",), "image_2 or image_0 with the images", kitti.open_posed_kitti_odometry,
     ),
     Layout(
-        "KITTI raw", kitti_raw.is_kitti_raw, kitti_raw.open_kitti_raw, kitti_raw.RAW,
+        "KITTI raw", None, kitti_raw.open_kitti_raw, kitti_raw.RAW,
         ("oxts", "image_0*/timestamps.txt", "calib_cam_to_cam.txt"),
         "image_02/data with the images of a drive",
         kitti_raw.open_posed_kitti_raw,
     ),
     Layout(
-        "ScanNet++", model_layouts.is_scannetpp, model_layouts.open_photographs,
+        "ScanNet++", None, model_layouts.open_photographs,
         model_layouts.SCANNETPP, ("rgb.mkv", "iphone/rgb.mkv", "pose_intrinsic_imu.json"),
         "iphone/rgb with the images (extract them from rgb.mkv, or give that)",
         model_layouts.open_posed_photographs,
     ),
     Layout(
-        "ETH3D", model_layouts.is_eth3d, model_layouts.open_photographs, model_layouts.ETH3D,
+        "ETH3D", None, model_layouts.open_photographs, model_layouts.ETH3D,
         ("dslr_calibration_undistorted", "dslr_calibration_jpg"),
         "images/dslr_images_undistorted with the images", model_layouts.open_posed_photographs,
     ),
     Layout(
-        "TartanAir", tartanair.is_tartanair, tartanair.open_tartanair, tartanair.PICTURES,
+        "TartanAir", None, tartanair.open_tartanair, tartanair.PICTURES,
         ("pose_left.txt", "pose_lcam_*.txt"), "image_left or image_lcam_front with the images",
         tartanair.open_posed_tartanair,
     ),

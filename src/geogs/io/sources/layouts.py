@@ -21,8 +21,8 @@ class Layout:
 
     name: str
     """Name of the data set, for sentences."""
-    holds: Callable[[Path], object]
-    """Whether a folder is a sequence."""
+    is_like: Callable[[Path], object] | None
+    """Whether a folder is a sequence; None: it is where one of ``pictures`` has images."""
     open: Callable[[Place], Reader]
     pictures: tuple[str, ...] = ()
     """Folders of images in that of a sequence, of one camera each; the first that there is counts,
@@ -33,6 +33,12 @@ class Layout:
     """What has to lie beside these signs, in words."""
     posed: Callable[[Place], PosedSet] | None = None
     """Reads the images with their true poses; raises InputError where these are missing."""
+
+    def holds(self, folder: Path) -> bool:
+        """Whether a folder is a sequence."""
+        if self.is_like is None:
+            return any(has_images(folder / name) for name in self.pictures)
+        return bool(self.is_like(folder))
 
     def place_in(self, folder: Path) -> Place | None:
         """The sequence that a folder is, or of which it is a folder of images; none if neither."""

@@ -1,8 +1,7 @@
 """The mapper's losses on a CPU: value and gradient in one go, compiled and cut over threads.
 
-Same definitions as :func:`geogs.losses.single_view.single_view_loss` and
-:func:`geogs.losses.multi_view.multi_view_loss`, in float32. The gradient is made together with the
-value, so the backward pass only scales it. Results do not depend on the number of threads.
+In float32; held to the plain definitions in ``tests/oracles``. The gradient is made together with
+the value, so the backward pass only scales it. Results do not depend on the number of threads.
 """
 
 import functools
@@ -71,10 +70,13 @@ def fused_single_view(
     config: LossConfig,
     unit: float,
 ) -> Float[Tensor, ""]:
-    """:func:`geogs.losses.single_view.single_view_loss` for float32 maps on a CPU.
+    """Weighted sum of the single-view terms: paper Eq. single_loss, plus opacity and silhouette.
 
-    ``unit`` is a length in map units that makes the distortion term unitless. Differentiable once,
-    in the four maps. NaN and pixels without depth count nowhere.
+    Each term is summed over the pixels where it counts and divided by the number of all pixels, so
+    that a small valid region does not get large gradients. ``unit`` is a length in map units that
+    makes the distortion term unitless. Where the view's prior depth is ``OUTSIDE`` only the
+    silhouette counts. Differentiable once, in the four maps, which are float32. NaN and pixels
+    without depth count nowhere.
     """
     return _SingleView.apply(depth, normal, alpha, distortion_map, view, config, unit)
 
@@ -164,10 +166,13 @@ def fused_multi_view(
     target_depth: Float[Tensor, "dh dw"] | None,
     config: LossConfig,
 ) -> Float[Tensor, ""]:
-    """:func:`geogs.losses.multi_view.multi_view_loss` for a float32 depth on a CPU.
+    """Photometric difference of two views through a rendered depth: paper Eq. multiview_loss.
 
-    ``depth`` is the reference's at render size, 0 where alpha is low. Differentiable once, in the
-    depth and, where they require it, in ``reference.T_cw`` and ``target.T_cw``.
+    ``depth`` is the reference's at render size, float32, 0 where alpha is low; it is enlarged to
+    the photometric size. Without ``target_depth`` (the target's rendered depth, any size, no
+    gradient) nothing counts as hidden. Each term is summed over valid pixels and divided by the
+    number of all pixels. Differentiable once, in the depth and, where they require it, in
+    ``reference.T_cw`` and ``target.T_cw``.
     """
     T = target.T_cw @ se3_inverse(reference.T_cw)
     loss = depth.new_zeros(())

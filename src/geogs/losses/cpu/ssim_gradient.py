@@ -5,9 +5,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from geogs.config import LossConfig
-from geogs.losses.photometric import MIN_COVERAGE
+from geogs.losses.kernel_settings import MIN_COVERAGE
 
-# Of Wang et al. 2004, as in :func:`geogs.losses.photometric.ssim`.
+# Of Wang et al. 2004.
 _C1, _C2, _SIGMA, _REACH = 0.01**2, 0.03**2, 1.5, 5
 _LINE = np.exp(-(np.arange(-_REACH, _REACH + 1) ** 2) / (2 * _SIGMA**2))
 _LINE = (_LINE / _LINE.sum()).astype(np.float64)
@@ -26,8 +26,8 @@ def ssim_gradient(
 ) -> tuple[float, Float32[np.ndarray, "h w"]]:
     """Weighted L_ssim over all pixels and its gradient in the warped image, computed in float64.
 
-    Same definition as :func:`geogs.losses.photometric.ssim`: windows are normalised over the mask,
-    and a pixel of it counts where its window is covered enough.
+    Windows are normalised over the mask, and a pixel of it counts where its window is covered
+    enough: paper Eq. ssim.
     """
     m = (mask > 0).astype(np.float64)
     a, b = reference * m, warped * m

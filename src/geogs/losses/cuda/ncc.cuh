@@ -1,4 +1,4 @@
-// L_ncc (paper Eq. zncc) over square windows, see ``geogs.losses.photometric.ncc``.
+// L_ncc (paper Eq. zncc) over square windows, see tests/oracles/photometric_reference.py.
 #pragma once
 #include "windows.cuh"
 

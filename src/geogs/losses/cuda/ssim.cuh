@@ -1,4 +1,4 @@
-// L_ssim (paper Eq. ssim) over Gaussian windows, see ``geogs.losses.photometric.ssim``.
+// L_ssim (paper Eq. ssim) over Gaussian windows, see tests/oracles/photometric_reference.py.
 #pragma once
 #include "windows.cuh"
 

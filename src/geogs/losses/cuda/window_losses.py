@@ -1,7 +1,6 @@
 """The losses of a window of views and their gradients, in a few kernel launches.
 
-Same definitions as :func:`geogs.losses.single_view.single_view_loss` and
-:func:`geogs.losses.multi_view.multi_view_loss`, in float32, for all views and pairs at once. The
+Same definitions as :mod:`geogs.losses.cpu`, in float32, for all views and pairs at once. The
 gradient is made with the value. A launch allocates nothing and never waits for the device, so it
 can be part of a captured graph; the views and pairs may change between replays.
 """
@@ -112,7 +111,7 @@ class WindowLosses:
         """Losses (map units as the views') and gradients of the views in the slots ``batch``.
 
         ``pairs`` holds the partners' slots; -1 stands for no view and no partner. ``depth`` and the
-        other rendered maps are as in ``single_view_loss``, with normals in planes. All outputs are
+        other rendered maps are as in ``fused_single_view``, with normals in planes. All outputs are
         overwritten, the four gradients everywhere. ``relative_gradient`` (needs ``with_pose``) is
         d loss / d T of the rows of T = T_partner T_view^-1. All tensors lie on the device,
         contiguous.

@@ -6,8 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.mesh.triangle_mesh import Mesh
-
 
 @dataclass(frozen=True)
 class TensorMesh:
@@ -17,12 +15,6 @@ class TensorMesh:
     """float32, map units."""
     faces: Int[Tensor, "m 3"]
     """int64."""
-
-    @staticmethod
-    def of(mesh: Mesh, device: torch.device | str) -> "TensorMesh":
-        """A mesh of the host, on a device."""
-        vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
-        return TensorMesh(vertices.to(device), faces.to(device).long())
 
     def normals(self) -> Float[Tensor, "n 3"]:
         """Unit normals in float32, the mean of a vertex's faces weighted by area."""

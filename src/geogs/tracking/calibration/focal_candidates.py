@@ -81,9 +81,7 @@ def try_candidate(
     )
 
 
-def _adjusted(
-    problem: BundleProblem, block: LensBlock, radial: bool
-) -> SharedResult[LensBlock] | None:
+def _adjusted(problem: BundleProblem, block: LensBlock, radial: bool) -> SharedResult | None:
     """From forgiving to strict, always with the focal length."""
     result = None
     for huber, steps in _STAGES:

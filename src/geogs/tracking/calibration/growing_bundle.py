@@ -54,7 +54,7 @@ class GrowingBundle:
             self._depth.append(d)
             self._information.append(i)
         self._edges: dict[tuple[int, int], _Edge] = {}
-        self.result: SharedResult[LensBlock] | None = None
+        self.result: SharedResult | None = None
 
     def __len__(self) -> int:
         return len(self._views)

@@ -141,16 +141,6 @@ class ClassicalFlow:
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
 
-    def dense(
-        self, first: ClassicalImage, second: ClassicalImage, start: np.ndarray | None
-    ) -> Float[np.ndarray, "h w 2"]:
-        """Flow of every pixel, in pixels; ``start`` (p, 2) as in :meth:`measure`."""
-        width, height = self.grid.camera.width, self.grid.camera.height
-        v, u = np.mgrid[:height, :width].astype(np.float32)
-        flow = self._dense(first, second, start, True)
-        rows = [flow.at(np.stack(row, -1), 0.0) for row in zip(u, v, strict=True)]
-        return np.stack(rows)
-
     def _workers(self) -> ThreadPoolExecutor:
         """Workers of the calling thread: a frame does not wait behind what a keyframe measures."""
         found: ThreadPoolExecutor | None = getattr(self._local, "pool", None)

@@ -39,8 +39,6 @@ class OdometryAgreement:
     """That were measured between neighbouring keyframes."""
     fitting: float
     """Fraction of these that fit within their deviations."""
-    deviation: float
-    """Relative deviation of the scale that they say; infinite where they say none."""
     used: bool
     """Whether they took part."""
 
@@ -71,9 +69,7 @@ class Odometry:
     def agreement(self) -> OdometryAgreement:
         """How far all motions fit, at the present poses."""
         vote = self._vote(self.keyframes.ids)
-        return OdometryAgreement(
-            len(vote.fits), vote.fraction, vote.deviation, self.found.scale is not None
-        )
+        return OdometryAgreement(len(vote.fits), vote.fraction, self.found.scale is not None)
 
     def between(self, ids: Sequence[int]) -> MeasuredMotions | None:
         """Motions from each of some keyframes to the next, in the unit of the map.

@@ -107,7 +107,7 @@ class KeyframePriors:
         weight = relative / (relative + DEVIATION**-2)
         aligned = align_inverse_depth(prior.values, prior.kind, inverse_depth, weight)
         if aligned is not None:
-            prior.inverse_depth = aligned.inverse_depth
+            prior.inverse_depth = aligned
             prior.scale, prior.is_aligned = torch.ones_like(prior.scale), True
 
 

@@ -22,7 +22,6 @@ from geogs.io.sources.formats.image_files import (
     ImageFile,
     ImageList,
     Place,
-    holds_pictures,
     images_in,
     in_order_of_time,
 )
@@ -36,11 +35,6 @@ _TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 _COLUMNS = (8, 17)
 """Time, position, quaternion; EuRoC's has velocity and biases behind them."""
 _NANOSECONDS = 1e-9
-
-
-def is_asl(folder: Path) -> bool:
-    """Whether ``folder`` is a sequence, that is, holds ``mav0``."""
-    return holds_pictures(folder, PICTURES)
 
 
 def open_asl(place: Place) -> ImageList:

@@ -17,7 +17,7 @@ from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.image_files import SUFFIXES, natural_key
-from geogs.io.sources.posed.posed_set import PosedFile, PosedSet, Sphere
+from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 from geogs.io.sources.posed.stored_pictures import has_alpha
 
 MAX_SKEW = 0.5
@@ -50,9 +50,7 @@ def open_dtu(folder: Path) -> PosedSet:
             mask = path
         time = index / FRAMES_PER_SECOND
         files.append(PosedFile(path, decomposed[k][1], calibrations[k], mask, time))
-    return PosedSet(
-        "dtu", folder.resolve().name, tuple(files), _unit(folder, scale), region=_region(scale)
-    )
+    return PosedSet("dtu", folder.resolve().name, tuple(files), _unit(folder, scale))
 
 
 def decompose(
@@ -136,10 +134,6 @@ def _pictures(folder: Path, names: tuple[str, ...]) -> list[Path]:
 def _number(path: Path) -> int | str:
     digits = re.findall(r"\d+", path.stem)
     return int(digits[-1]) if digits else path.stem
-
-
-def _region(scale: Float64[np.ndarray, "4 4"] | None) -> Sphere | None:
-    return None if scale is None else Sphere(scale[:3, 3].copy(), float(scale[0, 0]))
 
 
 def _unit(folder: Path, scale: Float64[np.ndarray, "4 4"] | None) -> str:

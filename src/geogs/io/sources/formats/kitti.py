@@ -18,7 +18,6 @@ from geogs.io.sources.formats.image_files import (
     ImageFile,
     ImageList,
     Place,
-    holds_pictures,
     images_in,
 )
 from geogs.io.sources.formats.timed_poses import with_timed_poses
@@ -29,11 +28,6 @@ ODOMETRY = ("image_2", "image_0", "image_3", "image_1")
 """Folders of images, those of the left colour camera first."""
 _FRAMES_PER_SECOND = 10.0
 """Of the data set, where the file of times is missing."""
-
-
-def is_kitti_odometry(folder: Path) -> bool:
-    """Whether ``folder`` is a sequence of the odometry benchmark."""
-    return holds_pictures(folder, ODOMETRY)
 
 
 def open_kitti_odometry(place: Place) -> ImageList:

@@ -19,7 +19,7 @@ from geogs.errors import InputError
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_offset, kitti_rows
-from geogs.io.sources.formats.image_files import ImageList, Place, file_names, holds_pictures
+from geogs.io.sources.formats.image_files import ImageList, Place, file_names
 from geogs.io.sources.formats.kitti import camera_of, timed
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
@@ -31,11 +31,6 @@ _EARTH = 6378137.0
 """Metres of its radius."""
 _MAX_GAP = 0.25
 """Seconds between two poses across which one is interpolated: there are ten a second."""
-
-
-def is_kitti_raw(folder: Path) -> bool:
-    """Whether ``folder`` is a drive of the raw data."""
-    return holds_pictures(folder, RAW)
 
 
 def open_kitti_raw(place: Place) -> ImageList:

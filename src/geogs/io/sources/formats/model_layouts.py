@@ -41,11 +41,6 @@ _PER_METRE = 1000.0
 _FRAME = re.compile(r"frame_(\d{1,9})")
 
 
-def is_scannetpp(folder: Path) -> bool:
-    """Whether ``folder`` is a scene of ScanNet++ with images."""
-    return holds_pictures(folder, SCANNETPP)
-
-
 def is_eth3d(folder: Path) -> bool:
     """Whether ``folder`` is a scene of ETH3D's photographs."""
     return holds_pictures(folder, ETH3D)

@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,34 +43,22 @@ def is_record3d(path: Path) -> bool:
     return path.suffix.lower() == ".r3d" and path.is_file() and zipfile.is_zipfile(path)
 
 
-@runtime_checkable
-class Files(Protocol):
-    """Files by their names within a recording."""
+@dataclass(frozen=True)
+class Files:
+    """Files by their names within a recording that was unpacked."""
+
+    path: Path
 
     def names(self) -> list[str]:
         """Names of all, such as ``rgbd/0.jpg``."""
-        ...
-
-    def read(self, name: str, largest: int) -> bytes:
-        """What one holds. Raises InputError if it is missing, too large, or damaged."""
-        ...
-
-
-@dataclass(frozen=True)
-class _Folder:
-    path: Path
-
-    def names(self) -> list[str]:
         return [f"rgbd/{p.name}" for p in (self.path / "rgbd").iterdir()]
 
     def read(self, name: str, largest: int) -> bytes:
+        """What one holds. Raises InputError if it is missing, too large, or damaged."""
         return read_bytes(self.path / name, largest)
 
 
-@dataclass(frozen=True)
-class _Archive:
-    path: Path
-
+class _Archive(Files):
     def names(self) -> list[str]:
         with self._opened() as archive:
             return archive.namelist()
@@ -133,7 +121,7 @@ class Record3dRecording:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._files: Files = _Folder(path) if path.is_dir() else _Archive(path)
+        self._files = Files(path) if path.is_dir() else _Archive(path)
         names = [name for name in self._files.names() if name.startswith("rgbd/")]
         pictures = {Path(n).stem: n for n in names if n.endswith((".jpg", ".png"))}
         numbered = ((int(k), name) for k, name in pictures.items() if _NUMBER.fullmatch(k))

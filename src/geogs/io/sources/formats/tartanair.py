@@ -18,7 +18,6 @@ from geogs.io.sources.formats.image_files import (
     ImageFile,
     ImageList,
     Place,
-    holds_pictures,
     images_in,
 )
 from geogs.io.sources.formats.timed_poses import with_timed_poses
@@ -33,11 +32,6 @@ PICTURES = (
 """Folders of images, one for each camera."""
 _OPENCV_FROM_NED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _NUMBER = re.compile(r"([0-9]{1,12})_\w+")
-
-
-def is_tartanair(folder: Path) -> bool:
-    """Whether ``folder`` is a trajectory."""
-    return holds_pictures(folder, PICTURES)
 
 
 def open_tartanair(place: Place) -> ImageList:

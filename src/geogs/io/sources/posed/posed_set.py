@@ -58,14 +58,6 @@ def renumbered(numbers: Int64[np.ndarray, "m"], kept: Sequence[int]) -> Int64[np
 
 
 @dataclass(frozen=True, slots=True)
-class Sphere:
-    """A ball in the world."""
-
-    centre: Float64[np.ndarray, "3"]
-    radius: float
-
-
-@dataclass(frozen=True, slots=True)
 class PosedSet:
     """An image set as its format describes it."""
 
@@ -77,8 +69,6 @@ class PosedSet:
     scene_scale: str = "arbitrary"
     """What one unit of the world is: metres, millimetres or arbitrary."""
     points: SparsePoints | None = None
-    region: Sphere | None = None
-    """Where the object lies, if the data set says so."""
     left_out: tuple[tuple[str, str], ...] = ()
     """Names of images that have no pose, each with the reason as a clause."""
 

@@ -15,7 +15,6 @@ from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_set import (
     PosedSet,
     SparsePoints,
-    Sphere,
     without_invalid_poses,
 )
 from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
@@ -66,8 +65,6 @@ class PosedSource:
         """What one unit of the world is: metres, millimetres or arbitrary."""
         self.points: SparsePoints | None = posed.points
         """Sparse points of the world with which images see them, if the format has any."""
-        self.region: Sphere | None = posed.region
-        """Where the object lies, if the data set says so."""
         self.left_out: tuple[tuple[str, str], ...] = posed.left_out
         """Names of images that have no pose, each with the reason as a clause."""
         self.T_cw: Float64[np.ndarray, "n 4 4"] = np.stack([file.T_cw for file in posed.files])

@@ -11,12 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# Keeps the correlation finite on flat windows; grey variance, far below the texture threshold.
-NCC_VARIANCE_FLOOR = 1e-5
-NCC_MIN_VARIANCE = 1e-8
-"""Windows of the reference with less grey variance have no texture to correlate."""
-MIN_COVERAGE = 0.7
-"""Windows of which a smaller fraction is valid are left out: little is left to compare."""
+from geogs.losses.kernel_settings import NCC_VARIANCE_FLOOR
 
 
 def _channels_first(image: Tensor) -> Tensor:
