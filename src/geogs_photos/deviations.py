@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.linalg import null_space
 
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -21,7 +20,6 @@ def pose_deviations(
     error: float,
     is_known: bool,
     fitted: Bool[np.ndarray, "n"] | None = None,
-    told: Float64[np.ndarray, "2 n"] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Standard deviations of the images' centres (world units) and orientations (radians).
 
@@ -36,9 +34,8 @@ def pose_deviations(
         error: deviation of a measured point, pixels.
         is_known: whether the camera was given, or found along with the poses.
         fitted: the images that the alignment fits; none fits all. The others are told beside
-            these: what hangs on at an end sways with that.
-        told: deviations of all centres and orientations from elsewhere, infinite where nothing was
-            told; none where nothing was of any.
+            these, which count as unsure as their matches leave them: what hangs on at an end sways
+            with that.
     """
     colmap = load_colmap()
     options = colmap.BundleAdjustmentOptions(
@@ -56,80 +53,49 @@ def pose_deviations(
     if joint is None:
         unknown = np.full(len(images), np.inf)
         return unknown, unknown.copy()
-    return without_gauge((ALIKE * error) ** 2 * joint, T_cw, fitted, told)
+    centre, rotation = without_gauge(joint, T_cw, fitted)
+    return ALIKE * error * centre, ALIKE * error * rotation
 
 
 def without_gauge(
     joint: Float64[np.ndarray, "k k"],
     T_cw: Float64[np.ndarray, "n 4 4"],
     fitted: Bool[np.ndarray, "n"] | None = None,
-    told: Float64[np.ndarray, "2 n"] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Deviations of centres and orientations without what a similarity of the world changes.
 
     ``joint`` is the covariance of the poses' left tangents, rotation (3) then translation (3) of
     each. With T = [Exp(w) R, t + dt] the centre -R^T t moves by R^T (w x t - dt), and the axes of
     the camera turn by R^T w in the world. The similarity is that of the images ``fitted``, or all.
-    ``told`` are deviations (all axes together) of centres and orientations from elsewhere.
     """
     count = len(T_cw)
     fitted = np.ones(count, bool) if fitted is None else fitted
-    J = np.zeros((2, 3 * count, 6 * count))
+    moves, rotations = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
     for k, T in enumerate(T_cw):
         back, t = T[:3, :3].T, T[:3, 3]
         rows, own = slice(3 * k, 3 * k + 3), slice(6 * k, 6 * k + 6)
-        J[0, rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
-        J[1, rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
-    J = J.reshape(6 * count, 6 * count)
+        moves[rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
+        rotations[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
     centres = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
     centres = centres - centres[fitted].mean(0)
-    identity, moved = np.tile(np.eye(3), (count, 1)), slice(0, 3 * count)
-    gauge = np.zeros((6 * count, 7))
+    identity = np.tile(np.eye(3), (count, 1))
     rotated = np.concatenate([-_cross(c) for c in centres])
-    gauge[moved] = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
-    gauge[3 * count :, 3:6] = identity
-    world = J @ joint @ J.T
-    if told is not None:
-        world = with_told(world, gauge, np.repeat(told, 3, 1).reshape(-1) ** 2 / 3)
-    turned, of_fitted = slice(3 * count, None), np.repeat(fitted, 3)
+    similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
+    of_fitted = np.repeat(fitted, 3)
     return (
-        _left(world[moved, moved], gauge[moved], of_fitted),
-        _left(world[turned, turned], identity, of_fitted),
-    )
-
-
-def with_told(
-    covariance: Float64[np.ndarray, "m m"],
-    gauge: Float64[np.ndarray, "m g"],
-    variance: Float64[np.ndarray, "m"],
-) -> Float64[np.ndarray, "m m"]:
-    """The covariance, but for what lies along ``gauge``, once some numbers are known from elsewhere.
-
-    ``covariance`` tells nothing along ``gauge``, wherever that was fixed; the numbers of finite
-    ``variance`` were told each by itself, in a gauge of their own. What both know is the sum of
-    their information across the gauge: of P that is P - P G (G^T P G)^+ G^T P (the Schur
-    complement, which lets the gauge be any).
-    """
-    unit = np.sqrt(covariance.diagonal())  # lengths and angles are of different size
-    G = gauge / unit[:, None]
-    PG = (unit**2 / variance)[:, None] * G
-    across = null_space(G.T)
-    own = np.linalg.inv(across.T @ (covariance / np.outer(unit, unit)) @ across)
-    told = np.diag(unit**2 / variance) - PG @ np.linalg.pinv(G.T @ PG, hermitian=True) @ PG.T
-    known = across @ np.linalg.inv(own + across.T @ told @ across) @ across.T
-    both: Float64[np.ndarray, "m m"] = known * np.outer(unit, unit)
-    return both
+        _left(moves, joint, similarity, of_fitted), _left(rotations, joint, identity, of_fitted)
+    )  # fmt: skip
 
 
 def _left(
-    covariance: Float64[np.ndarray, "m m"],
+    J: Float64[np.ndarray, "m k"],
+    joint: Float64[np.ndarray, "k k"],
     gauge: Float64[np.ndarray, "m g"],
     fitted: Bool[np.ndarray, "m"],
 ) -> Float64[np.ndarray, "n"]:
-    """Deviation of each triple beside what lies along ``gauge`` in the rows ``fitted``."""
-    free = np.eye(len(gauge))
-    free[:, fitted] -= gauge @ np.linalg.pinv(gauge[fitted])
-    variance = np.einsum("ij,ij->i", free @ covariance, free)
+    """Deviation of each triple of J x beside what lies along ``gauge`` in the rows ``fitted``."""
+    free = J - gauge @ (np.linalg.pinv(gauge[fitted]) @ J[fitted])
+    variance = np.einsum("ij,jk,ik->i", free, joint, free, optimize=True)
     return np.sqrt(variance.reshape(-1, 3).sum(1).clip(0))
 
 
