@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.linalg import block_diag
 
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -70,16 +71,12 @@ def without_gauge(
     """
     count = len(T_cw)
     beside = [range(count)] * count if beside is None else beside
-    moves, rotations = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
-    for k, T in enumerate(T_cw):
-        back, t = T[:3, :3].T, T[:3, 3]
-        rows, own = slice(3 * k, 3 * k + 3), slice(6 * k, 6 * k + 6)
-        moves[rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
-        rotations[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
-    centres = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
+    back, t, eye = T_cw[:, :3, :3].transpose(0, 2, 1), T_cw[:, :3, 3], np.eye(3)
+    moves = block_diag(*np.concatenate([back @ np.cross(t[:, None], eye), -back], 2))
+    rotations = block_diag(*np.concatenate([back, 0 * back], 2))
+    centres = -np.einsum("nij,nj->ni", back, t)
     centres = centres - centres.mean(0)
-    identity = np.tile(np.eye(3), (count, 1))
-    rotated = np.concatenate([-_cross(c) for c in centres])
+    identity, rotated = np.tile(eye, (count, 1)), np.cross(centres[:, None], eye).reshape(-1, 3)
     similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
     return _left(moves, joint, similarity, beside), _left(rotations, joint, identity, beside)
 
@@ -93,7 +90,8 @@ def _left(
     """Deviation of each triple of J x without what lies along ``gauge`` in the triples beside."""
     covariance, left = J @ joint @ J.T, np.zeros(len(beside))
     for k, fitted in enumerate(beside):
-        own, rows = slice(3 * k, 3 * k + 3), np.add.outer(3 * np.array(fitted), range(3)).reshape(-1)
+        own = slice(3 * k, 3 * k + 3)
+        rows = np.add.outer(3 * np.array(fitted), range(3)).reshape(-1)
         free = np.zeros((3, len(J)))
         free[:, own] = np.eye(3)
         free[:, rows] -= gauge[own] @ np.linalg.pinv(gauge[rows])
@@ -123,7 +121,3 @@ def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"
             joint[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] = block
             joint[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] = block.T
     return joint
-
-
-def _cross(v: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
