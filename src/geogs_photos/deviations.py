@@ -91,7 +91,7 @@ def _left(
     covariance, left = J @ joint @ J.T, np.zeros(len(beside))
     for k, fitted in enumerate(beside):
         own = slice(3 * k, 3 * k + 3)
-        rows = np.add.outer(3 * np.array(fitted), range(3)).reshape(-1)
+        rows = np.add.outer(3 * np.array(fitted, int), range(3)).reshape(-1)
         free = np.zeros((3, len(J)))
         free[:, own] = np.eye(3)
         free[:, rows] -= gauge[own] @ np.linalg.pinv(gauge[rows])
