@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.application.structure_from_motion.completion import about
 from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
 from geogs.types import FoundFrames, Frame
@@ -48,11 +49,12 @@ def place_lost(
         model = believed(model, database, known)
     images = placed_images(model)
     is_known = np.array([image.image_id in known for image in images], bool)
+    beside = [sorted(about([k], np.flatnonzero(is_known).tolist())) for k in range(len(images))]
     if is_known.all():
         return FoundFrames.none()
     poses = np.stack([world_to_camera(image) for image in images])
     error = float(model.compute_mean_reprojection_error())
-    deviations = pose_deviations(model, images, poses, error, True, is_known)
+    deviations = pose_deviations(model, images, poses, error, True, beside)
     of = [frames[int(image.name)] for image in images]
     times = np.array([frame.timestamp for frame in of], np.float64)
     numbers = tuple(frame.index for frame in of)

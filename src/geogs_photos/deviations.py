@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
+from scipy.linalg import block_diag
 
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -19,7 +20,7 @@ def pose_deviations(
     T_cw: Float64[np.ndarray, "n 4 4"],
     error: float,
     is_known: bool,
-    fitted: Bool[np.ndarray, "n"] | None = None,
+    beside: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Standard deviations of the images' centres (world units) and orientations (radians).
 
@@ -33,9 +34,8 @@ def pose_deviations(
         T_cw: the same.
         error: deviation of a measured point, pixels.
         is_known: whether the camera was given, or found along with the poses.
-        fitted: the images that the alignment fits; none fits all. The others are told beside
-            these, which count as unsure as their matches leave them: what hangs on at an end sways
-            with that.
+        beside: for each image the places of those that the alignment fits, which count as unsure
+            as their matches leave them: what hangs on at an end sways with that. None fits all.
     """
     colmap = load_colmap()
     options = colmap.BundleAdjustmentOptions(
@@ -53,50 +53,50 @@ def pose_deviations(
     if joint is None:
         unknown = np.full(len(images), np.inf)
         return unknown, unknown.copy()
-    centre, rotation = without_gauge(joint, T_cw, fitted)
+    centre, rotation = without_gauge(joint, T_cw, beside)
     return ALIKE * error * centre, ALIKE * error * rotation
 
 
 def without_gauge(
     joint: Float64[np.ndarray, "k k"],
     T_cw: Float64[np.ndarray, "n 4 4"],
-    fitted: Bool[np.ndarray, "n"] | None = None,
+    beside: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Deviations of centres and orientations without what a similarity of the world changes.
 
     ``joint`` is the covariance of the poses' left tangents, rotation (3) then translation (3) of
     each. With T = [Exp(w) R, t + dt] the centre -R^T t moves by R^T (w x t - dt), and the axes of
-    the camera turn by R^T w in the world. The similarity is that of the images ``fitted``, or all.
+    the camera turn by R^T w in the world. The similarity of each is that of the images ``beside``
+    it, or all.
     """
     count = len(T_cw)
-    fitted = np.ones(count, bool) if fitted is None else fitted
-    moves, rotations = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
-    for k, T in enumerate(T_cw):
-        back, t = T[:3, :3].T, T[:3, 3]
-        rows, own = slice(3 * k, 3 * k + 3), slice(6 * k, 6 * k + 6)
-        moves[rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
-        rotations[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
-    centres = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
-    centres = centres - centres[fitted].mean(0)
-    identity = np.tile(np.eye(3), (count, 1))
-    rotated = np.concatenate([-_cross(c) for c in centres])
+    beside = [range(count)] * count if beside is None else beside
+    back, t, eye = T_cw[:, :3, :3].transpose(0, 2, 1), T_cw[:, :3, 3], np.eye(3)
+    moves = block_diag(*np.concatenate([back @ np.cross(t[:, None], eye), -back], 2))
+    rotations = block_diag(*np.concatenate([back, 0 * back], 2))
+    centres = -np.einsum("nij,nj->ni", back, t)
+    centres = centres - centres.mean(0)
+    identity, rotated = np.tile(eye, (count, 1)), np.cross(centres[:, None], eye).reshape(-1, 3)
     similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
-    of_fitted = np.repeat(fitted, 3)
-    return (
-        _left(moves, joint, similarity, of_fitted), _left(rotations, joint, identity, of_fitted)
-    )  # fmt: skip
+    return _left(moves, joint, similarity, beside), _left(rotations, joint, identity, beside)
 
 
 def _left(
     J: Float64[np.ndarray, "m k"],
     joint: Float64[np.ndarray, "k k"],
     gauge: Float64[np.ndarray, "m g"],
-    fitted: Bool[np.ndarray, "m"],
+    beside: Sequence[Sequence[int]],
 ) -> Float64[np.ndarray, "n"]:
-    """Deviation of each triple of J x beside what lies along ``gauge`` in the rows ``fitted``."""
-    free = J - gauge @ (np.linalg.pinv(gauge[fitted]) @ J[fitted])
-    variance = np.einsum("ij,jk,ik->i", free, joint, free, optimize=True)
-    return np.sqrt(variance.reshape(-1, 3).sum(1).clip(0))
+    """Deviation of each triple of J x without what lies along ``gauge`` in the triples beside."""
+    covariance, left = J @ joint @ J.T, np.zeros(len(beside))
+    for k, fitted in enumerate(beside):
+        own = slice(3 * k, 3 * k + 3)
+        rows = np.add.outer(3 * np.array(fitted, int), range(3)).reshape(-1)
+        free = np.zeros((3, len(J)))
+        free[:, own] = np.eye(3)
+        free[:, rows] -= gauge[own] @ np.linalg.pinv(gauge[rows])
+        left[k] = np.sqrt(np.trace(free @ covariance @ free.T).clip(0))
+    return left
 
 
 def _covariance(model: Any, config: Any, options: Any) -> Any | None:
@@ -121,7 +121,3 @@ def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"
             joint[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] = block
             joint[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] = block.T
     return joint
-
-
-def _cross(v: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

@@ -26,6 +26,7 @@ from geogs_photos.incremental_mapping import (
     refine,
     world_to_camera,
 )
+from geogs_photos.only_turns import only_turns
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import Progress, structure_of
@@ -63,6 +64,11 @@ def place_frames(
         database, threads = Path(work) / "database.db", worker_count()
         parts, _ = structure_of(database, shared, entries, pairs, seed, progress)
         parts = rejoined(parts, database, count, shared, seed, threads, progress)
+        if parts and only_turns(parts[0], database):
+            raise InputError(
+                "The camera only turns: a turn alone explains what nearly all pairs of frames "
+                "show; move it sideways, too."
+            )
     best = refine(parts[0], shared, worker_count()) if parts else None
     images = [] if best is None else placed_images(best)
     if best is None or len(images) < LEAST_IMAGES:

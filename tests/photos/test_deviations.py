@@ -38,7 +38,7 @@ def test_what_hangs_on_at_an_end_sways_with_what_it_hangs_on():
     root = 1e-4 * random.normal(size=(36, 36))
     root[24:] = 0  # nothing is unsure about the last two but for the world of the others
     fitted = np.arange(6) < 4
-    place, _ = without_gauge(root @ root.T, T_cw, fitted)
+    place, _ = without_gauge(root @ root.T, T_cw, [range(4)] * 6)
     centres, squares = -T_cw[:, :3, 3], np.zeros(6)
     for _ in range(400):
         x = (root @ random.normal(size=36)).reshape(6, 6)
@@ -59,3 +59,52 @@ def test_a_similarity_of_the_world_is_no_deviation():
     place, turn = without_gauge(np.outer(common, common), T_cw)
     assert place.max() < 1e-6
     assert turn.max() < 1e-6
+
+
+def test_what_hangs_on_at_either_end_is_told_beside_that_end():
+    """Two walks that hardly see each other, and a camera found at either: each sample has its own
+    noise, is adjusted by dense least squares over poses and points, and laid over the truth by the
+    four known cameras of one walk."""
+    random = np.random.default_rng(5)
+    walk = np.repeat([0, 1], 5)
+    T_cw = np.tile(np.eye(4), (10, 1, 1))
+    T_cw[:, :3, :3] = Rotation.from_rotvec(0.05 * random.normal(size=(10, 3))).as_matrix()
+    T_cw[:, :3, 3] = 0.1 * random.normal(size=(10, 3)) - [0.3, 0, 0] * np.arange(10)[:, None]
+    points = random.uniform((-2, -1, 3), (3, 1, 5), (24, 3))
+    sigma = np.where(walk[:, None] == np.repeat([0, 1], 12), 1e-6, 1e-3).repeat(2)
+
+    def moved_by(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        w, t = x[:60].reshape(10, 6)[:, :3], x[:60].reshape(10, 6)[:, 3:]
+        return Rotation.from_rotvec(w).as_matrix() @ T_cw[:, :3, :3], T_cw[:, :3, 3] + t
+
+    def seen(x: np.ndarray) -> np.ndarray:
+        R, t = moved_by(x)
+        at = np.einsum("nij,kj->nki", R, points + x[60:].reshape(-1, 3)) + t[:, None]
+        return (at[..., :2] / at[..., 2:]).reshape(-1)
+
+    steps = 1e-6 * np.eye(60 + points.size)
+    J = np.stack([seen(e) - seen(-e) for e in steps], 1) / 2e-6
+    free = np.setdiff1d(np.arange(len(steps)), 60 + np.array([0, 1, 2, 3, 4, 5, 8]))  # any gauge
+    solver = np.zeros((len(steps), len(J)))
+    solver[free] = np.linalg.pinv(J[:, free] / sigma[:, None]) / sigma
+    joint = (solver[:60] * sigma**2) @ solver[:60].T
+    known = np.array([0, 1, 2, 3, 6, 7, 8, 9])
+    own = [known[walk[known] == w].tolist() for w in walk]
+    place, turn = without_gauge(joint, T_cw, own)
+    truth = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
+    squares, turned = np.zeros(10), np.zeros(10)
+    for _ in range(400):
+        R, t = moved_by(solver @ (sigma * random.normal(size=len(J))))
+        centres = -np.einsum("nij,ni->nj", R, t)
+        axes = Rotation.from_matrix(np.einsum("nji,njk->nik", R, T_cw[:, :3, :3])).as_rotvec()
+        for w in (0, 1):
+            fitted = known[walk[known] == w]
+            pair = (torch.from_numpy(c[fitted]) for c in (centres, truth))
+            scale, turn_back, shift = (v.numpy() for v in umeyama(*pair))
+            off = scale * centres @ turn_back.T + shift - truth
+            squares[walk == w] += np.square(off[walk == w]).sum(1)
+            turned[walk == w] += np.square(axes - axes[fitted].mean(0))[walk == w].sum(1)
+    assert place == pytest.approx(np.sqrt(squares / 400), rel=0.15)
+    assert turn == pytest.approx(np.sqrt(turned / 400), rel=0.15)
+    together, _ = without_gauge(joint, T_cw, [known.tolist()] * 10)
+    assert (together > 10 * place).all()
