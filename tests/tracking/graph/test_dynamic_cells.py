@@ -143,6 +143,17 @@ def test_cells_of_a_keyframe_without_matches_stay_what_they_were():
     assert not bool(held_cells(none + 0.5, none + 1, before).any())
 
 
+@pytest.mark.parametrize(("ratio", "held", "fresh"), [(4.0, 1, 1), (2.0, 1, 0), (1.4, 0, 0)])
+def test_what_is_held_has_to_suit_better_than_what_is_not(ratio: float, held: int, fresh: int):
+    """A car ahead suits its epipolar lines almost as well as what stands, for a while."""
+    before = block(slice(6, 14), slice(2, 10))
+    near = before | block(slice(6, 14), slice(16, 24))
+    total = torch.where(near, ratio, 1.0)
+    found = held_cells(total, torch.ones_like(total), before)
+    assert float(found[block(slice(7, 13), slice(3, 9))].float().mean()) == held
+    assert float(found[block(slice(7, 13), slice(17, 23))].float().mean()) == fresh
+
+
 def test_what_moves_includes_its_inside_that_is_not_matched():
     thing, inside = block(slice(4, 16), slice(5, 16)), block(slice(8, 12), slice(8, 12))
     count = torch.where(inside, 0.0, 5.0)

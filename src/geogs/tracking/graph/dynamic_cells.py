@@ -26,6 +26,9 @@ WORSE = 3.0
 """Times the usual residual of all edges that of one of them is at most taken to be."""
 MOST = 10.0
 """Times the usual residual that a single match can speak for motion."""
+RELEASED = 0.5
+"""Part of the threshold below which what was held for moving is scene again: along a straight road
+a car ahead suits its epipolar lines for a while, almost as well as what stands."""
 ENOUGH = 0.7
 """Matches per cell of a surrounding from which it can be decided."""
 FILLED = 0.8
@@ -68,13 +71,17 @@ def dynamic_fraction(keyframes: KeyframeSet) -> float:
 
 
 def update_dynamic(
-    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], decided: Sequence[Pair], threshold: float
+    keyframes: KeyframeSet,
+    edges: Mapping[Pair, Edge],
+    decided: Sequence[Pair],
+    threshold: float,
+    released: float = RELEASED,
 ) -> None:
     """Say anew of the sources of some directed edges which of their cells move.
 
     ``decided`` are all edges of these sources that have a say; where they say too little of a cell,
     it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
-    residual around a cell must be.
+    residual around a cell must be; around one that was held for moving ``released`` of that.
     """
     directed = sorted(decided)
     if not directed:
@@ -91,7 +98,7 @@ def update_dynamic(
         before = [keyframes[k].moving for k in ids.tolist()]
         none = torch.zeros_like(static[0])
         dynamic = torch.stack([none if b is None else b for b in before])
-        dynamic = dynamic_cells(keyframes.grid, total, count, dynamic, threshold)
+        dynamic = dynamic_cells(keyframes.grid, total, count, dynamic, threshold, released)
         for n, k in enumerate(ids.tolist()):
             keyframes[k].moving = dynamic[n].clone()
 
@@ -102,8 +109,10 @@ def dynamic_cells(
     count: Float[Tensor, "n p"],
     before: Bool[Tensor, "n p"],
     threshold: float,
+    released: float = RELEASED,
 ) -> Bool[Tensor, "n p"]:
-    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold.
+    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold,
+    ``released`` of it where a cell was dynamic ``before``.
 
     A cell that cannot be decided goes with its surroundings, and each with the majority of those
     around it, so that what moves includes its border. All stay what they were ``before`` where none
@@ -111,7 +120,8 @@ def dynamic_cells(
     """
     near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
     known = seen >= ENOUGH
-    core = (near > threshold * seen) & known
+    most = torch.where(before, released * threshold, threshold)
+    core = (near > most * seen) & known
     is_known = known.any(1, keepdim=True) & (core.sum(1) <= FILLED * known.sum(1))[:, None]
     filled = grid_fields(grid).fill(core.to(total), known.to(total))
     return torch.where(is_known, _mean(grid, filled, 5) >= REGION, before)
