@@ -150,8 +150,8 @@ def test_what_is_held_has_to_suit_better_than_what_is_not(ratio: float, held: in
     near = before | block(slice(6, 14), slice(16, 24))
     total = torch.where(near, ratio, 1.0)
     found = held_cells(total, torch.ones_like(total), before)
-    assert float(found[block(slice(7, 13), slice(3, 9))].float().mean()) == held
-    assert float(found[block(slice(7, 13), slice(17, 23))].float().mean()) == fresh
+    assert float(found[block(slice(8, 12), slice(4, 8))].float().mean()) == held
+    assert float(found[block(slice(8, 12), slice(18, 22))].float().mean()) == fresh
 
 
 def test_what_moves_includes_its_inside_that_is_not_matched():
