@@ -46,7 +46,7 @@ from geogs.geometry.lie import (
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closure import ClosingQuestion, close_loops
-from geogs.mapping.map_update import MapUpdate, covisible_keyframe, plan_update
+from geogs.mapping.map_update import covisible_keyframe, plan_update
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.types import PoseCorrection
@@ -358,7 +358,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
 def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
     """Seconds of planning alone, the better of two."""
 
-    def plan() -> MapUpdate:
+    def plan() -> torch.Tensor:
         seen = [covisible_keyframe(v, correction) for v in mapper.views.values() if v.has_depth]
         disks = mapper.table.disks
         strategy = mapper.config.ablation.map_update
