@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from geogs.application.progress.mesh_plan import mesh_seconds, mesh_stage
 from geogs.application.progress.run_plan import PIXELS
@@ -55,16 +56,13 @@ class PosedPlan:
     """Seconds of each stage before it, such as those that find the poses."""
     end: float | None = None
     """When it is to be done, by the performance counter, where a time is given."""
+    frames: ClassVar[int] = 0
+    """None is tracked."""
 
     @property
     def fixed(self) -> Collection[str]:
         """What finds the poses."""
         return self.before
-
-    @property
-    def frames(self) -> int:
-        """None is tracked."""
-        return 0
 
     def tracked(self, frames: int, keyframes: float | int) -> float:
         """No time."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from geogs.application.progress.mesh_plan import mesh_seconds, mesh_stage
 from geogs.config import Config
@@ -71,15 +72,10 @@ class RunPlan:
     on_gpu: bool
     calibrates: bool
     maps_at_end: bool
-
-    @property
-    def end(self) -> None:
-        """No time is given."""
-
-    @property
-    def fixed(self) -> tuple[str, ...]:
-        """None, as there is no end."""
-        return ()
+    end: ClassVar[None] = None
+    """No time is given."""
+    fixed: ClassVar[tuple[str, ...]] = ()
+    """Stages that take their time whatever is given: none, as there is no end."""
 
     @property
     def costs(self) -> StageCosts:
@@ -128,7 +124,8 @@ class RunPlan:
         return sum(stages.values()) - sum(stages[name] for name in BEFORE_MAP)
 
     def at(self, reported: str, fraction: float) -> tuple[str, float]:
-        """Mapping is the search of depths, then the training."""
+        """Stage and its finished part, where so much of something is reported as done; another name
+        where that is not planned. Mapping is the search of depths, then the training."""
         if reported not in ("mapping", "map refinement"):
             return mesh_stage(reported, fraction)
         searched = SEARCHED * (self.maps_at_end or self.config.mapping.final_depth)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.mapped_scene import MappedScene
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.writers.map_file import save_map
@@ -20,6 +19,7 @@ from geogs.on_demand import OnDemand
 from geogs.types import MapSnapshot, RenderedKeyframe
 
 if TYPE_CHECKING:
+    from geogs.application.results.mapped_scene import MappedScene
     from geogs.reconstruction import Reconstruction
 
 
@@ -64,7 +64,7 @@ def write_surface(
     return mesh
 
 
-def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) -> None:
+def write_depth_mesh(output: Path, scene: "MappedScene", progress: RunProgress) -> None:
     """``depth_fusion/mesh.ply``: the surface of the searched depths, to compare the map with."""
     with scene.stopwatch("depth fusion"):
         path = output / "depth_fusion" / "mesh.ply"
@@ -72,7 +72,7 @@ def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) ->
 
 
 def write_stage(
-    output: Path, scene: MappedScene, progress: RunProgress, name: Literal["online", "adjusted"]
+    output: Path, scene: "MappedScene", progress: RunProgress, name: Literal["online", "adjusted"]
 ) -> None:
     """Trajectories and mesh as they stand, to a folder of the stage's name.
 
