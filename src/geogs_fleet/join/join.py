@@ -18,7 +18,7 @@ from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.map_file import load_map_file
-from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.ply_writer import write_splats
 from geogs.io.writers.replacement import replaced
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.stopwatch import Stopwatch
@@ -117,7 +117,7 @@ class _Join:
             mesh = joint_mesh(space, self.config.mesh, self.workers, self.device)
         except InputError:
             return None
-        write_mesh(self.output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(self.output / "mesh.ply")
         self._write_splats(disks, space)
         return mesh
 

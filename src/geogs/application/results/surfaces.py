@@ -10,7 +10,6 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.writers.map_file import save_map
-from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
@@ -60,7 +59,7 @@ def write_surface(
     """
     mesh = surface_of(renders, config, progress, name)
     if mesh is not None:
-        write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(path)
     return mesh
 
 
