@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
-from geogs.depth.revision.revised_search import RevisedSearch
 from geogs.geometry.jumps import minmod_slopes
 
 APART = 0.03
