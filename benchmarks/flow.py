@@ -74,10 +74,17 @@ def compare(network: FlowNetwork, batches: Iterable[FlowBatch], name: str, count
     found: dict[str, list[CellErrors]] = {"own": [], "classical": []}
     device = next(network.parameters()).device
     for batch in batches:
-        found["own"].append(own_errors(network, batch.to(device), count))
+        found["own"].append(own_errors(network, on_device(batch, device), count))
         found["classical"].append(classical_errors(batch, "cold" in name))
     for operator, parts in found.items():
         print(f"{name} {operator:9} {summarise(parts).line()}", flush=True)
+
+
+def on_device(batch: FlowBatch, device: torch.device) -> FlowBatch:
+    """The same on a device."""
+    edges = Edges(batch.edges.first.to(device), batch.edges.second.to(device))
+    moved = {k: v.to(device) for k, v in vars(batch).items() if isinstance(v, torch.Tensor)}
+    return FlowBatch(edges=edges, **moved)
 
 
 @torch.no_grad()

@@ -96,8 +96,8 @@ class DepthCourse:
         return load_depth_network(path).requires_grad_(True)
 
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
-        """Write weights as they are shipped, calibrated on rooms that neither training nor validation
-        show."""
+        """Write weights as they are shipped; calibrated on rooms that neither training nor
+        validation show."""
         assert self._held_out is not None  # by the examination
         calibration = calibrated(DepthErrors.join(self._held_out.errors(network)))
         write_weights(network, path, step, scores=scores, calibration=calibration)
