@@ -53,7 +53,7 @@ from geogs.types import PoseCorrection
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import RelativePoses
-from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.motion.handheld import FRAMES_PER_LAP, HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
@@ -103,7 +103,7 @@ class Walk:
 
 def path(scene: str, room) -> np.ndarray:
     """Camera-to-world poses of the keyframes."""
-    T = handheld_trajectory(room, EVERY * KEYFRAMES)[::EVERY]
+    T = HandheldPath(room).at_frames(np.arange(0, EVERY * KEYFRAMES, EVERY))
     if scene == "across":
         return T
     # Outwards and ahead: what is seen now is not seen again before the lap is done.

@@ -11,8 +11,8 @@ from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.training.map_trainer import draw_views
 from geogs.types import PoseCorrection
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera
+from handheld_walk import handheld_trajectory
 from keyframe_samples import Sample, add, segment_of
 from lit_rooms import lit_room
 

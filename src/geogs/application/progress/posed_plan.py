@@ -24,22 +24,8 @@ class PosedCosts:
     report: float
 
 
-# Two cores; and rendered at 800 pixels on an H200.
+# Rendered at 800 pixels on an H200; on a CPU two cores are the reference.
 ON_GPU = PosedCosts(1.0, 0.01, 0.02, 0.01, 0.006, 0.05, 3.0, 1.0)
-
-
-def on_cpu(rendered: float) -> PosedCosts:
-    """On a CPU, where maps have so many times the pixels of the reference."""
-    return PosedCosts(
-        first_look=2.0,
-        view=0.01,
-        searched_view=0.1 + 1.3 * rendered,
-        grown_view=0.03,
-        step=0.04 + 0.03 * rendered,
-        meshed_view=0.02 + 0.25 * rendered,
-        mesh=1.0,
-        report=0.6,
-    )
 
 
 @dataclass(frozen=True)
@@ -72,7 +58,11 @@ class PosedPlan:
         """Of each stage in its order."""
         (width, height), search = self.size, self.config.search
         smaller = min(self.config.mapping.render_long_edge / max(width, height), 1.0)
-        c = ON_GPU if self.on_gpu else on_cpu(width * height * smaller**2 / PIXELS)
+        rendered = width * height * smaller**2 / PIXELS
+        c = ON_GPU if self.on_gpu else PosedCosts(
+            first_look=2.0, view=0.01, searched_view=0.1 + 1.3 * rendered, grown_view=0.03,
+            step=0.04 + 0.03 * rendered, meshed_view=0.02 + 0.25 * rendered, mesh=1.0, report=0.6,
+        )  # fmt: skip
         views = min(self.views, search.most_views)
         steps = max(search.least_steps, search.steps_per_view * views)
         return {
