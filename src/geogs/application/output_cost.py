@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
-from geogs.application.results.result_page import write_report
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.errors import InputError
@@ -160,7 +160,8 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
         except InputError:  # these views show no surface: the others may
             times("merge", 1, 1)
         fused = clock()
-        write_report(Path(folder) / "report", scene.trajectory(), renders, mesh, {})
+        write_pictures(Path(folder) / "report", scene.trajectory(), renders)
+        write_page(Path(folder) / "report", scene.trajectory(), renders, mesh, {})
         report = clock() - fused
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
     surface = times.seconds.get("surface", 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
-from geogs.application.results.result_page import write_report
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import lost_spans
 from geogs.config import Config
@@ -229,9 +229,9 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     }
     write_summary(join.output, summary)
     written = load_result(join.output, join.device)
-    write_report(
-        join.output / "report", trajectory, written.keyframes, mesh, summary, written.disks
-    )
+    report, renders = join.output / "report", written.keyframes
+    write_pictures(report, trajectory, renders)
+    write_page(report, trajectory, renders, mesh, summary, written.disks)
     names = tuple(parts[n].name for n in gauge.parts)
     return Joint(join.output, names, tuple(unjoined), len(gauge.links), summary)
 
