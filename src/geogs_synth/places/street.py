@@ -29,20 +29,16 @@ _SUN = (-60.0, -120.0, 240.0)
 _STREET_STREAM, _DRIVE_STREAM = 0x57E, 0xD71
 
 
-def middle_line(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 2"]:
-    """The middle of the road, a gentle wave, at distances along the street in metres."""
-    return np.column_stack([x, _WIDTH / 2 + _BEND * np.sin(2 * np.pi * x / _BEND_LENGTH)])
-
-
 def heading(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
     """Direction of the road in radians from x."""
     return np.arctan(2 * np.pi * _BEND / _BEND_LENGTH * np.cos(2 * np.pi * x / _BEND_LENGTH))
 
 
 def on_road(x: Float64[np.ndarray, "n"], left: Float64[np.ndarray, "n"]) -> np.ndarray:
-    """n x 2 points ``left`` metres beside the middle of the road."""
+    """n x 2 points ``left`` metres beside the middle of the road, a gentle wave, at x along it."""
     yaw = heading(x)
-    return middle_line(x) + left[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    middle = np.column_stack([x, _WIDTH / 2 + _BEND * np.sin(2 * np.pi * x / _BEND_LENGTH)])
+    return middle + left[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], 1)
 
 
 def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
