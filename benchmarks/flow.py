@@ -98,7 +98,7 @@ def own_errors(network: FlowNetwork, batch: FlowBatch, iterations: int) -> CellE
 
 def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
     """Of the operator without a network, on the CPU; edges come as pairs of both directions."""
-    batch = batch.to(torch.device("cpu"))
+    batch = on_device(batch, torch.device("cpu"))
     height, width = batch.images.shape[-2:]
     grid = SampleGrid(Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=width, height=height))
     operator = ClassicalFlow(grid)
