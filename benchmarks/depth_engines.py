@@ -26,7 +26,7 @@ from geogs.geometry.depth_maps import normals_from_depth
 from geogs.geometry.lie import se3_exp
 from geogs.threads import worker_count
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.textured_scene import Scene
@@ -223,7 +223,7 @@ def main() -> None:
         number = 1000 * bare
         for seed in range(arguments.first, arguments.first + arguments.rooms):
             scene = make_room(seed)
-            path = handheld_trajectory(scene, 280, seed=seed)
+            path = HandheldPath(scene, seed).at_frames(np.arange(280))
             caster = Raycaster(flattened(scene, seed) if bare else scene, threads=worker_count())
             for n in range(arguments.keyframes):
                 middle = 30 + n * 220 // arguments.keyframes

@@ -74,10 +74,17 @@ def compare(network: FlowNetwork, batches: Iterable[FlowBatch], name: str, count
     found: dict[str, list[CellErrors]] = {"own": [], "classical": []}
     device = next(network.parameters()).device
     for batch in batches:
-        found["own"].append(own_errors(network, batch.to(device), count))
+        found["own"].append(own_errors(network, on_device(batch, device), count))
         found["classical"].append(classical_errors(batch, "cold" in name))
     for operator, parts in found.items():
         print(f"{name} {operator:9} {summarise(parts).line()}", flush=True)
+
+
+def on_device(batch: FlowBatch, device: torch.device) -> FlowBatch:
+    """The same on a device."""
+    edges = Edges(batch.edges.first.to(device), batch.edges.second.to(device))
+    moved = {k: v.to(device) for k, v in vars(batch).items() if isinstance(v, torch.Tensor)}
+    return FlowBatch(edges=edges, **moved)
 
 
 @torch.no_grad()
@@ -91,7 +98,7 @@ def own_errors(network: FlowNetwork, batch: FlowBatch, iterations: int) -> CellE
 
 def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
     """Of the operator without a network, on the CPU; edges come as pairs of both directions."""
-    batch = batch.to(torch.device("cpu"))
+    batch = on_device(batch, torch.device("cpu"))
     height, width = batch.images.shape[-2:]
     grid = SampleGrid(Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=width, height=height))
     operator = ClassicalFlow(grid)

@@ -46,14 +46,14 @@ from geogs.geometry.lie import (
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closure import ClosingQuestion, close_loops
-from geogs.mapping.map_update import MapUpdate, covisible_keyframe, plan_update
+from geogs.mapping.map_update import covisible_keyframe, plan_update
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.types import PoseCorrection
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import RelativePoses
-from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.motion.handheld import FRAMES_PER_LAP, HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
@@ -103,7 +103,7 @@ class Walk:
 
 def path(scene: str, room) -> np.ndarray:
     """Camera-to-world poses of the keyframes."""
-    T = handheld_trajectory(room, EVERY * KEYFRAMES)[::EVERY]
+    T = HandheldPath(room).at_frames(np.arange(0, EVERY * KEYFRAMES, EVERY))
     if scene == "across":
         return T
     # Outwards and ahead: what is seen now is not seen again before the lap is done.
@@ -358,7 +358,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
 def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
     """Seconds of planning alone, the better of two."""
 
-    def plan() -> MapUpdate:
+    def plan() -> torch.Tensor:
         seen = [covisible_keyframe(v, correction) for v in mapper.views.values() if v.has_depth]
         disks = mapper.table.disks
         strategy = mapper.config.ablation.map_update

@@ -42,7 +42,7 @@ from geogs.world.disks import DiskParameters, GaussianMap
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs.world.map import MapTable
-from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
@@ -86,7 +86,10 @@ class Window:
         photo = centred_camera(2 * width, 2 * height)
         cameras = MapCameras(photo, photo.with_long_edge(max(width, height)), photo)
         scene = make_room(0)
-        caster, poses = Raycaster(scene), handheld_trajectory(scene, FRAMES_APART * views)
+        caster, poses = (
+            Raycaster(scene),
+            HandheldPath(scene).at_frames(np.arange(FRAMES_APART * views)),
+        )
         own, depths = [], []
         segment = KeyframeTable.on(SampleGrid(photo, device), None, views).new_set()
         pool = _views(segment, cameras, device)

@@ -27,7 +27,7 @@ from geogs.world.disks import GaussianMap
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.map import MapTable
-from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
@@ -39,7 +39,7 @@ def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCam
     cameras = MapCameras(photo, photo.with_long_edge(width), photo)
     scene = make_room(0)
     caster = Raycaster(scene)
-    poses = handheld_trajectory(scene, 60)
+    poses = HandheldPath(scene).at_frames(np.arange(60))
     segment = KeyframeTable.on(SampleGrid(photo)).new_set()
     views, pool = (
         [],

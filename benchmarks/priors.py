@@ -31,7 +31,7 @@ from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, stru
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 
@@ -67,7 +67,7 @@ def walk(seed: int, frames: int, long_edge: int, bare: bool = True) -> Walk:
     """A hand-held path through a room."""
     camera = Camera(272.0, 272.0, 159.5, 119.5, 320, 240).with_long_edge(long_edge)
     scene = with_bare_walls(make_room(seed)) if bare else make_room(seed)
-    T_wc = handheld_trajectory(scene, frames)
+    T_wc = HandheldPath(scene).at_frames(np.arange(frames))
     caster = Raycaster(scene)
     return Walk(camera, [caster.render(camera, T) for T in T_wc], T_wc)
 

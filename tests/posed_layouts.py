@@ -39,7 +39,7 @@ class Room:
 
 def render_room(frames: int, step: int, width: int, height: int) -> Room:
     """A walk through the room."""
-    from geogs_synth.motion.handheld import handheld_trajectory
+    from handheld_walk import handheld_trajectory
     from lit_rooms import lit_room
 
     camera = Camera(0.7 * width, 0.71 * width, width / 2 - 3.25, height / 2 + 1.5, width, height)

@@ -10,8 +10,8 @@ from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.disks import DiskParameters, GaussianMap
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera
+from handheld_walk import handheld_trajectory
 from keyframe_samples import Sample, segment_of, views_of
 from lit_rooms import lit_room
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -123,8 +123,10 @@ class ReconstructionOutput:
         return self._in_world(self.mapper.depth_maps(chosen))
 
     def _in_world(self, renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
-        frame, poses = self.table.frame, self._poses
-        return OnDemand(renders, lambda r: frame.world_render(r, poses[r.keyframe_id]))
+        unit, poses = self.table.frame.unit, self._poses
+        return OnDemand(
+            renders, lambda r: replace(r, depth=r.depth * unit, T_cw=poses[r.keyframe_id])
+        )
 
     def _in_order(self, keyframe_ids: Iterable[int]) -> list[int]:
         """Keyframes in the order of their images in the set."""

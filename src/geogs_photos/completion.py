@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from geogs.application.structure_from_motion.completion import about
 from geogs.io.sources.calibration import Calibration
-from geogs.threads import thread_map, worker_count
+from geogs.threads import thread_map
 from geogs.types import FoundFrames, Frame
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.deviations import pose_deviations
@@ -38,12 +38,10 @@ def place_lost(
     entries = [Entry(f"{k:06d}", 0, features[k]) for k in shown]
     pairs = frame_pairs([e.features for e in entries], seed, progress)
     with tempfile.TemporaryDirectory(prefix="geogs-lost-") as work:
-        database, threads = Path(work) / "database.db", worker_count()
+        database = Path(work) / "database.db"
         write_database(database, [SharedCamera(seen_by, is_known=True)], entries)
-        match_pairs(database, entries, pairs, seed, threads, lambda f: progress("matching", f))
-        model = continued(
-            database, Path(work), known, seed, threads, lambda f: progress("finding poses", f)
-        )
+        match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
+        model = continued(database, Path(work), known, seed, lambda f: progress("finding poses", f))
         if model is None:
             return FoundFrames.none()
         model = believed(model, database, known)

@@ -4,6 +4,7 @@ Its pixels have their centres at one half.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from geogs.io.sources.calibration import Calibration
+from geogs.threads import worker_count
 from geogs_photos.photo_features import PhotoFeatures
 from geogs_photos.photo_pairs import Pairs
 from geogs_photos.pycolmap_library import load_colmap
@@ -47,8 +49,7 @@ class Entry:
 def write_database(path: Path, cameras: Sequence[SharedCamera], entries: Sequence[Entry]) -> None:
     """Write cameras, pictures and features; cameras and pictures are numbered from 1."""
     colmap = load_colmap()
-    database = colmap.Database.open(path)
-    try:
+    with closing(colmap.Database.open(path)) as database:
         for place, camera in enumerate(cameras):
             database.write_camera(_camera(colmap, place + 1, camera), use_camera_id=True)
         for place, entry in enumerate(entries):
@@ -60,8 +61,6 @@ def write_database(path: Path, cameras: Sequence[SharedCamera], entries: Sequenc
             kind = colmap.FeatureExtractorType.SIFT
             descriptors = colmap.FeatureDescriptors(type=kind, data=features.descriptors)
             database.write_descriptors(place + 1, descriptors)
-    finally:
-        database.close()
 
 
 def match_pairs(
@@ -69,7 +68,6 @@ def match_pairs(
     entries: Sequence[Entry],
     pairs: Pairs,
     seed: int,
-    threads: int,
     progress: Callable[[float], None],
 ) -> np.ndarray:
     """Match pairs of pictures and keep what one motion of the camera explains.
@@ -77,7 +75,7 @@ def match_pairs(
     Returns the number of kept matches between any two pictures, a symmetric matrix.
     """
     colmap = load_colmap()
-    matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
+    matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=worker_count())
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     listed = path.with_suffix(".pairs.txt")
@@ -98,11 +96,8 @@ def match_pairs(
 
 
 def _kept_matches(colmap: Any, path: Path, count: int) -> np.ndarray:
-    database = colmap.Database.open(path)
-    try:
+    with closing(colmap.Database.open(path)) as database:
         numbers, matches = database.read_two_view_geometry_num_inliers()
-    finally:
-        database.close()
     kept = np.zeros((count, count), np.int64)
     for number, inliers in zip(numbers, matches, strict=True):
         one, other = colmap.pair_id_to_image_pair(number)

@@ -10,6 +10,7 @@ tell, and mapped incrementally.
 
 import shutil
 from collections.abc import Callable, Container, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from geogs.threads import worker_count
 from geogs_photos.contradictions import false_pairs, undisputed
 from geogs_photos.database import SharedCamera, known_cameras
 from geogs_photos.incremental_mapping import (
@@ -40,7 +42,6 @@ def rejoined(
     count: int,
     cameras: Sequence[SharedCamera],
     seed: int,
-    threads: int,
     progress: Callable[[str, float], None],
 ) -> list[Any]:
     """Reconstructions by the way that puts most frames into one; ``parts`` are by the first.
@@ -51,7 +52,6 @@ def rejoined(
         count: how many frames there are.
         cameras: of the frames.
         seed: of the random choices.
-        threads: to compute with.
         progress: called with a stage and its finished part; what it raises ends the work.
     """
     known = known_cameras(cameras)
@@ -60,18 +60,18 @@ def rejoined(
     best = _believed(parts, database)
     if false and _placed(best) < WHOLE * count:
         again, database = _without(
-            false, database, count, known, seed, threads,
+            false, database, count, known, seed,
             lambda f: progress("finding poses again", f),
         )  # fmt: skip
         best = max(best, _believed(again, database), key=_placed)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
-        once = _globally(database, is_known, seed, threads)
+        once = _globally(database, is_known, seed)
         best = max(best, _believed(once, database), key=_placed)
         progress("finding poses globally", 1.0)
     if best and _placed(best) < WHOLE * count and not is_known:
         again = _with_camera_of(
-            best[0], database, count, seed, threads, lambda f: progress("finding poses again", f)
+            best[0], database, count, seed, lambda f: progress("finding poses again", f)
         )
         best = max(best, _believed(again, database), key=_placed)
     return best
@@ -150,27 +150,23 @@ def _without(
     count: int,
     known: Sequence[int],
     seed: int,
-    threads: int,
     progress: Callable[[float], None],
 ) -> tuple[list[Any], Path]:
     """Parts by incremental mapping where some pairs do not match, and the database that says so."""
     own = database.with_name("without.db")
     shutil.copy(database, own)
-    opened = load_colmap().Database.open(own)
-    try:
+    with closing(load_colmap().Database.open(own)) as opened:
         for one, other in pairs:
             opened.delete_two_view_geometry(one, other)
             opened.delete_matches(one, other)  # or they would be verified once more
-    finally:
-        opened.close()
-    return put_together(own, own.with_name("without"), count, known, seed, threads, progress), own
+    return put_together(own, own.with_name("without"), count, known, seed, progress), own
 
 
-def _globally(database: Path, is_known: bool, seed: int, threads: int) -> list[Any]:
+def _globally(database: Path, is_known: bool, seed: int) -> list[Any]:
     colmap = load_colmap()
-    options = colmap.GlobalPipelineOptions(num_threads=threads, random_seed=seed)
+    options = colmap.GlobalPipelineOptions(num_threads=worker_count(), random_seed=seed)
     mapper = options.mapper
-    mapper.random_seed, mapper.num_threads = seed, threads
+    mapper.random_seed, mapper.num_threads = seed, worker_count()
     for stage in (mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation):
         stage.random_seed = seed
     adjustment = mapper.bundle_adjustment
@@ -187,24 +183,20 @@ def _with_camera_of(
     database: Path,
     count: int,
     seed: int,
-    threads: int,
     progress: Callable[[float], None],
 ) -> list[Any]:
     colmap = load_colmap()
     own = database.with_name("again.db")
     shutil.copy(database, own)
-    opened = colmap.Database.open(own)
-    try:
+    with closing(colmap.Database.open(own)) as opened:
         for number in model.cameras:
             camera = opened.read_camera(number)
             camera.params = model.cameras[number].params
             camera.has_prior_focal_length = True
             opened.update_camera(camera)
         opened.clear_two_view_geometries()
-    finally:
-        opened.close()
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     colmap.geometric_verification(own, two_view_geometry_options=verification)
     known = list(model.cameras)
-    return put_together(own, own.with_name("again"), count, known, seed, threads, progress)
+    return put_together(own, own.with_name("again"), count, known, seed, progress)

@@ -2,12 +2,14 @@
 
 import itertools
 from collections.abc import Callable, Container, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.threads import worker_count
 from geogs_photos.database import SharedCamera
 from geogs_photos.pycolmap_library import load_colmap
 
@@ -30,7 +32,6 @@ def put_together(
     count: int,
     known: Sequence[int],
     seed: int,
-    threads: int,
     progress: Callable[[float], None],
 ) -> list[Any]:
     """Reconstructions of the parts that hang together, the largest first.
@@ -41,10 +42,9 @@ def put_together(
         count: how many pictures there are.
         known: numbers of the cameras that stay as they are.
         seed: of the random choices.
-        threads: to compute with.
         progress: called with the finished part; what it raises ends the work.
     """
-    options = _options(known, seed, threads, min_model_size=LEAST_IMAGES)
+    options = _options(known, seed, min_model_size=LEAST_IMAGES)
     work.mkdir(parents=True, exist_ok=True)
     models = load_colmap().incremental_mapping(
         database, work, work, options=options, next_image_callback=_counting(2, count, progress)
@@ -57,7 +57,6 @@ def continued(
     work: Path,
     known: Mapping[int, Float64[np.ndarray, "4 4"]],
     seed: int,
-    threads: int,
     progress: Callable[[float], None],
 ) -> Any | None:
     """The reconstruction of pictures whose poses are known, and of what joins them; none if these
@@ -68,14 +67,13 @@ def continued(
         work: folder for what pycolmap writes.
         known: poses, world to camera, by the numbers of the pictures; they stay.
         seed: of the random choices.
-        threads: to compute with.
         progress: called with the finished part; what it raises ends the work.
     """
     colmap = load_colmap()
-    options = _options([1], seed, threads, multiple_models=False, fix_existing_frames=True)
+    options = _options([1], seed, multiple_models=False, fix_existing_frames=True)
     options.mapper.abs_pose_min_num_inliers = LEAST_POINTS
     begun, went_on = work / "begun", work / "on"
-    model, count = _of_poses(colmap, database, known)
+    model, count = of_poses(database, known)
     for folder in (begun, went_on):
         folder.mkdir(parents=True, exist_ok=True)
     model = colmap.triangulate_points(model, database, work, begun, options=options)
@@ -89,10 +87,10 @@ def continued(
     return next(iter(largest_first(models)), None)
 
 
-def _options(known: Sequence[int], seed: int, threads: int, **more: Any) -> Any:
+def _options(known: Sequence[int], seed: int, **more: Any) -> Any:
     """pycolmap's, with the cameras that stay as they are."""
     options = load_colmap().IncrementalPipelineOptions(
-        num_threads=threads, random_seed=seed, extract_colors=False, **more
+        num_threads=worker_count(), random_seed=seed, extract_colors=False, **more
     )
     options.constant_cameras = set(known)
     options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -105,12 +103,14 @@ def _counting(placed: int, count: int, progress: Callable[[float], None]) -> Cal
     return lambda: progress(min(next(numbers) / count, 1.0))
 
 
-def _of_poses(
-    colmap: Any, database: Path, known: Mapping[int, Float64[np.ndarray, "4 4"]]
-) -> tuple[Any, int]:
-    """A reconstruction without points, and how many pictures the database holds."""
-    model, opened = colmap.Reconstruction(), colmap.Database.open(database)
-    try:
+def of_poses(database: Path, known: Mapping[int, Float64[np.ndarray, "4 4"]]) -> tuple[Any, int]:
+    """A reconstruction without points, and how many pictures the database holds.
+
+    ``known`` are poses, world to camera, by the numbers of the pictures.
+    """
+    colmap = load_colmap()
+    model = colmap.Reconstruction()
+    with closing(colmap.Database.open(database)) as opened:
         for camera in opened.read_all_cameras():
             model.add_camera_with_trivial_rig(camera)
         for image in opened.read_all_images():
@@ -118,8 +118,6 @@ def _of_poses(
                 pose = colmap.Rigid3d(np.ascontiguousarray(known[image.image_id][:3]))
                 model.add_image_with_trivial_frame(image, pose)
         return model, opened.num_images()
-    finally:
-        opened.close()
 
 
 def largest_first(models: Mapping[int, Any]) -> list[Any]:
@@ -141,7 +139,7 @@ def world_to_camera(image: Any) -> Float64[np.ndarray, "4 4"]:
     return T
 
 
-def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:
+def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:
     """The reconstruction adjusted once more, robustly, with more of each camera.
 
     Cameras that are not known and have the pictures for it get their principal point and a second
@@ -158,17 +156,17 @@ def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:
         camera.model = colmap.CameraModelId.RADIAL
         camera.params = [focal, cx, cy, k1, 0.0]
     if free:
-        _adjust(colmap, trial, set(model.cameras) - free, with_centres=True, threads=threads)
+        _adjust(colmap, trial, set(model.cameras) - free, with_centres=True)
         if all(_is_central(trial.cameras[number]) for number in free):
             return trial
-    _adjust(colmap, model, known, with_centres=False, threads=threads)
+    _adjust(colmap, model, known, with_centres=False)
     return model
 
 
-def adjust_free(model: Any, known: Container[int], threads: int) -> None:
+def adjust_free(model: Any, known: Container[int]) -> None:
     """A refined reconstruction adjusted once more, with all of the cameras that are not known."""
     colmap, constant = load_colmap(), {number for number in model.cameras if number in known}
-    _adjust(colmap, model, constant, with_centres=True, threads=threads)
+    _adjust(colmap, model, constant, with_centres=True)
 
 
 def _is_free(model: Any, number: int) -> bool:
@@ -188,14 +186,14 @@ def _is_central(camera: Any) -> bool:
     return offset <= MAX_OFFSET * max(camera.width, camera.height)
 
 
-def _adjust(colmap: Any, model: Any, constant: set[int], with_centres: bool, threads: int) -> None:
+def _adjust(colmap: Any, model: Any, constant: set[int], with_centres: bool) -> None:
     options = colmap.BundleAdjustmentOptions(
         refine_principal_point=with_centres, print_summary=False
     )
     options.ceres.loss_function_type = colmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.max_num_iterations = _ITERATIONS
     options.ceres.solver_options.function_tolerance = _TOLERANCE
-    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.num_threads = worker_count()
     config = colmap.BundleAdjustmentConfig()
     for number in model.reg_image_ids():
         config.add_image(number)

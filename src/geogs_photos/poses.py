@@ -104,7 +104,7 @@ def find_poses(
     if not parts:
         raise InputError(_nothing_found(folder.root, entries, kept))
     progress("adjusting", 0.0)
-    best = refine(parts[0], cameras, worker_count())
+    best = refine(parts[0], cameras)
     progress("adjusting", 1.0)
     _make_upright(colmap, best, {p.name: p.quarter_turns for p in photographs})
     best.extract_colors_for_all_images(folder.root, worker_count())
@@ -123,11 +123,10 @@ def structure_of(
     progress: Progress,
 ) -> tuple[list[Any], np.ndarray]:
     """Parts that hang together, largest first, and the kept matches of any two pictures."""
-    threads = worker_count()
     write_database(database, cameras, entries)
-    kept = match_pairs(database, entries, pairs, seed, threads, lambda f: progress("matching", f))
+    kept = match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
     parts = put_together(
-        database, database.with_name("models"), len(entries), known_cameras(cameras), seed, threads,
+        database, database.with_name("models"), len(entries), known_cameras(cameras), seed,
         lambda f: progress("finding poses", f),
     )  # fmt: skip
     return parts, kept

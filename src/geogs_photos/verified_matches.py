@@ -1,6 +1,7 @@
 """Verified matches of the pictures of a reconstruction, with their poses."""
 
 from collections.abc import Collection, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,7 @@ def verified_matches(
 ) -> Iterator[PairMatches]:
     """Those of all pairs of some pictures that have a pose."""
     colmap = load_colmap()
-    opened = colmap.Database.open(database)
-    try:
+    with closing(colmap.Database.open(database)) as opened:
         ids, _ = opened.read_two_view_geometry_num_inliers()
         rays = {n: _rays(model, opened, n) for n in pictures}
         for one, other in (colmap.pair_id_to_image_pair(i) for i in ids):
@@ -58,8 +58,6 @@ def verified_matches(
                 (rays[one][matches[:, 0]], rays[other][matches[:, 1]]),
                 float(model.cameras[model.images[one].camera_id].mean_focal_length()),
             )  # fmt: skip
-    finally:
-        opened.close()
 
 
 def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:

@@ -15,7 +15,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
-from geogs.threads import thread_map, worker_count
+from geogs.threads import thread_map
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import rejoined
@@ -61,15 +61,15 @@ def place_frames(
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
     shared = [SharedCamera(begin, is_known)]
     with tempfile.TemporaryDirectory(prefix="geogs-video-") as work:
-        database, threads = Path(work) / "database.db", worker_count()
+        database = Path(work) / "database.db"
         parts, _ = structure_of(database, shared, entries, pairs, seed, progress)
-        parts = rejoined(parts, database, count, shared, seed, threads, progress)
+        parts = rejoined(parts, database, count, shared, seed, progress)
         if parts and only_turns(parts[0], database):
             raise InputError(
                 "The camera only turns: a turn alone explains what nearly all pairs of frames "
                 "show; move it sideways, too."
             )
-    best = refine(parts[0], shared, worker_count()) if parts else None
+    best = refine(parts[0], shared) if parts else None
     images = [] if best is None else placed_images(best)
     if best is None or len(images) < LEAST_IMAGES:
         raise InputError(
@@ -84,9 +84,7 @@ def place_frames(
         progress("finding the readout", 0.0)
         times = np.array([frame.timestamp for frame in chosen.frames])
         known = set(best.cameras) if is_known else set[int]()
-        best, unsure = with_rows_at_once(
-            best, times, lambda model: adjust_free(model, known, worker_count())
-        )
+        best, unsure = with_rows_at_once(best, times, lambda model: adjust_free(model, known))
         progress("finding the readout", 1.0)
     placed = _placed(best, chosen, entries, is_known)
     placed = replace(placed, deviation=np.hypot(placed.deviation, unsure))

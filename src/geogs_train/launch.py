@@ -11,11 +11,12 @@ import torch
 from torch import distributed
 
 from geogs.gpu.installation import require_device
-from geogs_train.course import Course, Panels, Worker
+from geogs_train.course import Panels, Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining
 from geogs_train.flow.flow_course import FlowCourse
 from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.network_trainer import Course
 from geogs_train.pace import shared
 from geogs_train.training_checkpoint import read_options
 from geogs_train.training_options import TrainingRunOptions

@@ -9,9 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
-from geogs_train.course import Course, Worker
+from geogs_train.course import Worker
+from geogs_train.depth.depth_course import DepthCourse
+from geogs_train.flow.flow_course import FlowCourse
 from geogs_train.training_options import TrainingSchedule
 
+Course = FlowCourse | DepthCourse
 Batch = TypeVar("Batch")
 
 WARM_UP = 3
@@ -126,7 +129,7 @@ def schedule(step: int, progress: float, options: TrainingSchedule) -> float:
     return rate * min(1.0, (step + 1) / max(options.warmup, 1))
 
 
-def _on_device(network: nn.Module, device: torch.device) -> nn.Module:
+def _on_device(network: nn.Module, device: torch.device) -> Any:
     """With the layout that convolutions are fast in (which PyTorch's stubs do not know)."""
     return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from geogs.errors import GeogsError, InputError
-from geogs_train.course import Course, Examination, ValidationScores, Worker
-from geogs_train.network_trainer import NetworkTrainer
+from geogs_train.course import Worker
+from geogs_train.depth.depth_validation import DepthValidation
+from geogs_train.flow.flow_validation import SceneValidation
+from geogs_train.network_trainer import Course, NetworkTrainer
 from geogs_train.pace import EVERY, Clock, shared
 from geogs_train.training_checkpoint import load_checkpoint, save_checkpoint
 from geogs_train.training_options import TrainingRunOptions
@@ -25,8 +27,8 @@ Progress = Callable[[str], None]
 
 def train(
     course: Course, run: TrainingRunOptions, out: Path, worker: Worker, progress: Progress
-) -> ValidationScores | None:
-    """Train until the last step or the last minute; returns the last validation's scores.
+) -> None:
+    """Train until the last step or the last minute.
 
     The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
     (their running mean in half precision) to ``out``. Ctrl-C ends it as the last minute does.
@@ -46,7 +48,7 @@ def train(
     first = worker.rank == 0
     validation = course.examination(run.validation_batches) if first else None
     out.mkdir(parents=True, exist_ok=True)
-    scores, since, at = None, time.monotonic(), trainer.step
+    since, at = time.monotonic(), trainer.step
     clock = Clock(run.minutes, trainer.progress, worker) if run.paced and run.minutes else None
     try:
         while trainer.progress < 1:
@@ -68,25 +70,28 @@ def train(
                 if clock is None and shared(late, worker):
                     break
             if trainer.step % run.validate_every == 0 and validation is not None:
-                scores = _saved(trainer, validation, out, progress)
+                _save(trainer, validation, out, progress)
                 since, at = time.monotonic(), trainer.step
     except KeyboardInterrupt:
         progress("interrupted; writing what there is")
     finally:
         course.close()
     if validation is not None:
-        scores = _saved(trainer, validation, out, progress)
-    return scores
+        _save(trainer, validation, out, progress)
 
 
-def _saved(trainer: NetworkTrainer, validation: Examination, out: Path, progress: Progress) -> Any:
+def _save(
+    trainer: NetworkTrainer,
+    validation: SceneValidation | DepthValidation,
+    out: Path,
+    progress: Progress,
+) -> None:
     """Validate, and write the checkpoint and the weights."""
-    scores = validation.score(trainer.mean)
+    scores: Any = validation.score(trainer.mean)
     _log(out, {"step": trainer.step, "scores": asdict(scores)})
     progress(f"validation at step {trainer.step}: {scores.line()}")
     save_checkpoint(trainer, out)
     trainer.course.export(trainer.mean, out / trainer.course.weights, trainer.step, scores)
-    return scores
 
 
 def _log(out: Path, entry: dict[str, Any]) -> None:

@@ -84,7 +84,8 @@ def rehearsal(monkeypatch, rehearsed) -> FakeClock:
         if progress is not None:
             progress("merge", 1, 1)
 
-    monkeypatch.setattr(output_cost, "write_report", draw)
+    monkeypatch.setattr(output_cost, "write_pictures", lambda *of: None)
+    monkeypatch.setattr(output_cost, "write_page", draw)
     monkeypatch.setattr(output_cost, "write_keyframes", write)
     monkeypatch.setattr(output_cost, "extract_mesh", extract)
     return clock

@@ -107,9 +107,8 @@ def test_a_job_whose_node_is_removed_is_done_elsewhere_and_counts_once(cluster, 
 
 def test_a_join_on_a_cluster_is_that_of_one_process(cluster, tmp_path, monkeypatch):
     # Takes half of the time.
-    monkeypatch.setattr(
-        "geogs_fleet.join.join.write_report", lambda *a: None
-    )  # takes half of the time
+    monkeypatch.setattr("geogs_fleet.join.join.write_pictures", lambda *a: None)
+    monkeypatch.setattr("geogs_fleet.join.join.write_page", lambda *a: None)
     places = np.linspace(-0.2, 0.0, 3), np.linspace(-0.15, 0.05, 3)
     config = Config(mesh=MeshConfig(voxel=0.08, min_component_faces=10))
     parts = [Part(n, make_part(tmp_path / n, p, k)) for k, (n, p) in enumerate(zip("ab", places))]  # noqa: B905

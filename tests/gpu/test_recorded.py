@@ -24,7 +24,7 @@ def views(neighbours: int, seed: int, device: str) -> StereoViews:
     T[..., :3, 3] = 0.2 * torch.randn(1, neighbours, 3, generator=random)
     lens = torch.tensor([[60.0, 60.0, 31.5, 31.5]])
     bounds = (torch.tensor([x]) for x in (0.5, 4.0, 1.5))
-    return StereoViews(
+    made = (
         torch.rand(1, 3, 64, 64, generator=random),
         torch.rand(1, neighbours, 3, 64, 64, generator=random),
         lens,
@@ -32,7 +32,8 @@ def views(neighbours: int, seed: int, device: str) -> StereoViews:
         T,
         torch.ones(1, neighbours, dtype=torch.bool),
         *bounds,
-    ).to(device)
+    )
+    return StereoViews(*(values.to(device) for values in made))
 
 
 def test_without_a_gpu_it_is_called_as_it_is():

@@ -10,8 +10,8 @@ from geogs.config import Config
 from geogs.geometry.lie import se3_inverse
 from geogs.mapping import partners
 from geogs.mapping.mapper import Mapper
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera
+from handheld_walk import handheld_trajectory
 from keyframe_samples import Sample, segment_of
 from lit_rooms import lit_room
 from records import copied

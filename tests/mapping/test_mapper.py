@@ -8,12 +8,11 @@ import torch
 
 from geogs.config import Config, MappingConfig
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
-from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.training.map_trainer import draw_views
 from geogs.types import PoseCorrection
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera
+from handheld_walk import handheld_trajectory
 from keyframe_samples import Sample, add, segment_of
 from lit_rooms import lit_room
 
@@ -161,12 +160,12 @@ def test_disturbed_poses_are_drawn_back_by_the_map(mapper, sequence):
         mapper.keyframes[i].T_cw = true[i]
 
 
-def correct(mapper: Mapper, correction: PoseCorrection) -> MapUpdate:
+def correct(mapper: Mapper, correction: PoseCorrection) -> None:
     """Let the keyframes take over a correction, and the map follow."""
     segment = mapper.keyframes.set_of[0]
     segment.correct(correction)
     (made,) = segment.take_corrections()
-    return mapper.correct(made)
+    mapper.correct(made)
 
 
 def test_a_rigid_correction_moves_map_and_views_together(sequence):
@@ -176,8 +175,7 @@ def test_a_rigid_correction_moves_map_and_views_together(sequence):
     G = se3_exp(torch.tensor([0.5, -0.3, 0.2, 0.3, 0.5, -0.2], dtype=torch.float64))
     old = {n: k.T_cw for n, k in enumerate(keyframes[:6])}
     new = {i: T @ se3_inverse(G) for i, T in old.items()}
-    update = correct(mapper, PoseCorrection(old, new, dict.fromkeys(old, 1.0)))
-    assert update.residual < 1e-4
+    correct(mapper, PoseCorrection(old, new, dict.fromkeys(old, 1.0)))
     assert depth_error(mapper, truth[:6]) == pytest.approx(before, abs=0.02)
 
 
@@ -198,8 +196,7 @@ def test_mapping_goes_on_in_corrected_units(sequence):
     moved = [corrected(k) for k in keyframes]
     new = {n: k.T_cw for n, k in enumerate(moved[:6])}
     depths = {i: v.dense.depth.clone() for i, v in mapper.views.items()}
-    update = correct(mapper, PoseCorrection(old, new, dict.fromkeys(old, 1 / factor)))
-    assert update.residual < 1e-4
+    correct(mapper, PoseCorrection(old, new, dict.fromkeys(old, 1 / factor)))
     for i, view in mapper.views.items():
         assert (view.dense.depth / depths[i]).numpy() == pytest.approx(factor, rel=1e-5)
         assert (view.T_cw - new[i]).abs().max() == 0

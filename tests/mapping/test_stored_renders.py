@@ -9,7 +9,7 @@ import torch
 
 from depth_scene import make_scene
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.result_page import write_report
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views, splat_colours, write_surface
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
@@ -131,7 +131,8 @@ def test_results_hold_few_maps(monkeypatch, tmp_path):
     assert max(counts) <= 3
     T_wc = np.stack([torch.linalg.inv(r.T_cw).numpy() for r in renders])
     trajectory = Trajectory(np.arange(20.0), T_wc, np.ones(20, bool))
-    write_report(tmp_path / "report", trajectory, kept, mesh, {"source": "wall"})
+    write_pictures(tmp_path / "report", trajectory, kept)
+    write_page(tmp_path / "report", trajectory, kept, mesh, {"source": "wall"})
     assert max(counts) <= 8  # five that are shown
 
 

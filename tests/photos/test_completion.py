@@ -6,7 +6,7 @@ import pytest
 from geogs.application.structure_from_motion.completion import about, as_seen
 from geogs.types import FoundFrames, FoundLens, Frame, Uncertainty
 from geogs_photos.completion import place_lost
-from geogs_synth.motion.handheld import handheld_trajectory
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 from posed_layouts import render_room
 

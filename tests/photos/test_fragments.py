@@ -73,7 +73,7 @@ def test_of_all_ways_the_one_that_puts_most_into_one(
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
     parts = [Part(n) for n in first]
-    found = rejoined(parts, Path("all"), 100, [CAMERA], 0, 1, lambda *_: None)
+    found = rejoined(parts, Path("all"), 100, [CAMERA], 0, lambda *_: None)
     assert asked == tried
     assert (found[0].frames if found else None) == best
 
@@ -141,10 +141,10 @@ def test_each_way_places_a_room(monkeypatch):
     extent = np.linalg.norm(truth - truth[0], axis=1)
 
     def check(parts, *given: object) -> list:
-        found = {"globally": fragments._globally(given[0], False, 0, 1)}
-        arguments = (parts[0], given[0], 9, 0, 1, lambda _: None)
+        found = {"globally": fragments._globally(given[0], False, 0)}
+        arguments = (parts[0], given[0], 9, 0, lambda _: None)
         found["again"] = fragments._with_camera_of(*arguments)
-        rest = fragments._without([(1, 2), (4, 9)], given[0], 9, [], 0, 1, lambda _: None)
+        rest = fragments._without([(1, 2), (4, 9)], given[0], 9, [], 0, lambda _: None)
         found["without"] = rest[0]
         for way in found.values():
             assert way[0].num_reg_images() == 9

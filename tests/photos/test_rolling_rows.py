@@ -60,8 +60,8 @@ def test_the_readout_is_found_and_poses_with_it(readout, better):
         scale, R, t = umeyama(centres, truth)
         return float((scale * centres @ R.T + t - truth).norm(dim=1).mean())
 
-    adjust_free(model, {1}, 1)
-    found, unsure = with_rows_at_once(model, times, lambda some: adjust_free(some, {1}, 1))
+    adjust_free(model, {1})
+    found, unsure = with_rows_at_once(model, times, lambda some: adjust_free(some, {1}))
     assert off(found) * better <= off(model)
     assert off(found) < 4e-4
     assert unsure.shape == (FRAMES,)

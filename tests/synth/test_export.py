@@ -14,12 +14,12 @@ from geogs.io.pose_files import read_poses
 from geogs.io.sources.sniff import open_source
 from geogs_synth.camera.flaws import Flaws, camera_flaws
 from geogs_synth.cli import main
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.replica_files import write_sequence
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
 FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 3

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
 from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.scene.textured_scene import Scene
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
 

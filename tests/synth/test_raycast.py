@@ -9,7 +9,6 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth_maps import normals_from_depth
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.raycast.solid_kernels import crossing
@@ -18,6 +17,7 @@ from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.scene_mesh import scene_mesh
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
 CAMERA = Camera(70.0, 72.0, 40.3, 29.1, 80, 60)

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.motion.handheld import FRAMES_PER_LAP
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
 
@@ -124,11 +125,6 @@ def test_longer_paths_begin_with_shorter_ones(room: Scene) -> None:
     short, long = handheld_trajectory(room, 50), handheld_trajectory(room, 130)
     np.testing.assert_array_equal(short, long[:50])
     assert not np.allclose(short, handheld_trajectory(room, 50, seed=9))
-
-
-def test_path_needs_a_frame(room: Scene) -> None:
-    with pytest.raises(InputError, match="at least 1 frame"):
-        handheld_trajectory(room, 0)
 
 
 def test_path_in_a_crowded_room_is_refused() -> None:

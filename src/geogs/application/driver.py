@@ -15,7 +15,6 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation
 from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result, Written
 from geogs.application.results.surfaces import write_depth_mesh
 from geogs.application.results.write import write_files
@@ -28,6 +27,7 @@ from geogs.io.writers.replacement import replaced
 from geogs.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
+    from geogs.application.results.mapped_scene import MappedScene
     from geogs.reconstruction import Reconstruction
 
 
@@ -44,7 +44,7 @@ class Outcome(Enum):
 class Work(ABC):
     """Poses and a map from a source: what differs between the commands."""
 
-    scene: MappedScene
+    scene: "MappedScene"
     """What is written, once the work has ended."""
     source: Source | PosedSource
     """What it was made from."""

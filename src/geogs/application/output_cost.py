@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
-from geogs.application.results.result_page import write_report
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views
-from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.mapping.time_budget import OutputCost
-from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume
+from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.reconstruction import Reconstruction
 
 _log = logging.getLogger(__name__)
@@ -149,6 +148,7 @@ def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
 
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehearsal:
     start, mesh, blocks, triangles = clock(), None, 0, 0
+    config = replace(scene.config.mesh, min_weight=min(scene.config.mesh.min_weight, ONE_VIEW))
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
         renders = scene.depth_maps(of=views)
         write_keyframes(Path(folder), scene, scene.camera, renders, True)
@@ -156,18 +156,14 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
         try:
             plan = plan_volume(fusion_views(renders), scene.config.mesh)
             blocks, triangles = plan.blocks, plan.triangles
-            mesh = extract_mesh(fusion_views(renders), _coarse(scene.config.mesh, plan), times)
+            coarse = replace(config, voxel=COARSER * plan.voxel)
+            mesh = extract_mesh(fusion_views(renders), coarse, times)
         except InputError:  # these views show no surface: the others may
             times("merge", 1, 1)
         fused = clock()
-        write_report(Path(folder) / "report", scene.trajectory(), renders, mesh, {})
+        write_pictures(Path(folder) / "report", scene.trajectory(), renders)
+        write_page(Path(folder) / "report", scene.trajectory(), renders, mesh, {})
         report = clock() - fused
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
     surface = times.seconds.get("surface", 0.0)
     return _Rehearsal(report, of_views / len(views), surface, blocks, triangles)
-
-
-def _coarse(config: MeshConfig, plan: VolumePlan) -> MeshConfig:
-    """How the surface of a few views is made, in place of what was planned."""
-    lenient = min(config.min_weight, ONE_VIEW)
-    return replace(config, voxel=COARSER * plan.voxel, min_weight=lenient)

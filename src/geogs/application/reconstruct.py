@@ -4,7 +4,6 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -140,43 +139,28 @@ def reconstruct_to_folder(
         if not settings.resume:
             wanted = free_folder(wanted, source.fingerprint())
     end = None if settings.budget is None else begin + settings.budget
-    planned = _Planned(progress, config, device, end)
+
+    def plan(views: int, size: tuple[int, int], before: Mapping[str, float]) -> None:
+        """Tell what is going to be done, as soon as it is known."""
+        progress.plan(PosedPlan(config, views, size, device.type == "cuda", before, end))
+
+    def finding_poses(photographs: int, stages: Mapping[str, float]) -> None:
+        edge = config.input.long_edge or RECORDED
+        plan(photographs, (edge, 3 * edge // 4), stages)
+
     with claimed(settings.output or wanted) as output, compiling(device) as kernels:
         if finds_poses:
             with stop:
                 source = open_photographs(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
-                    stop, settings.budget, planned.finding_poses,
+                    stop, settings.budget, finding_poses,
                 )  # fmt: skip
         begin += _compiled(device, kernels, settings.budget, progress)
-        planned.mapping(source)
+        plan(len(source), (source.camera.width, source.camera.height), {})
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)
         return driver.complete(MappedImages(scene, source, settings))
-
-
-@dataclass(frozen=True)
-class _Planned:
-    """Tells ``progress`` what a reconstruction is going to do, as soon as it is known."""
-
-    progress: RunProgress
-    config: ReconstructConfig
-    device: torch.device
-    end: float | None
-
-    def finding_poses(self, photographs: int, stages: Mapping[str, float]) -> None:
-        """With the poses to be found, in so many seconds by stage."""
-        edge = self.config.input.long_edge or RECORDED
-        self._tell(photographs, (edge, 3 * edge // 4), stages)
-
-    def mapping(self, source: PosedSource) -> None:
-        """With the poses known."""
-        self._tell(len(source), (source.camera.width, source.camera.height), {})
-
-    def _tell(self, views: int, size: tuple[int, int], before: Mapping[str, float]) -> None:
-        on_gpu = self.device.type == "cuda"
-        self.progress.plan(PosedPlan(self.config, views, size, on_gpu, before, self.end))
 
 
 class MappedImages(Work):

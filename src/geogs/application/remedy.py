@@ -37,9 +37,10 @@ def remedy(
     again = f", in about {duration(took)}" if took else ""
     if not _was_placed(settings, source):
         install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
+        plan = offline_plan(settings.config, source, False, False, is_begun=True)
         return (
             f"{install}{command} --offline places the frames by structure from motion, in about "
-            f"{duration(seconds_offline(settings, source))}."
+            f"{duration(sum(plan.seconds(0).values()))}."
         )
     if settings.map is not None:
         return f"{command} makes a map of its own{again}."
@@ -60,12 +61,6 @@ def arguments(settings: RunSettings) -> str:
         if (value := getattr(given, option)) != getattr(usual, option):
             words += [f"--{option}", str(value)]
     return shlex.join(words)
-
-
-def seconds_offline(settings: RunSettings, source: Source) -> float:
-    """About how long a run takes that places frames by structure from motion."""
-    plan = offline_plan(settings.config, source, False, False, is_begun=True)
-    return sum(plan.seconds(0).values())
 
 
 def _was_placed(settings: RunSettings, source: Source) -> bool:

@@ -7,10 +7,7 @@ from pathlib import Path
 
 from geogs.application.calibrate import self_calibrated, with_shutter_found
 from geogs.application.checkpoints.checkpoint import has_checkpoint
-from geogs.application.checkpoints.run_state import (
-    RunMetadata,
-    SavedRun,
-)
+from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import compiling

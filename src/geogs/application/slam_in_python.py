@@ -13,7 +13,7 @@ from geogs.application.results.output_folder import claimed
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.write import write_config
-from geogs.config import Config, InputConfig
+from geogs.config import Config
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.frame_source import Source
@@ -52,7 +52,7 @@ def track(
         DeviceError: the device cannot be used.
     """
     settings = config or (Config() if slam is None else slam.config)
-    stream = _opened(source, settings.input)
+    stream = source if isinstance(source, Source) else open_source(source, settings.input)
     if slam is None:
         if stream is not source:
             stream = self_calibrated(stream, settings, require_device(device))
@@ -63,12 +63,6 @@ def track(
         )  # fmt: skip
     for frame in stream:
         yield slam.process(frame)
-
-
-def _opened(source: str | Path | Sequence[str | Path] | Source, config: InputConfig) -> Source:
-    if isinstance(source, str | Path):
-        return open_source(source, config)
-    return open_source(source, config) if isinstance(source, Sequence) else source
 
 
 @on_one_torch_thread

@@ -88,7 +88,7 @@ class CpuDepthEngine:
         asked: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, "2 h w"]:
         """As in the protocol."""
-        from geogs.depth.revision.photo_vote_cpu import photo_costs
+        from geogs.depth.revision.photo_vote import photo_costs
 
         return photo_costs(view, others, depths, same, self.render, asked)
 
@@ -96,6 +96,6 @@ class CpuDepthEngine:
         self, depth: Float[Tensor, "h w"], reach: int, apart: float
     ) -> Float[Tensor, "h w"]:
         """As in the protocol."""
-        from geogs.depth.revision.far_side import compiled_surface
+        from geogs.depth.revision.far_side import farther_surface
 
-        return compiled_surface(depth, reach, apart)
+        return farther_surface(depth, reach, apart)

@@ -1,5 +1,6 @@
 """What the mapper asks of whatever finds keyframe depths."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -7,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
+from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""
@@ -92,3 +94,23 @@ class AlternativeSearch:
     ) -> list[DenseDepth]:
         """As in the protocol."""
         return self.classical.check(depths, others)
+
+
+class RevisedSearch(AlternativeSearch, ABC):
+    """Another engine's search, of which each depth is looked at once more by itself."""
+
+    def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
+        """As in the protocol."""
+        searched = self.classical.estimate(tasks, progress)
+
+        def one(pair: tuple[DepthTask, DenseDepth]) -> DenseDepth:
+            task, found = pair
+            return self.revised(task.view, task.neighbours, found)
+
+        return thread_map(one, list(zip(tasks, searched, strict=True)))
+
+    @abstractmethod
+    def revised(
+        self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
+    ) -> DenseDepth:
+        """What is made of the depth of a view that was matched with some others."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
@@ -150,6 +150,13 @@ def depth_images(
     return small, cv2.GaussianBlur(grey, (0, 0), 0.7)
 
 
+def relative_poses(
+    reference: DepthView, neighbours: Sequence[DepthView]
+) -> Float[np.ndarray, "n 4 4"]:
+    """What takes the reference's frame to the neighbours'."""
+    return np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+
+
 def homographies(
     reference: DepthView, neighbours: Sequence[DepthView], source: Camera, target: Camera
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]:
@@ -157,7 +164,7 @@ def homographies(
     a p + rho b (homogeneous) in each neighbour's ``target`` camera.
     """
     k, back = target.matrix().numpy(), np.linalg.inv(source.matrix().numpy())
-    relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+    relative = relative_poses(reference, neighbours)
     return k @ relative[:, :3, :3] @ back, relative[:, :3, 3] @ k.T
 
 

@@ -21,42 +21,31 @@ def depth_engine(
 
     Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
-    classical = FarSideSearch(_classical(device, render, working, config, resident))
-    engine = config.engine
+    device, engine = torch.device(device), config.engine
+    if device.type == "cuda":
+        from geogs.depth.cuda.classical import CudaDepthEngine
+
+        classical = FarSideSearch(CudaDepthEngine(device, render, working, resident, config.planes))
+    else:
+        from geogs.depth.classical import CpuDepthEngine
+
+        classical = FarSideSearch(CpuDepthEngine(render, working, config.planes))
     if engine == "auto":
-        engine = "joint" if torch.device(device).type == "cuda" else "classical"
+        engine = "joint" if device.type == "cuda" else "classical"
     if engine == "classical":
         return SkySearch(classical)
     if engine == "tracker":
         from geogs.depth.tracker_depth import TrackerDepthEngine
 
-        return TrackerDepthEngine(classical, torch.device(device), render, working)
+        return TrackerDepthEngine(classical, device, render, working)
     from geogs.depth.network.engine import NetworkDepthEngine
     from geogs.depth.network.model import load_depth_network
     from geogs.networks.weights_files import find_weights
 
     trained = load_depth_network(find_weights("depth", config.weights))
-    network = NetworkDepthEngine(
-        trained, classical, torch.device(device), render, working, resident
-    )
+    network = NetworkDepthEngine(trained, classical, device, render, working, resident)
     if engine == "network":
         return SkySearch(network)
     from geogs.depth.network.joint import JointDepthEngine
 
     return SkySearch(JointDepthEngine(network, classical))
-
-
-def _classical(
-    device: torch.device | str,
-    render: Camera,
-    working: Camera,
-    config: DepthConfig,
-    resident: int,
-) -> DepthEngine:
-    if torch.device(device).type == "cuda":
-        from geogs.depth.cuda.classical import CudaDepthEngine
-
-        return CudaDepthEngine(torch.device(device), render, working, resident, config.planes)
-    from geogs.depth.classical import CpuDepthEngine
-
-    return CpuDepthEngine(render, working, config.planes)

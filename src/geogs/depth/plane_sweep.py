@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from geogs.depth import plane_sweep_kernels as kernels
-from geogs.depth.depth_view import DepthView, homographies
+from geogs.depth.depth_view import DepthView, homographies, relative_poses
 from geogs.depth.sampling_kernels import pixel_pairs
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
@@ -70,7 +70,7 @@ def sweep_planes(
     rays = np.concatenate([pixels / [camera.fx, camera.fy], np.ones((len(pixels), 1))], 1)
     shifts = [0.0]
     if neighbours:
-        relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+        relative = relative_poses(reference, neighbours)
         rotated = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
         ends = [rotated + relative[:, None, :3, 3] / z for z in (near, far)]
         seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1

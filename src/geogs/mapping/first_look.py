@@ -127,9 +127,9 @@ class _Look:
     """A small view swept around a distance."""
 
     reference: DepthView
+    mask: Bool[np.ndarray, "h w"]
     neighbours: list[DepthView]
     distance: float
-    mask: Bool[np.ndarray, "h w"]
 
 
 class _FirstLook:
@@ -153,7 +153,7 @@ class _FirstLook:
         """Clear matches of images around distances; none where neighbours are not well placed."""
         matched = {task: self._matched_at(*task) for task in tasks}
         looks = {
-            (i, d): _Look(self._view(i), [self._view(k) for k in others], d, self._mask(i))
+            (i, d): _Look(*self._read(i), [self._read(k)[0] for k in others], d)
             for (i, d), others in matched.items()
             if others
         }
@@ -166,7 +166,7 @@ class _FirstLook:
 
     def pixels(self, images: Sequence[int]) -> int:
         """Pixels of some images that count."""
-        return sum(int(self._mask(i).sum()) for i in images)
+        return sum(int(self._read(i)[1].sum()) for i in images)
 
     def _read(self, index: int) -> tuple[DepthView, Bool[np.ndarray, "h w"]]:
         if index not in self._small:
@@ -182,12 +182,6 @@ class _FirstLook:
             view = DepthView(place.id, place.T_cw, grey, grey, colours, unknown, unknown)
             self._small[index] = (view, inside)
         return self._small[index]
-
-    def _view(self, index: int) -> DepthView:
-        return self._read(index)[0]
-
-    def _mask(self, index: int) -> Bool[np.ndarray, "h w"]:
-        return self._read(index)[1]
 
     def _matched_at(self, index: int, distance: float) -> list[int]:
         """Images to match one with at a distance; none where none is well placed for it."""

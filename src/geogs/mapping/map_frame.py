@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.limits import Positive
-from geogs.types import MapSnapshot, RenderedKeyframe
+from geogs.types import MapSnapshot
 
 # Cameras whose distances make the unit, at most.
 _SAMPLED_CAMERAS = 8
@@ -61,12 +61,6 @@ class MapFrame:
         origin = torch.from_numpy(self.origin).to(disks.position)
         position = (disks.position - origin) / self.unit
         return replace(disks, position=position, scale=disks.scale / self.unit)
-
-    def world_render(
-        self, render: RenderedKeyframe, T_cw: Float[Tensor, "4 4"]
-    ) -> RenderedKeyframe:
-        """A rendering of the map with its depth in world units; ``T_cw`` is its pose there."""
-        return replace(render, depth=render.depth * self.unit, T_cw=T_cw)
 
 
 WORLD = MapFrame(np.zeros(3), 1.0)

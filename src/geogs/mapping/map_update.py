@@ -11,7 +11,6 @@ moves every disk with all keyframes that see it where it lies
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -31,18 +30,6 @@ STILL = 1e-3
 """An anchor has moved if its disks do by more than this part of their distance to its camera."""
 DESCRIBED = 0.5
 """Part of the correction of revisited disks that one Sim(3) may leave where others stay behind."""
-
-
-@dataclass(frozen=True)
-class MapUpdate:
-    """How each disk moves, and how well one Sim(3) described it."""
-
-    transform: Float[Tensor, "n 4 4"]
-    """World similarity of each disk, float64."""
-    correction: float
-    """Root mean square distance between positions and targets, map units."""
-    residual: float
-    """Root mean square distance between targets and where the update puts the disks."""
 
 
 def covisible_keyframe(view: MapView, correction: PoseCorrection) -> CovisibleKeyframe:
@@ -82,8 +69,9 @@ def plan_update(
     correction: PoseCorrection,
     strategy: Strategy = "blended",
     covisible: Iterable[CovisibleKeyframe] = (),
-) -> MapUpdate:
-    """The similarity of every disk for a pose correction, computed where the disks live.
+) -> Float[Tensor, "n 4 4"]:
+    """The world similarity (float64) of every disk for a pose correction, computed where the disks
+    live.
 
     Disks whose anchor is not in the correction follow the corrected keyframe nearest in time.
     ``per_keyframe`` moves each with its anchor, ``coherent`` those whose anchors move by the one
@@ -92,20 +80,19 @@ def plan_update(
     neighbours; those that the correction does not have count for nothing.
     """
     if len(position) == 0:
-        return MapUpdate(torch.zeros(0, 4, 4, dtype=torch.float64), 0.0, 0.0)
+        return torch.zeros(0, 4, 4, dtype=torch.float64)
     ids, similarities = anchor_transforms(correction)
     slot = _nearest_in_time(ids, anchor.cpu()).to(position.device)
     own = similarities.to(position.device)[slot]
     x = position.detach().double()
     target = apply_each(own, x)
-    S = own
     if strategy == "coherent":
-        S = coherent_similarities(x, target, own, _revisited(x, target, slot, correction))
-    elif strategy == "blended" and (fit := _fit_similarity(x, target)) is not None:
+        return coherent_similarities(x, target, own, _revisited(x, target, slot, correction))
+    if strategy == "blended" and (fit := _fit_similarity(x, target)) is not None:
         known = {int(i): n for n, i in enumerate(ids)}
         seen = ((k, known[k.keyframe_id]) for k in covisible if k.keyframe_id in known)
-        S = blended_similarities(x, own, fit, similarities, seen)
-    return MapUpdate(S, _rms(target - x), _rms(target - apply_each(S, x)))
+        return blended_similarities(x, own, fit, similarities, seen)
+    return own
 
 
 def coherent_similarities(

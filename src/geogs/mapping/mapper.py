@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from geogs.mapping.disk_growth import DiskGrowth
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.map_frame import WORLD, MapFrame
-from geogs.mapping.map_update import MapUpdate, covisible_keyframe, plan_update
+from geogs.mapping.map_update import covisible_keyframe, plan_update
 from geogs.mapping.partners import Partners
 from geogs.mapping.rendered import (
     MapRenderer,
@@ -26,7 +27,7 @@ from geogs.mapping.rendered import (
 )
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mapping.training.full import FullTraining
-from geogs.mapping.training.map_trainer import MapTrainer, draw_batch, draw_views
+from geogs.mapping.training.map_trainer import draw_batch, draw_views
 from geogs.mapping.training.trainer_choice import map_trainer
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
 from geogs.on_demand import OnDemand
@@ -35,6 +36,9 @@ from geogs.world.archive import Archive
 from geogs.world.disks import DiskParameters
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.map import MapTable, TrainingPlace, check_map
+
+if TYPE_CHECKING:
+    from geogs.mapping.training.trainer_choice import MapTrainer
 
 CARVE_EVERY = 10
 """Keyframes between votes of all keyframes around against disks in free space: bounds the time."""
@@ -93,7 +97,7 @@ class Mapper:
         """Called between the parts of the work on a keyframe, where others may go first."""
 
     @property
-    def trainer(self) -> MapTrainer:
+    def trainer(self) -> "MapTrainer":
         """What changes the disks, once a keyframe is mapped."""
         if self._trainer is None:
             if self.table.unit is None:
@@ -191,22 +195,18 @@ class Mapper:
         for i, T_cw in poses.items():
             self.keyframes[i].T_cw = T_cw
 
-    def correct(self, correction: PoseCorrection) -> MapUpdate:
+    def correct(self, correction: PoseCorrection) -> None:
         """Move the map with a global correction that the keyframes have taken over."""
         views = [v for v in self.views.values() if v.has_depth]
         views = views[:: 1 + len(views) // _COVISIBLE]
         disks = self.table.disks
-        update = plan_update(
-            disks.position,
-            disks.keyframe_id,
-            correction,
-            self.config.ablation.map_update,
+        moves = plan_update(
+            disks.position, disks.keyframe_id, correction, self.config.ablation.map_update,
             (covisible_keyframe(v, correction) for v in views),
-        )
+        )  # fmt: skip
         if len(disks):
-            disks.transform(update.transform)
+            disks.transform(moves)
             self.trainer.forget_renders(self.views.values())
-        return update
 
     # --- all keyframes at once -------------------------------------------------------------
 

@@ -77,7 +77,8 @@ class Mesh(ShortRepr):
             InputError: it ends otherwise.
             OutputError: it cannot be written.
         """
-        from geogs.io.writers.exports.mesh_writers import write_glb, write_obj
+        from geogs.io.writers.atomic import atomic_file
+        from geogs.io.writers.exports.mesh_writers import glb, write_obj
         from geogs.io.writers.ply_writer import write_mesh
 
         path = expanded(path)
@@ -86,7 +87,8 @@ class Mesh(ShortRepr):
                 write_mesh(path, self.vertices, self.faces, self.colours, self.normals)
             case ".glb":
                 mesh = self.creased()
-                write_glb(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
+                with atomic_file(path) as stream:
+                    stream.write(glb(mesh.vertices, mesh.faces, mesh.normals, mesh.colours))
             case ".obj":
                 write_obj(path, self.vertices, self.faces, self.normals, self.colours)
             case _:

@@ -14,6 +14,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
 from geogs_bench.appearance.training_views import TrainingView
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
+from geogs_photos.incremental_mapping import of_poses
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.pycolmap_library import load_colmap
@@ -61,9 +62,7 @@ def find_start_points(
     with tempfile.TemporaryDirectory(prefix="geogs-points-") as folder:
         database = Path(folder) / "database.db"
         write_database(database, shared, entries)
-        match_pairs(
-            database, entries, pairs, seed, worker_count(), lambda f: progress("matching", f)
-        )
+        match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
         model = _triangulated(database, views, seed)
     positions = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     inside = in_visual_hull(views, positions)
@@ -96,17 +95,7 @@ def in_visual_hull(
 def _triangulated(database: Path, views: Sequence[TrainingView], seed: int) -> Any:
     """The reconstruction of the images of a database, in their order, with the views' poses."""
     colmap = load_colmap()
-    opened = colmap.Database.open(database)
-    try:
-        cameras, images = opened.read_all_cameras(), opened.read_all_images()
-    finally:
-        opened.close()
-    model = colmap.Reconstruction()
-    for camera in cameras:
-        model.add_camera_with_trivial_rig(camera)
-    for image in images:
-        pose = colmap.Rigid3d(views[image.image_id - 1].T_cw[:3])
-        model.add_image_with_trivial_frame(image, pose)
+    model, _ = of_poses(database, {n: view.T_cw for n, view in enumerate(views, 1)})
     options = colmap.IncrementalPipelineOptions(
         num_threads=worker_count(), random_seed=seed, extract_colors=False
     )

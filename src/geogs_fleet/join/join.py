@@ -11,14 +11,14 @@ import numpy as np
 import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
-from geogs.application.results.result_page import write_report
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import lost_spans
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.map_file import load_map_file
-from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.ply_writer import write_splats
 from geogs.io.writers.replacement import replaced
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.stopwatch import Stopwatch
@@ -117,7 +117,7 @@ class _Join:
             mesh = joint_mesh(space, self.config.mesh, self.workers, self.device)
         except InputError:
             return None
-        write_mesh(self.output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(self.output / "mesh.ply")
         self._write_splats(disks, space)
         return mesh
 
@@ -229,9 +229,9 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     }
     write_summary(join.output, summary)
     written = load_result(join.output, join.device)
-    write_report(
-        join.output / "report", trajectory, written.keyframes, mesh, summary, written.disks
-    )
+    report, renders = join.output / "report", written.keyframes
+    write_pictures(report, trajectory, renders)
+    write_page(report, trajectory, renders, mesh, summary, written.disks)
     names = tuple(parts[n].name for n in gauge.parts)
     return Joint(join.output, names, tuple(unjoined), len(gauge.links), summary)
 

@@ -33,28 +33,22 @@ class Flaws(Settings, group="flaws"):
     """Radial distortion, OpenCV's second coefficient."""
 
 
-_PHONE = Flaws(
-    readout=0.02, exposure=0.01, noise=2.0, gain_drift=0.3, colour_drift=0.04, vignetting=0.25,
-    jpeg=88, k1=0.06, k2=-0.1,
-)  # fmt: skip
-_KINECT = Flaws(
-    readout=0.027, exposure=0.016, noise=3.0, gain_drift=0.3, colour_drift=0.06, vignetting=0.15,
-    jpeg=85, k1=0.1, k2=-0.2,
-)  # fmt: skip
-_ACTION = Flaws(
-    readout=0.012, exposure=0.005, noise=2.5, gain_drift=0.4, colour_drift=0.04, vignetting=0.45,
-    jpeg=80, k1=-0.25, k2=0.06,
-)  # fmt: skip
+_TYPICAL: dict[CameraKind, Flaws] = {
+    "phone": Flaws(
+        readout=0.02, exposure=0.01, noise=2.0, gain_drift=0.3, colour_drift=0.04, vignetting=0.25,
+        jpeg=88, k1=0.06, k2=-0.1,
+    ),
+    "kinect": Flaws(
+        readout=0.027, exposure=0.016, noise=3.0, gain_drift=0.3, colour_drift=0.06,
+        vignetting=0.15, jpeg=85, k1=0.1, k2=-0.2,
+    ),
+    "action": Flaws(
+        readout=0.012, exposure=0.005, noise=2.5, gain_drift=0.4, colour_drift=0.04,
+        vignetting=0.45, jpeg=80, k1=-0.25, k2=0.06,
+    ),
+}  # fmt: skip
 
 
 def camera_flaws(kind: CameraKind) -> Flaws:
     """The flaws of a phone, of a depth sensor's colour camera, of an action camera, or none."""
-    match kind:
-        case "phone":
-            return _PHONE
-        case "kinect":
-            return _KINECT
-        case "action":
-            return _ACTION
-        case _:
-            return Flaws()
+    return _TYPICAL.get(kind, Flaws())

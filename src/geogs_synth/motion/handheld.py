@@ -23,18 +23,6 @@ _SHAKE_METRES = 0.004
 _SHAKE_RADIANS = np.radians(0.3)
 
 
-def handheld_trajectory(
-    scene: Scene, frames: int, seed: int = 0, frames_per_lap: int = FRAMES_PER_LAP
-) -> Float64[np.ndarray, "n 4 4"]:
-    """Camera-to-world poses of :class:`HandheldPath` at 30 frames a second.
-
-    The same seed gives the same path, however many frames are asked for.
-    """
-    if frames < 1:
-        raise InputError(f"a sequence needs at least 1 frame, not {frames}")
-    return HandheldPath(scene, seed, frames_per_lap).at_frames(np.arange(frames))
-
-
 class HandheldPath:
     """A walk around the middle of a room, looking across it.
 

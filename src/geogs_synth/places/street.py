@@ -21,16 +21,12 @@ _WIDTH, _HEIGHT = 46.0, 18.0
 _BEND, _BEND_LENGTH = 5.0, 170.0
 _ROAD_HALF, _PAVEMENT = 4.5, 2.6
 _SECTION = 8.0
-_START = 14.0
+START = 14.0
+"""Distance along the street of the first frame, in metres."""
 _SPEED, _SPEED_WAVE, _SPEED_PERIOD = 10.0, 4.0, 12.0
 _EYE_HEIGHT = 1.65
 _SUN = (-60.0, -120.0, 240.0)
 _STREET_STREAM, _DRIVE_STREAM = 0x57E, 0xD71
-
-
-def middle_line(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 2"]:
-    """The middle of the road, a gentle wave, at distances along the street in metres."""
-    return np.column_stack([x, _WIDTH / 2 + _BEND * np.sin(2 * np.pi * x / _BEND_LENGTH)])
 
 
 def heading(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
@@ -39,9 +35,10 @@ def heading(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
 
 
 def on_road(x: Float64[np.ndarray, "n"], left: Float64[np.ndarray, "n"]) -> np.ndarray:
-    """n x 2 points ``left`` metres beside the middle of the road."""
+    """n x 2 points ``left`` metres beside the middle of the road, a gentle wave, at x along it."""
     yaw = heading(x)
-    return middle_line(x) + left[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    middle = np.column_stack([x, _WIDTH / 2 + _BEND * np.sin(2 * np.pi * x / _BEND_LENGTH)])
+    return middle + left[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], 1)
 
 
 def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
@@ -71,7 +68,7 @@ def drive(seed: int = 0) -> Motion:
     phases = rng.uniform(0, 2 * np.pi, 5)
 
     def path(times: np.ndarray) -> np.ndarray:
-        x = _START + driven(times, seed)
+        x = START + driven(times, seed)
         left = LANE + 0.2 * np.sin(2 * np.pi * x / 47 + phases[0])
         bounce = np.sin(2 * np.pi * 1.4 * times + phases[1])
         height = _EYE_HEIGHT + 0.012 * bounce
@@ -91,11 +88,6 @@ def driven(times: Float64[np.ndarray, "n"], seed: int) -> Float64[np.ndarray, "n
     rate = 2 * np.pi / _SPEED_PERIOD
     wave = np.cos(phase) - np.cos(rate * times + phase)
     return _SPEED * times + _SPEED_WAVE / rate * wave
-
-
-def start_of_drive() -> float:
-    """Distance along the street of the first frame, in metres."""
-    return _START
 
 
 def _seconds_of_drive(seed: int) -> float:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from geogs.geometry.camera import Camera
-from geogs_synth.places.street import LANE, LENGTH, driven, heading, on_road, start_of_drive
+from geogs_synth.places.street import LANE, LENGTH, START, driven, heading, on_road
 from geogs_synth.places.vehicles import (
     VAN_HEIGHT,
     VAN_LENGTH,
@@ -47,7 +47,7 @@ def _follows(gap: float, seed: int) -> Path:
 
     def path(times: np.ndarray) -> np.ndarray:
         away = gap * (1 + _GAP_WAVE * np.sin(2 * np.pi * times / _GAP_PERIOD))
-        x = start_of_drive() + driven(times, seed) + away
+        x = START + driven(times, seed) + away
         return _placed(x, LANE, 0.0)
 
     return path

@@ -67,19 +67,15 @@ def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -
             kind, f"procedural street, seed {seed}", seed, scene, drive(seed),
             width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
         )  # fmt: skip
-    if kind == "dining":
-        return Location(
-            kind, f"procedural dining room, seed {seed}", seed, scene,
-            room_motion("handheld", scene, seed),
-            width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
-        )  # fmt: skip
     if kind == "corridor":
         return Location(
             kind, f"procedural corridor, seed {seed}", seed, scene, walk(scene, seed),
             width=320, height=240, focal=ROOM_FOCAL, depth_scale=2000.0, voxel_cm=2, reach=15.0,
         )  # fmt: skip
+    motion = room_motion("handheld" if kind == "dining" else kind, scene, seed)
+    room = "dining room" if kind == "dining" else "room"
     return Location(
-        kind, f"procedural room, seed {seed}", seed, scene, room_motion(kind, scene, seed),
+        kind, f"procedural {room}, seed {seed}", seed, scene, motion,
         width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
     )  # fmt: skip
 

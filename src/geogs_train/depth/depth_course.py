@@ -52,18 +52,18 @@ class DepthCourse:
         self._held_out: DepthValidation | None = None
 
     def network(self) -> DepthNetwork:
-        """As in the protocol."""
+        """With random weights, on the CPU."""
         return DepthNetwork(self.options.network)
 
     def compile(self, network: DepthNetwork) -> None:
-        """As in the protocol: what sees batches of one size, whatever the number of neighbours."""
+        """What sees batches of one size, whatever the number of neighbours."""
         for part in (network.context, network.body):
             part.compile(dynamic=False)
 
     @torch.no_grad()
     def batch(self, step: int, progress: float) -> DepthBatch:
-        """As in the protocol; the size of the images and the number of neighbours are those of all
-        workers."""
+        """The size of the images, by the fraction of the run that is done, and the number of
+        neighbours are those of all workers."""
         options, device = self.options, self.worker.device
         small = progress < options.small
         if not small:
@@ -79,11 +79,11 @@ class DepthCourse:
         return replace(batch, progress=progress)
 
     def loss(self, network: DepthNetwork, batch: DepthBatch) -> Float[Tensor, ""]:
-        """As in the protocol."""
+        """Nothing random."""
         return depth_loss(network(batch.views), batch, self.options.loss)
 
     def examination(self, batches: int) -> DepthValidation:
-        """As in the protocol."""
+        """The validation set."""
         found = DepthValidation(self.options, self.worker.device, batches)
         count = min(batches, CALIBRATION_BATCHES)
         self._held_out = DepthValidation(
@@ -92,11 +92,12 @@ class DepthCourse:
         return found
 
     def load(self, path: Path) -> DepthNetwork:
-        """As in the protocol."""
+        """The network of a file of weights."""
         return load_depth_network(path).requires_grad_(True)
 
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
-        """As in the protocol; calibrated on rooms that neither training nor validation show."""
+        """Write weights as they are shipped; calibrated on rooms that neither training nor
+        validation show."""
         assert self._held_out is not None  # by the examination
         calibration = calibrated(DepthErrors.join(self._held_out.errors(network)))
         write_weights(network, path, step, scores=scores, calibration=calibration)

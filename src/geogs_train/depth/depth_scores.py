@@ -31,8 +31,8 @@ class DepthErrors:
     @staticmethod
     def join(parts: "list[DepthErrors]") -> "DepthErrors":
         """All pixels of several batches."""
-        names = ("error", "deviation", "outlier", "angle", "kind")
-        return DepthErrors(*(torch.cat([getattr(p, n) for p in parts]) for n in names))
+        rows = zip(*(vars(part).values() for part in parts), strict=True)
+        return DepthErrors(*map(torch.cat, rows))
 
 
 @dataclass(frozen=True)

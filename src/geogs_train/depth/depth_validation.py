@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from geogs.depth.network.model import DepthNetwork
@@ -69,13 +69,7 @@ def pixel_errors(
 ) -> DepthErrors:
     """Errors of some of the pixels of a batch."""
     error = (found.depth(batch.views.typical) / batch.depth).log()
-    angle = angle_between(found.normal, batch.normal)
+    cosine = (found.normal * batch.normal).sum(1)
+    angle = torch.rad2deg(cosine.clamp(-1, 1).arccos())
     columns = (error, found.deviation(), found.outlier.sigmoid(), angle, kind)
     return DepthErrors(*(c[:, ::EVERY, ::EVERY].flatten() for c in columns))
-
-
-def angle_between(
-    first: Float[Tensor, "b 3 h w"], second: Float[Tensor, "b 3 h w"]
-) -> Float[Tensor, "b h w"]:
-    """Degrees."""
-    return torch.rad2deg((first * second).sum(1).clamp(-1, 1).arccos())

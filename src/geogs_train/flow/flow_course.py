@@ -26,7 +26,9 @@ class FlowCourse:
     """Every step films other rooms."""
 
     recordable = True
+    """Whether loss and gradients may be recorded as a CUDA graph."""
     weights = "flow.safetensors"
+    """Name of the file of trained weights."""
     curves: Panels = (
         (
             "usual rooms: error, pixels",
@@ -49,17 +51,17 @@ class FlowCourse:
         self._plans = PlansAhead(self.rooms, options.batch, worker, LEAST_PROCESSES)
 
     def network(self) -> FlowNetwork:
-        """As in the protocol."""
+        """With random weights, on the CPU."""
         return FlowNetwork(self.options.network)
 
     def compile(self, network: FlowNetwork) -> None:
-        """As in the protocol."""
+        """The parts that are worth it."""
         network.encoder.compile(dynamic=False)
         network.update.compile(dynamic=False)
 
     def batch(self, step: int, progress: float) -> FlowBatch:
         """Every ordered pair of neighbouring views, from disturbed starts; all that is random is
-        drawn here."""
+        drawn here, the same whenever the step is asked for."""
         clips = self.rooms.film(self._plans.plan(step))
         generator = torch.Generator(self.worker.device)
         generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
@@ -72,15 +74,15 @@ class FlowCourse:
         return flow_loss(*found, batch, self.options)
 
     def examination(self, batches: int) -> SceneValidation:
-        """As in the protocol."""
+        """The validation set."""
         return SceneValidation(self.options, self.worker.device, batches)
 
     def load(self, path: Path) -> FlowNetwork:
-        """As in the protocol."""
+        """The network of a file of weights."""
         return load_flow_network(path)
 
     def export(self, network: FlowNetwork, path: Path, step: int, scores: SceneScores) -> None:
-        """As in the protocol."""
+        """Write weights as they are shipped."""
         write_weights(network, path, step, scores=scores)
 
     def close(self) -> None:

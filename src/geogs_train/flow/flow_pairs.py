@@ -1,7 +1,7 @@
 """Clips of rooms as what the flow network learns from: images, edges, truth, starts."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -37,13 +37,6 @@ class FlowBatch:
     start: Float[Tensor, "e p 2"]
     probe: Float[Tensor, "e p 2"]
     """Positions near the truth, where descriptors are asked to point to it."""
-
-    def to(self, device: torch.device) -> "FlowBatch":
-        """The same on a device."""
-        edges = Edges(self.edges.first.to(device), self.edges.second.to(device))
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        moved = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
-        return FlowBatch(edges=edges, **moved)
 
     @property
     def flow(self) -> Float[Tensor, "e h w 2"]:

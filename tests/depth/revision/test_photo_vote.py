@@ -13,25 +13,18 @@ from geogs.depth.cuda import photo_vote as cuda_photo_vote
 from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth
-from geogs.depth.revision.far_side import (
-    APART,
-    REACH,
-    FarSideSearch,
-    compiled_surface,
-    farther_surface,
-)
-from geogs.depth.revision.photo_vote import (
-    CONTRAST,
-    DEVIATIONS,
-    LEAST_DEVIATION,
-    RADIUS,
+from geogs.depth.revision import far_side
+from geogs.depth.revision.far_side import APART, REACH, FarSideSearch
+from geogs.depth.revision.photo_vote import CONTRAST, DEVIATIONS, LEAST_DEVIATION, RADIUS
+from geogs.geometry.camera import Camera
+from oracles.revision_reference import (
     averaged_by_colour,
     best_half,
+    farther_surface,
     photo_costs,
     seen_from,
     truncated,
 )
-from geogs.geometry.camera import Camera
 
 
 def test_grey_values_are_looked_up_as_a_loop_does():
@@ -179,7 +172,7 @@ def test_the_same_surfaces_go_on(seed, reach, where, monkeypatch):
         use_emulator(monkeypatch, cuda_far_side)
         found = cuda_far_side.farther_surface(depth, reach, APART)
     elif where == "cpu":
-        found = compiled_surface(depth, reach)
+        found = far_side.farther_surface(depth, reach, APART)
     elif torch.cuda.is_available():
         found = cuda_far_side.farther_surface(depth.cuda(), reach, APART).cpu()
     else:

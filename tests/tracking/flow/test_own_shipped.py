@@ -11,7 +11,7 @@ from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs_synth.motion.handheld import handheld_trajectory
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system

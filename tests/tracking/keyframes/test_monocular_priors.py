@@ -16,8 +16,8 @@ from geogs.priors.monocular_prior import DepthKind, PriorMaps
 from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
-from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
+from handheld_walk import handheld_trajectory
 from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system

@@ -30,9 +30,7 @@ from geogs.world.pack import pack, unpack
 
 S = TypeVar("S")
 
-_UNUSABLE = (
-    OSError, InputError, SafetensorError, MemoryError, RuntimeError, *UNUSABLE,
-)  # fmt: skip
+_UNUSABLE = (OSError, InputError, SafetensorError, MemoryError, RuntimeError, *UNUSABLE)
 """What reading a file may end with that somebody made up."""
 
 _MAX_TIME_FRACTION = 0.05

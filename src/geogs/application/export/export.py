@@ -19,7 +19,7 @@ from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.writers.exports.gsplat import write_gsplat_start
 from geogs.io.writers.exports.las import write_las
-from geogs.io.writers.exports.mesh_writers import write_glb, write_obj, write_textured_glb
+from geogs.io.writers.exports.mesh_writers import write_textured_glb
 from geogs.io.writers.ply_writer import write_points, write_splats
 from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_euroc, write_kitti, write_tum_trajectory
@@ -128,11 +128,8 @@ def _write_mesh(path: Path, result: SavedResult, settings: ExportSettings) -> No
     mesh = result.mesh
     if mesh is None:
         raise InputError(f"{result.folder} has no mesh.ply; geogs mesh {result.folder} makes it.")
-    if settings.to == "obj":
-        write_obj(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
-    elif not settings.textured:
-        mesh = mesh.creased()
-        write_glb(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
+    if settings.to == "obj" or not settings.textured:
+        mesh.save(path)
     else:
         result.require_images()
         views, tolerance = fusion_views(result.keyframes), TOLERANCE * median_edge(mesh)

@@ -62,7 +62,7 @@ def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None
     seen = seen_points(result.keyframes, result.camera, points)
     write_points(folder / "points.ply", seen.positions, seen.colours, seen.normals)
     path = folder / "transforms.json"
-    write_transforms(path, result.camera, images, masked, unit, "points.ply")
+    write_transforms(path, result.camera, images, masked, unit)
 
 
 def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "normals"]) -> None:

@@ -47,12 +47,10 @@ def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: in
     )  # fmt: skip
 
 
-def cloud(
-    keyframes: Sequence[RenderedKeyframe], spacing: float = 1.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cloud(keyframes: Sequence[RenderedKeyframe]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, normals and colours of the surface that all confident depths show.
 
-    Of the points in a cube with edges of ``spacing`` pixels at the median depth one is kept.
+    Of the points in a cube with edges of a pixel at the median depth one is kept.
 
     Raises:
         InputError: there is no depth, or a keyframe has no image.
@@ -62,7 +60,7 @@ def cloud(
     if not len(positions):
         raise InputError("The map shows no surface; there are no points to export.")
     depths = [k.depth[k.depth > 0].median() for k in keyframes if bool((k.depth > 0).any())]
-    edge = spacing * float(torch.stack(depths).median()) / keyframes[0].camera.fx
+    edge = float(torch.stack(depths).median()) / keyframes[0].camera.fx
     _, first = np.unique(np.floor(positions / edge).astype(np.int64), axis=0, return_index=True)
     first.sort()
     return positions[first], normals[first].astype(np.float32), colours[first]

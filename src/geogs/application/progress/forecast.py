@@ -4,8 +4,10 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from geogs.application.progress.plan import Plan
+if TYPE_CHECKING:
+    from geogs.application.progress.plan import Plan
 
 Clock = Callable[[], float]
 
@@ -47,7 +49,7 @@ class _Stage:
 class Forecast:
     """Seconds left of a command by what it has reported: one steady figure for all of it."""
 
-    def __init__(self, plan: Plan, clock: Clock = time.perf_counter) -> None:
+    def __init__(self, plan: "Plan", clock: Clock = time.perf_counter) -> None:
         self._plan, self._clock = plan, clock
         self._said_at = self._rest_began = clock()
         """The latter is when what finds poses had ended, if anything has to."""
@@ -65,7 +67,7 @@ class Forecast:
         that find poses, whose time depends on the pictures more than on the machine."""
         self._found = self._by_now()
 
-    def change(self, plan: Plan) -> None:
+    def change(self, plan: "Plan") -> None:
         """Something else is done from now on; the pace of the machine stays known."""
         now = self._clock()
         self._end_aside(now)

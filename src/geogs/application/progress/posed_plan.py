@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from geogs.application.progress.mesh_plan import mesh_seconds, mesh_stage
 from geogs.application.progress.run_plan import PIXELS
@@ -23,22 +24,8 @@ class PosedCosts:
     report: float
 
 
-# Two cores; and rendered at 800 pixels on an H200.
+# Rendered at 800 pixels on an H200; on a CPU two cores are the reference.
 ON_GPU = PosedCosts(1.0, 0.01, 0.02, 0.01, 0.006, 0.05, 3.0, 1.0)
-
-
-def on_cpu(rendered: float) -> PosedCosts:
-    """On a CPU, where maps have so many times the pixels of the reference."""
-    return PosedCosts(
-        first_look=2.0,
-        view=0.01,
-        searched_view=0.1 + 1.3 * rendered,
-        grown_view=0.03,
-        step=0.04 + 0.03 * rendered,
-        meshed_view=0.02 + 0.25 * rendered,
-        mesh=1.0,
-        report=0.6,
-    )
 
 
 @dataclass(frozen=True)
@@ -55,16 +42,13 @@ class PosedPlan:
     """Seconds of each stage before it, such as those that find the poses."""
     end: float | None = None
     """When it is to be done, by the performance counter, where a time is given."""
+    frames: ClassVar[int] = 0
+    """None is tracked."""
 
     @property
     def fixed(self) -> Collection[str]:
         """What finds the poses."""
         return self.before
-
-    @property
-    def frames(self) -> int:
-        """None is tracked."""
-        return 0
 
     def tracked(self, frames: int, keyframes: float | int) -> float:
         """No time."""
@@ -74,7 +58,11 @@ class PosedPlan:
         """Of each stage in its order."""
         (width, height), search = self.size, self.config.search
         smaller = min(self.config.mapping.render_long_edge / max(width, height), 1.0)
-        c = ON_GPU if self.on_gpu else on_cpu(width * height * smaller**2 / PIXELS)
+        rendered = width * height * smaller**2 / PIXELS
+        c = ON_GPU if self.on_gpu else PosedCosts(
+            first_look=2.0, view=0.01, searched_view=0.1 + 1.3 * rendered, grown_view=0.03,
+            step=0.04 + 0.03 * rendered, meshed_view=0.02 + 0.25 * rendered, mesh=1.0, report=0.6,
+        )  # fmt: skip
         views = min(self.views, search.most_views)
         steps = max(search.least_steps, search.steps_per_view * views)
         return {

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from geogs.application.progress.mesh_plan import mesh_seconds, mesh_stage
 from geogs.config import Config
@@ -35,29 +36,8 @@ class StageCosts:
     report: float
 
 
-# Two cores; and 600 x 340 on an H200 with eight, whatever the size.
+# 600 x 340 on an H200 with eight cores, whatever the size; on a CPU two cores are the reference.
 ON_GPU = StageCosts(1.5, 0.3, 0.006, 0.5, 0.03, 0.02, 0.02, 0.004, 0.05, 3.0, 1.0)
-
-
-def on_cpu(
-    worked_on: float, fine: bool, matched: float, rendered: float, planes: int
-) -> StageCosts:
-    """On a CPU, where images have so many times the pixels of the reference, those that are matched
-    for the adjustment, which may be fine, so many, and maps so many, whose depths are searched over
-    so many planes."""
-    return StageCosts(
-        calibration=3.0 + 6.0 * worked_on,
-        shutter=0.7 * worked_on,
-        frame=0.025 * worked_on,
-        start=2.2 * worked_on,
-        keyframe=0.36 * worked_on,
-        adjusted_keyframe=(0.18 if fine else 0.08) * worked_on + 0.1 * matched,
-        searched_keyframe=0.1 + 0.3 * rendered * planes / 64,
-        step=0.016 + 0.025 * rendered,
-        meshed_keyframe=0.02 + 0.12 * rendered,
-        mesh=1.0,
-        report=0.6,
-    )
 
 
 @dataclass(frozen=True)
@@ -71,15 +51,10 @@ class RunPlan:
     on_gpu: bool
     calibrates: bool
     maps_at_end: bool
-
-    @property
-    def end(self) -> None:
-        """No time is given."""
-
-    @property
-    def fixed(self) -> tuple[str, ...]:
-        """None, as there is no end."""
-        return ()
+    end: ClassVar[None] = None
+    """No time is given."""
+    fixed: ClassVar[tuple[str, ...]] = ()
+    """Stages that take their time whatever is given: none, as there is no end."""
 
     @property
     def costs(self) -> StageCosts:
@@ -91,7 +66,19 @@ class RunPlan:
         fine = self.config.tracking.fine_adjustment
         matched = worked_on if fine or longer <= SMALL_IMAGE else worked_on / 4
         rendered = worked_on * min(self.config.mapping.render_long_edge / longer, 1.0) ** 2
-        return on_cpu(worked_on, fine, matched, rendered, self.config.mapping.depth.planes)
+        return StageCosts(
+            calibration=3.0 + 6.0 * worked_on,
+            shutter=0.7 * worked_on,
+            frame=0.025 * worked_on,
+            start=2.2 * worked_on,
+            keyframe=0.36 * worked_on,
+            adjusted_keyframe=(0.18 if fine else 0.08) * worked_on + 0.1 * matched,
+            searched_keyframe=0.1 + 0.3 * rendered * self.config.mapping.depth.planes / 64,
+            step=0.016 + 0.025 * rendered,
+            meshed_keyframe=0.02 + 0.12 * rendered,
+            mesh=1.0,
+            report=0.6,
+        )
 
     def tracked(self, frames: int, keyframes: float | int) -> float:
         """Seconds of so many frames, with what is mapped on the way."""
@@ -128,7 +115,8 @@ class RunPlan:
         return sum(stages.values()) - sum(stages[name] for name in BEFORE_MAP)
 
     def at(self, reported: str, fraction: float) -> tuple[str, float]:
-        """Mapping is the search of depths, then the training."""
+        """Stage and its finished part, where so much of something is reported as done; another name
+        where that is not planned. Mapping is the search of depths, then the training."""
         if reported not in ("mapping", "map refinement"):
             return mesh_stage(reported, fraction)
         searched = SEARCHED * (self.maps_at_end or self.config.mapping.final_depth)

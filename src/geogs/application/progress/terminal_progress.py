@@ -13,13 +13,13 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from geogs.application.machine.device import peak_memory
 from geogs.application.progress.forecast import Forecast
-from geogs.application.progress.plan import Plan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.run_settings import Verbosity
 from geogs.errors import OutputError
 from geogs.evaluation.duration import duration
 
 if TYPE_CHECKING:
+    from geogs.application.progress.plan import Plan
     from geogs.pose_estimate import PoseEstimate
 
 _LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
@@ -93,7 +93,7 @@ class TerminalProgress(RunProgress):
             Console(stderr=True, highlight=False).print(text, soft_wrap=True, markup=False)
         self._bar.console.print(text, soft_wrap=True, markup=False)
 
-    def plan(self, plan: Plan) -> None:
+    def plan(self, plan: "Plan") -> None:
         """From now on the time that is left is that of all of it."""
         if self._forecast is None:
             self._forecast = Forecast(plan)

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geogs.application.results.mapped_scene import MappedScene
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_folder import (
     image_path,
@@ -18,10 +18,13 @@ from geogs.io.writers.keyframe_folder import (
 from geogs.io.writers.map_file import MapViews
 from geogs.types import RenderedKeyframe
 
+if TYPE_CHECKING:
+    from geogs.application.results.mapped_scene import MappedScene
+
 
 def write_keyframes(
     folder: Path,
-    scene: MappedScene,
+    scene: "MappedScene",
     camera: Camera,
     renders: Sequence[RenderedKeyframe],
     with_images: bool,

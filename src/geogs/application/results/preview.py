@@ -8,7 +8,6 @@ import torch
 from geogs.depth.tracker_depth import enlarged_depth
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.replacement import replaced
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
@@ -38,7 +37,7 @@ def write_preview(output: Path, slam: Slam) -> bool:
     if mesh is None:
         return False
     with replaced(output, "part") as new:
-        write_mesh(new / NAME, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(new / NAME)
     return True
 
 

@@ -14,7 +14,6 @@ from geogs.config.old_names import present_values
 from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.replacement import replaced
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import Mesh
@@ -58,12 +57,12 @@ def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Pat
         raise InputError(f"{path} should end in .ply; geogs export writes other formats.")
     if path != folder / "mesh.ply":
         mesh = _mesh_of(load_result(folder, require_device(settings.device)), settings, follow)
-        write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(path)
         return path
     with claimed(folder), replaced(folder, "part") as new:
         result = load_result(folder, require_device(settings.device))
         mesh = _mesh_of(result, settings, follow)
-        write_mesh(new / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(new / "mesh.ply")
         write_page_anew(new, result, mesh)
     return path
 

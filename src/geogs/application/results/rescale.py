@@ -29,7 +29,7 @@ from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.map_file import MapViews, load_map_file, save_map_with_views
-from geogs.io.writers.ply_writer import SH_DEGREE_0, write_mesh, write_splats
+from geogs.io.writers.ply_writer import SH_DEGREE_0, write_splats
 from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.io.writers.uncertainty import HEADER, moved_rows
@@ -162,5 +162,5 @@ def _scale_mesh(folder: Path, new: Path, name: str, factor: float) -> Mesh | Non
         return None
     mesh = read_mesh(folder / name)
     mesh = replace(mesh, vertices=factor * mesh.vertices)
-    write_mesh(new / name, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    mesh.save(new / name)
     return mesh

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.geometry.camera import Camera
@@ -18,12 +18,15 @@ from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
+if TYPE_CHECKING:
+    from geogs.application.results.mapped_scene import MappedScene
+
 
 @dataclass(frozen=True, repr=False)
 class Result:
     """What there is of a scene; each part is made when it is first asked for, then kept."""
 
-    scene: MappedScene
+    scene: "MappedScene"
     """A ``Slam`` or a ``Reconstruction``, whose work is done."""
     source: Source | PosedSource
     """What it was made from, read to the end."""

@@ -48,23 +48,6 @@ class ShownView:
     image: Callable[[], UInt8[np.ndarray, "h w 3"] | None]
 
 
-def write_report(
-    folder: Path,
-    trajectory: Trajectory,
-    renders: Sequence[RenderedKeyframe],
-    mesh: Mesh | None,
-    summary: Mapping[str, object],
-    disks: MapSnapshot | None = None,
-) -> None:
-    """A model that turns, the path, renders beside images, and the numbers of the summary.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    write_pictures(folder, trajectory, renders)
-    write_page(folder, trajectory, renders, mesh, summary, disks)
-
-
 def write_pictures(
     folder: Path, trajectory: Trajectory, renders: Sequence[RenderedKeyframe]
 ) -> None:

@@ -3,18 +3,21 @@
 import math
 import platform
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
-from geogs.application.results.mapped_scene import MappedScene
 from geogs.application.results.result import Result
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.stopwatch import Stopwatch
 from geogs.types import FrameState, Trajectory
 from geogs.version import __version__
+
+if TYPE_CHECKING:
+    from geogs.application.results.mapped_scene import MappedScene
 
 
 def summarise(result: Result) -> dict[str, object]:
@@ -47,7 +50,7 @@ def summarise(result: Result) -> dict[str, object]:
     }
 
 
-def statistics(scene: MappedScene) -> dict[str, object]:
+def statistics(scene: "MappedScene") -> dict[str, object]:
     """What the scene says of itself; where its lengths are metres, ``scale`` says by what."""
     said = dict(scene.statistics())
     metric = said.get("metric_scale")

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.mapped_scene import MappedScene
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.writers.map_file import save_map
-from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
@@ -20,6 +18,7 @@ from geogs.on_demand import OnDemand
 from geogs.types import MapSnapshot, RenderedKeyframe
 
 if TYPE_CHECKING:
+    from geogs.application.results.mapped_scene import MappedScene
     from geogs.reconstruction import Reconstruction
 
 
@@ -60,11 +59,11 @@ def write_surface(
     """
     mesh = surface_of(renders, config, progress, name)
     if mesh is not None:
-        write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        mesh.save(path)
     return mesh
 
 
-def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) -> None:
+def write_depth_mesh(output: Path, scene: "MappedScene", progress: RunProgress) -> None:
     """``depth_fusion/mesh.ply``: the surface of the searched depths, to compare the map with."""
     with scene.stopwatch("depth fusion"):
         path = output / "depth_fusion" / "mesh.ply"
@@ -72,7 +71,7 @@ def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) ->
 
 
 def write_stage(
-    output: Path, scene: MappedScene, progress: RunProgress, name: Literal["online", "adjusted"]
+    output: Path, scene: "MappedScene", progress: RunProgress, name: Literal["online", "adjusted"]
 ) -> None:
     """Trajectories and mesh as they stand, to a folder of the stage's name.
 

@@ -17,7 +17,7 @@ from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.map_file import save_map_with_views
-from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.ply_writer import write_splats
 from geogs.io.writers.replacement import replaced
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
@@ -68,9 +68,7 @@ def write_files(
         drawn = threads.submit(_write_pictures, output, result, shown)
         if (mesh := result.mesh) is not None:
             with scene.stopwatch("mesh"):
-                write_mesh(
-                    output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals
-                )
+                mesh.save(output / "mesh.ply")
         with scene.stopwatch("keyframes"):
             written.result()
             drawn.result()

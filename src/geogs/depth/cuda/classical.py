@@ -20,10 +20,16 @@ from geogs.depth.cuda.photo_vote import photo_costs
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
 from geogs.depth.cuda.refinement import PixelPositions, TrackerMaps, choose_start, judge, refine
 from geogs.depth.depth_engine import DepthTask, Progress, silent
-from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths, homographies
+from geogs.depth.depth_view import (
+    DenseDepth,
+    DepthView,
+    PosedDepth,
+    dense_depths,
+    homographies,
+    relative_poses,
+)
 from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
-from geogs.depth.revision.photo_vote import relative_poses
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import upload

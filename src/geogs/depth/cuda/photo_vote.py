@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from geogs.depth.cuda.images import KeyframeImages
-from geogs.depth.revision.photo_vote import CONTRAST, RADIUS, light_and_noise
+from geogs.depth.revision.photo_vote import CONTRAST, DEVIATIONS, LEAST_DEVIATION, RADIUS
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import upload
@@ -47,3 +47,14 @@ def photo_costs(
     kernels["pixel_costs"]((-(-h * w // 128), 2), (128,), differences, light, most, n, h * w, costs)
     kernels["average_costs"](tiles, (32, 4), costs, own.colours, RADIUS, -1 / CONTRAST, h, w, means)
     return means if asked is None else torch.where(asked, means, 0.0)
+
+
+def light_and_noise(
+    differences: Float[Tensor, "n h w"], same: Bool[Tensor, "h w"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Median difference of each neighbour where there is one depth, and the deviation from it that
+    counts in full."""
+    known = torch.where(same, differences, torch.nan).flatten(1)
+    light = known.nanmedian(1).values.nan_to_num()
+    deviation = (known - light[:, None]).abs().nanmedian(1).values.nan_to_num()
+    return light, DEVIATIONS * deviation.clamp(min=LEAST_DEVIATION)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
-import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -22,7 +21,7 @@ from geogs.depth.depth_engine import (
     Progress,
     silent,
 )
-from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
+from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths, relative_poses
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
@@ -121,7 +120,7 @@ class NetworkDepthEngine(AlternativeSearch):
         self, reference: DepthView, others: Sequence[DepthView], between: SearchRange
     ) -> tuple[Tensor, ...]:
         """The fields of ``StereoViews``."""
-        relative = np.stack([v.T_cw for v in others]) @ np.linalg.inv(reference.T_cw)
+        relative = relative_poses(reference, others)
         images = torch.stack([self._image(v) for v in (reference, *others)])
         images = images.permute(0, 3, 1, 2).float() / 255
         numbers = (between.near, between.far, between.typical)

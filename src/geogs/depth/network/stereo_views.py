@@ -1,8 +1,7 @@
 """What the depth network is given, and what it says."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -32,10 +31,6 @@ class StereoViews:
     """Farthest depth to search."""
     typical: Float[Tensor, "b"]
     """About the median depth."""
-
-    def to(self, device: torch.device | str) -> "StereoViews":
-        """The same on a device."""
-        return StereoViews(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 @dataclass(frozen=True)

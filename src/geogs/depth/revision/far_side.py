@@ -1,16 +1,14 @@
 """Pixels that a search has put on the nearer side of an edge, and the images on the farther one."""
 
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.depth.depth_engine import RevisedSearch
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths
-from geogs.depth.revision.revised_search import RevisedSearch
 from geogs.geometry.jumps import minmod_slopes
 
 APART = 0.03
@@ -21,7 +19,6 @@ PASSES = 2
 """Times that all pixels are asked."""
 MOVED_CONFIDENCE = 0.35
 """Confidence of a depth that was moved, as measured."""
-_AROUND = [step for step in product((-1, 0, 1), repeat=2) if step != (0, 0)]
 
 
 class FarSideSearch(RevisedSearch):
@@ -48,10 +45,12 @@ class FarSideSearch(RevisedSearch):
         return found
 
 
-def compiled_surface(
-    depth: Float[Tensor, "h w"], reach: int, apart: float = APART
-) -> Float[Tensor, "h w"]:
-    """As :func:`farther_surface`, by compiled loops on a CPU."""
+def farther_surface(depth: Float[Tensor, "h w"], reach: int, apart: float) -> Float[Tensor, "h w"]:
+    """Depth of the nearest farther surface within ``reach`` pixels, its plane gone on to the pixel.
+
+    0 where there is none that is farther by ``apart`` of the inverse depth, or it would be farther
+    than all that was found. ``depth`` is positive; inverse depth is linear along a plane.
+    """
     from geogs.depth.revision.far_side_kernels import farther_planes
 
     planes = inverse_planes(depth)
@@ -69,27 +68,3 @@ def inverse_planes(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
 def as_depth(inverse: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Depth of an inverse depth, 0 where that is none."""
     return torch.where(inverse > 0, 1 / inverse.clamp(min=1e-12), 0.0)
-
-
-def farther_surface(
-    depth: Float[Tensor, "h w"], reach: int, apart: float = APART
-) -> Float[Tensor, "h w"]:
-    """Depth of the nearest farther surface within ``reach`` pixels, its plane gone on to the pixel.
-
-    0 where there is none that is farther by ``apart`` of the inverse depth, or it would be farther
-    than all that was found. ``depth`` is positive; inverse depth is linear along a plane. What the
-    engines are held to.
-    """
-    source = inverse_planes(depth)
-    inverse, found = source[0], torch.zeros_like(source)
-    (height, width), farthest = depth.shape, inverse.amin()
-    for _ in range(reach):
-        around = F.pad(source, (1, 1, 1, 1))
-        for dy, dx in _AROUND:
-            plane = around[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-            here = plane[0] - dx * plane[1] - dy * plane[2]
-            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - apart) * inverse)
-            new = goes_on & (found[0] == 0)
-            found = torch.where(new, torch.stack([here, plane[1], plane[2]]), found)
-        source = found
-    return as_depth(found[0])

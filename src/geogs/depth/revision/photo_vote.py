@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from geogs.depth.depth_view import DepthView
+from geogs.depth.depth_view import DepthView, relative_poses
+from geogs.depth.revision import photo_vote_kernels as kernels
 from geogs.geometry.camera import Camera
 
 DEVIATIONS = 3.0
@@ -30,18 +30,18 @@ CONTRAST = 8 / 255
 
 
 def photo_costs(
-    reference: DepthView,
+    view: DepthView,
     neighbours: Sequence[DepthView],
-    depths: Float[Tensor, "2 h w"],
+    depths: Float32[Tensor, "2 h w"],
     same: Bool[Tensor, "h w"],
     camera: Camera,
     asked: Bool[Tensor, "h w"] | None = None,
-) -> Float[Tensor, "2 h w"]:
+) -> Float32[Tensor, "2 h w"]:
     """How badly the neighbours' images agree at each of two depths, in [0, 1]: means over the
-    pixels around that have the same colour. What the engines are held to.
+    pixels around that have the same colour.
 
     Args:
-        reference: the view that the depths are of.
+        view: the view that the depths are of.
         neighbours: what it is compared with, at least one.
         depths: two depths of each pixel, z in map units; 0 where there is none.
         same: where both are of one surface, from which the neighbours' noise and light are learned.
@@ -49,95 +49,44 @@ def photo_costs(
         asked: where that is asked: elsewhere the result is 0, and the second depth is taken for the
             first. By default everywhere.
     """
-    if asked is not None:
-        depths = torch.stack([depths[0], torch.where(asked, depths[1], depths[0])])
-    device, size = depths.device, (camera.width, camera.height)
-    grey = torch.from_numpy(np.stack([v.grey for v in (reference, *neighbours)])).to(device)
-    poses = relative_poses(reference, neighbours)
-    differences = torch.stack(
-        [seen_from(grey[1:], poses, depth, camera) - grey[0] for depth in depths]
-    )
-    colour = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
-    guide = torch.from_numpy(colour).to(device).movedim(-1, 0).float() / 255
-    costs = averaged_by_colour(best_half(truncated(differences, same)), guide)
-    return costs if asked is None else torch.where(asked, costs, 0.0)
+    size = (camera.width, camera.height)
+    colour = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+    guide = colour.astype(np.float32) / np.float32(255)
+    where = np.ones(guide.shape[:2], bool) if asked is None else asked.numpy()
+    window = np.ones((2 * RADIUS + 1, 2 * RADIUS + 1), np.uint8)
+    near = cv2.dilate(where.astype(np.uint8), window).astype(bool)
+    images = np.stack([v.grey for v in neighbours])
+    poses = relative_poses(view, neighbours)[:, :3].astype(np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    first, second = np.ascontiguousarray(depths.numpy(), np.float32)
+    differences, costs = np.empty_like(images), np.empty(depths.shape, np.float32)
+    kernels.grey_differences(view.grey, images, poses, lens, first, differences)
+    light, most = _light_and_noise(differences, same.numpy())
+    kernels.pixel_costs(differences, light, most, near, costs[0])
+    other = np.where(where, second, np.float32(0))
+    kernels.grey_differences(view.grey, images, poses, lens, other, differences)
+    kernels.pixel_costs(differences, light, most, where, costs[1])
+    costs[1] = np.where(where, costs[1], costs[0])
+    mean = np.empty_like(costs)
+    kernels.average_costs(costs, where, guide, RADIUS, np.float32(CONTRAST), mean)
+    return torch.from_numpy(mean)
 
 
-def relative_poses(
-    reference: DepthView, neighbours: Sequence[DepthView]
-) -> Float[np.ndarray, "n 4 4"]:
-    """What takes the reference's frame to the neighbours'."""
-    return np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+def _light_and_noise(
+    differences: Float32[np.ndarray, "n h w"], same: Bool[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """As the tensors' of that name, only of what is known."""
+    light, most = np.zeros((2, len(differences)), np.float32)
+    for n, known in enumerate(differences[:, same]):
+        known = known[~np.isnan(known)]
+        deviation = np.float32(0)
+        if len(known):
+            light[n] = _lower_median(known)
+            deviation = _lower_median(np.abs(known - light[n]))
+        most[n] = DEVIATIONS * max(deviation, np.float32(LEAST_DEVIATION))
+    return light, most
 
 
-def seen_from(
-    grey: Float[Tensor, "n h w"],
-    poses: Float[np.ndarray, "n 4 4"],
-    depth: Float[Tensor, "h w"],
-    camera: Camera,
-) -> Float[Tensor, "n h w"]:
-    """The neighbours' grey values where they see the pixels of a depth map; not a number outside.
-
-    ``poses`` take the frame of the depth map to the neighbours'.
-    """
-    T = torch.from_numpy(poses).to(depth)
-    points = camera.back_project(depth) @ T[:, None, :3, :3].mT + T[:, None, None, :3, 3]
-    z = points[..., 2].clamp(min=1e-9)
-    x = camera.fx * points[..., 0] / z + camera.cx
-    y = camera.fy * points[..., 1] / z + camera.cy
-    inside = (depth > 0) & (points[..., 2] > 0) & (x >= 0) & (y >= 0)
-    inside &= (x <= camera.width - 1) & (y <= camera.height - 1)
-    place = torch.stack([2 * x / (camera.width - 1) - 1, 2 * y / (camera.height - 1) - 1], -1)
-    found = F.grid_sample(grey[:, None], place, align_corners=True, padding_mode="border")[:, 0]
-    return torch.where(inside, found, torch.nan)
-
-
-def truncated(
-    differences: Float[Tensor, "2 n h w"], same: Bool[Tensor, "h w"]
-) -> Float[Tensor, "2 n h w"]:
-    """Differences of grey values without that of the light, over what each neighbour's noise makes
-    of them, at most 1."""
-    light, most = light_and_noise(differences[0], same)
-    return ((differences - light[:, None, None]).abs() / most[:, None, None]).clamp(max=1)
-
-
-def light_and_noise(
-    differences: Float[Tensor, "n h w"], same: Bool[Tensor, "h w"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Median difference of each neighbour where there is one depth, and the deviation from it that
-    counts in full."""
-    known = torch.where(same, differences, torch.nan).flatten(1)
-    light = known.nanmedian(1).values.nan_to_num()
-    deviation = (known - light[:, None]).abs().nanmedian(1).values.nan_to_num()
-    return light, DEVIATIONS * deviation.clamp(min=LEAST_DEVIATION)
-
-
-def best_half(costs: Float[Tensor, "*b n h w"]) -> Float[Tensor, "*b h w"]:
-    """The mean of each pixel's lower half, without those that are not numbers: in the other
-    neighbours it may be hidden. 1 where there is none."""
-    ordered = costs.nan_to_num(torch.inf).sort(-3).values
-    count = (~costs.isnan()).sum(-3, keepdim=True)
-    half = (count + 1) // 2
-    rank = torch.arange(costs.shape[-3], device=costs.device)[:, None, None]
-    total = torch.where(rank < half, ordered, 0.0).sum(-3)
-    return torch.where(count[..., 0, :, :] > 0, total / half[..., 0, :, :].clamp(min=1), 1.0)
-
-
-def averaged_by_colour(
-    values: Float[Tensor, "*b h w"], guide: Float[Tensor, "3 h w"]
-) -> Float[Tensor, "*b h w"]:
-    """Each pixel's mean over those within ``RADIUS``, weighted by their likeness in colour."""
-    height, width = values.shape[-2:]
-    sides = (RADIUS,) * 4
-    around = F.pad(values.reshape(1, -1, height, width), sides, mode="replicate")[0]
-    around = around.reshape(*values.shape[:-2], *around.shape[1:])
-    colours = F.pad(guide[None], sides, mode="replicate")[0]
-    total, weights = torch.zeros_like(values), torch.zeros_like(guide[0])
-    for dy in range(2 * RADIUS + 1):
-        for dx in range(2 * RADIUS + 1):
-            rows, columns = slice(dy, dy + height), slice(dx, dx + width)
-            apart = (colours[:, rows, columns] - guide).abs().mean(0)
-            weight = (apart * (-1 / CONTRAST)).exp()
-            total += weight * around[..., rows, columns]
-            weights += weight
-    return total / weights
+def _lower_median(values: Float32[np.ndarray, "k"]) -> np.float32:
+    middle = (len(values) - 1) // 2
+    return np.float32(np.partition(values, middle)[middle])

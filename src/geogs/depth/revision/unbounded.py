@@ -6,9 +6,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from geogs.depth.depth_engine import DepthEngine
+from geogs.depth.depth_engine import DepthEngine, RevisedSearch
 from geogs.depth.depth_view import INFINITY, DenseDepth, DepthView, PosedDepth
-from geogs.depth.revision.revised_search import RevisedSearch
 
 FAR = 2.0
 """Times the median depth from which a pixel is asked: a bare wall nearby looks the same at any

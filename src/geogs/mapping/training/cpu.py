@@ -84,6 +84,7 @@ class CpuTrainer:
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
         is_large = cameras.render.long_edge // 2 >= LEAST_COARSE
         self.coarse_part = COARSE_PART if is_large else 0.0
+        """Part of a training over all keyframes, its first, that goes at half the resolution."""
 
     def train(
         self,
@@ -93,8 +94,9 @@ class CpuTrainer:
     ) -> None:
         """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
 
-        At half the resolution if ``coarse``. On an excerpt of the map where the views can see no
-        more than that, which changes nothing but rounding.
+        At half the resolution if ``coarse``, which is only for trainers with a ``coarse_part``. On
+        an excerpt of the map where the views can see no more than that, which changes nothing but
+        rounding.
         """
         whole, optimizer, seen = self.disks, self.optimizer, self._in_view(batches)
         if not 0 < len(seen) <= _LARGE_EXCERPT * len(whole):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,8 +10,11 @@ from geogs.config import MappingConfig
 from geogs.depth.depth_engine import Progress
 from geogs.mapping.disk_growth import DiskGrowth
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
-from geogs.mapping.training.map_trainer import MapTrainer, draw_batch
+from geogs.mapping.training.map_trainer import draw_batch
 from geogs.world.map import MapTable, TrainingPlace
+
+if TYPE_CHECKING:
+    from geogs.mapping.training.trainer_choice import MapTrainer
 
 # Steps between two reports of progress, at least.
 _REPORTED_STEPS = 20
@@ -29,7 +33,7 @@ class FullTraining:
         self,
         table: MapTable,
         views: KeyframeViews,
-        trainer: MapTrainer,
+        trainer: "MapTrainer",
         growth: DiskGrowth,
         config: MappingConfig,
     ) -> None:
@@ -92,7 +96,7 @@ class FullTraining:
 
 
 def seconds_per_step(
-    table: MapTable, views: KeyframeViews, trainer: MapTrainer, config: MappingConfig
+    table: MapTable, views: KeyframeViews, trainer: "MapTrainer", config: MappingConfig
 ) -> float:
     """What a training step takes, from some of them at full rate: from more where these are
     quick."""

@@ -1,11 +1,8 @@
-"""What the mapper asks of whatever trains its map, and which views take part in a step."""
+"""Which views take part in a step of training, and how far it goes."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_views import MapView
@@ -73,33 +70,3 @@ def _draw_partners(
     ids = [i for i in view.row.partners if i in views]
     count = min(config.photo.per_step, len(ids))
     return [views[ids[i]] for i in random.choice(len(ids), count, replace=False)] if count else []
-
-
-@runtime_checkable
-class MapTrainer(Protocol):
-    """Trains a map in place, and poses on it."""
-
-    coarse_part: float
-    """Part of a training over all keyframes, its first, that goes at half the resolution."""
-
-    def train(
-        self,
-        batches: Sequence[Batch],
-        factors: Sequence[float] | None = None,
-        coarse: bool = False,
-    ) -> None:
-        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
-
-        At half the resolution if ``coarse``, which is only for trainers with a ``coarse_part``.
-        """
-        ...
-
-    def refine_poses(
-        self, active: list[MapView], views: Mapping[int, MapView], config: MappingConfig
-    ) -> dict[int, Float[Tensor, "4 4"]]:
-        """Poses of the active keyframes that agree better with the map; the earliest stays."""
-        ...
-
-    def forget_renders(self, views: Iterable[MapView]) -> None:
-        """What the views showed of the map counts no more: it was moved."""
-        ...

@@ -112,18 +112,6 @@ class GltfBuffer:
         return len(self._views) - 1
 
 
-def write_glb(
-    path: Path,
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "n 3"],
-    colours: UInt8[np.ndarray, "n 3"] | None,
-) -> None:
-    """Write glTF 2.0 in one file, with axes and colours as in ``glb``."""
-    with atomic_file(path) as stream:
-        stream.write(glb(vertices, faces, normals, colours))
-
-
 def glb(
     vertices: Float[np.ndarray, "n 3"],
     faces: Int[np.ndarray, "m 3"],
@@ -158,7 +146,7 @@ def write_textured_glb(
     uv: Float[np.ndarray, "n 2"],
     texture: UInt8[np.ndarray, "h w 3"],
 ) -> None:
-    """Write glTF 2.0 in one file, with axes as ``write_glb`` has them and a JPEG inside.
+    """Write glTF 2.0 in one file, with axes as ``glb`` has them and a JPEG inside.
 
     Light is in the texture already, so the material asks to be shown as it is
     (KHR_materials_unlit); readers that do not know that see a rough surface. ``uv`` is
@@ -190,7 +178,7 @@ def write_obj(
     normals: Float[np.ndarray, "n 3"],
     colours: UInt8[np.ndarray, "n 3"] | None,
 ) -> None:
-    """Write text with normals, y up as in ``write_glb``; sRGB from 0 to 1 stands behind x, y, z."""
+    """Write text with normals, y up as in ``glb``; sRGB from 0 to 1 stands behind x, y, z."""
     axes = OPENCV_FROM_OPENGL[:3, :3]
     rows = vertices @ axes
     if colours is not None:

@@ -25,7 +25,6 @@ def write_transforms(
     images: Sequence[ExportedImage],
     masked: Sequence[bool],
     depth_unit: float,
-    points: str,
 ) -> None:
     """Write the file beside ``images/``, ``depth/``, ``normals/`` and ``masks/``.
 
@@ -35,7 +34,6 @@ def write_transforms(
         images: names as they are in ``images/``; depth, normals and masks are PNG of that stem.
         masked: which of them have a mask.
         depth_unit: map units of a step of a depth image.
-        points: file of the start points, beside the JSON.
     """
     frames = []
     for image, has_mask in zip(images, masked, strict=True):
@@ -60,7 +58,7 @@ def write_transforms(
         "p1": 0.0,
         "p2": 0.0,
         "depth_unit_scale_factor": depth_unit,
-        "ply_file_path": points,
+        "ply_file_path": "points.ply",
         "frames": frames,
     }
     write_text(path, json.dumps(document, indent=1) + "\n")

@@ -35,7 +35,7 @@ class WindowPass:
     ) -> None:
         """``fresh`` renders all partners first, for the occlusion tests of the same pass."""
         device = table.device
-        self.table, self.views, self.partners, self.capacity = table, views, partners, capacity
+        self.table, self.views, self.capacity = table, views, capacity
         self._generation = table.generation
         self.rasterizer = Rasterizer(capacity, views, camera, NEAR, device)
         self.losses = WindowLosses(table, config, unit, views, partners, pair_weight, for_poses)
