@@ -26,9 +26,9 @@ WORSE = 3.0
 """Times the usual residual of all edges that of one of them is at most taken to be."""
 MOST = 10.0
 """Times the usual residual that a single match can speak for motion."""
-RELEASED = 0.5
-"""Part of the threshold below which what was held for moving is scene again: along a straight road
-a car ahead suits its epipolar lines for a while, almost as well as what stands."""
+RELEASED = 0.75
+"""Part of the threshold below which what was held for moving is scene again, as long as only the
+pairs of a window tell: along a straight road a car ahead suits their epipolar lines for a while."""
 ENOUGH = 0.7
 """Matches per cell of a surrounding from which it can be decided."""
 FILLED = 0.8
@@ -75,7 +75,7 @@ def update_dynamic(
     edges: Mapping[Pair, Edge],
     decided: Sequence[Pair],
     threshold: float,
-    released: float = RELEASED,
+    released: float = 1.0,
 ) -> None:
     """Say anew of the sources of some directed edges which of their cells move.
 
@@ -109,7 +109,7 @@ def dynamic_cells(
     count: Float[Tensor, "n p"],
     before: Bool[Tensor, "n p"],
     threshold: float,
-    released: float = RELEASED,
+    released: float = 1.0,
 ) -> Bool[Tensor, "n p"]:
     """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold,
     ``released`` of it where a cell was dynamic ``before``.

@@ -20,7 +20,7 @@ from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.tracking.graph.dynamic_cells import RELEASED, static_weight, update_dynamic
+from geogs.tracking.graph.dynamic_cells import static_weight, update_dynamic
 from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.graph.proximity import PAIRS_TOGETHER
 from geogs.types import FlowMatch
@@ -203,9 +203,7 @@ class FrameGraph:
         )
         return problem, ids
 
-    def update_dynamic(
-        self, ids: Collection[int], threshold: float, released: float = RELEASED
-    ) -> None:
+    def update_dynamic(self, ids: Collection[int], threshold: float, released: float = 1.0) -> None:
         """Say anew which cells of some keyframes move, by all their edges (:func:`update_dynamic`).
 
         A threshold of 0 says nothing.

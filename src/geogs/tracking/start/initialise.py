@@ -148,7 +148,7 @@ def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
             return False
         normalise(segment)
         if n >= FORGIVING:
-            graph.update_dynamic(ids, moving, released=1.0)  # it was judged by worse poses
+            graph.update_dynamic(ids, moving)
     return True
 
 
