@@ -8,7 +8,7 @@ import torch
 
 from cuda_emulator import use_emulator
 from geogs.application.machine.device import device_summary
-from geogs.application.results.result_page import write_page
+from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
@@ -151,6 +151,7 @@ def test_results_are_written_from_any_device(device, tmp_path):
     save_map(tmp_path / "map.safetensors", disks)
     T_wc = np.stack([torch.linalg.inv(r.T_cw.cpu()).numpy() for r in renders])
     trajectory = Trajectory(np.arange(6.0), T_wc, np.ones(6, bool))
+    write_pictures(tmp_path / "report", trajectory, renders)
     write_page(tmp_path / "report", trajectory, renders, mesh, {"source": "room"})
     for name in ("trajectory", "keyframes"):
         assert (tmp_path / "report" / f"{name}.png").stat().st_size > 5000
