@@ -126,6 +126,15 @@ def test_a_start_does_not_believe_what_a_failed_one_held_for_moving(
     assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.3
 
 
+@pytest.mark.parametrize(("moving", "starts"), [(0.45, True), (0.55, False)])
+def test_no_map_starts_by_which_most_of_the_scene_moves(
+    monkeypatch: pytest.MonkeyPatch, moving: float, starts: bool
+):
+    monkeypatch.setattr("geogs.tracking.start.initialise.dynamic_fraction", lambda _: moving)
+    segments, _ = run(frames(sideways(12)))
+    assert (segments.table.why_not == "") == starts
+
+
 def test_nothing_known_is_still_an_error():
     black = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     with pytest.raises(TrackingLost, match="texture"):

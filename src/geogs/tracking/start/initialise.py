@@ -19,6 +19,7 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.marginals import marginals
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
+from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
 from geogs.tracking.graph.proximity import RADIUS
 from geogs.tracking.locate.frame_locator import MIN_KNOWN
@@ -51,6 +52,10 @@ FAR = 1.5
 """Times the allowed deviation of depths beyond which one more keyframe is not going to help."""
 
 
+MOST_MOVING = 0.5
+"""Fraction of all cells that may be held for moving: of more, the poses are those of what moves."""
+
+
 class Attempt(Enum):
     """What came of trying to start."""
 
@@ -65,8 +70,9 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
 
     It fails if they show no parallax, or none that a rotation of the camera would not explain as
     well (:mod:`geogs.tracking.matching.two_view_rotation`), if matches and poses leave their depths
-    open (``MAX_DEVIATION``), or if the images of two that follow each other do not correlate where
-    poses and depths put them (``MIN_NCC``).
+    open (``MAX_DEVIATION``), if most of what is seen moves by them (``MOST_MOVING``), or if the
+    images of two that follow each other do not correlate where poses and depths put them
+    (``MIN_NCC``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
@@ -84,7 +90,9 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
         deviation = _depth_deviation(graph)
         if deviation > FAR * MAX_DEVIATION:
             return Attempt.FAR_OFF
-    if deviation > MAX_DEVIATION or not _passes_photometric_check(graph):
+    if deviation > MAX_DEVIATION or dynamic_fraction(segment) > MOST_MOVING:
+        return Attempt.FAILED
+    if not _passes_photometric_check(graph):
         return Attempt.FAILED
     return Attempt.STARTED
 
