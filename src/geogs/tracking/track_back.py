@@ -11,7 +11,7 @@ from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion
 from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.tracking.start.early_frames import oriented_frames
-from geogs.world.keyframes import Keyframe, KeyframeSet
+from geogs.world.keyframes import KeyframeSet
 
 
 def track_back(local: LocalMapping, locator: FrameLocator) -> None:
@@ -63,13 +63,10 @@ def _located(
     """A frame at the keyframe nearest in time, or at those that see most from the guess."""
     candidates = list(keyframes)
     nearest = min(candidates, key=lambda k: abs(k.frame_index - index))
-    tried = list[Keyframe]()
-    for keyframe in (nearest, *visible_keyframes(candidates, guess)):
-        if keyframe not in tried:
-            motion = locator.locate(keyframe, encoded, guess, is_expected=False)
-            if motion is not None and motion.known >= MIN_KNOWN:
-                return motion
-            tried.append(keyframe)
+    for keyframe in dict.fromkeys((nearest, *visible_keyframes(candidates, guess))):
+        motion = locator.locate(keyframe, encoded, guess, is_expected=False)
+        if motion is not None and motion.known >= MIN_KNOWN:
+            return motion
     return None
 
 
