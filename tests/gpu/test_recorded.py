@@ -113,3 +113,4 @@ def test_work_that_cannot_be_recorded_is_done_as_it_is(caplog):
     for _ in range(2):
         torch.testing.assert_close(recorded(x)[0], 6 * x)
     assert "The work is slower than it could be" in caplog.text
+    assert 0 <= torch.rand((), device="cuda").item() < 1  # its generator records no longer

@@ -20,7 +20,8 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
     """A CUDA graph of what this thread launches on ``device`` within the block.
 
     Python's garbage collector rests meanwhile: an older graph that it found and destroyed would
-    end the recording with an error.
+    end the recording with an error. What cannot be recorded leaves the device's generator of
+    random numbers believing that it is still recorded: it goes on with a state of its own.
     """
     graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
     gc.disable()
@@ -30,6 +31,10 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
             torch.cuda.graph(graph, capture_error_mode="thread_local"),
         ):
             yield graph
+    except RuntimeError:
+        random = torch.cuda.default_generators[device.index or 0]
+        random.graphsafe_set_state(random.clone_state())
+        raise
     finally:
         if collects:
             gc.enable()
