@@ -73,6 +73,22 @@ def test_errors_that_all_matches_have_in_common_are_foretold(monkeypatch):
     assert 0.5 < np.sqrt(np.mean(squares)) < 1.2
 
 
+def test_depths_are_as_unsure_as_lens_and_common_errors_leave_them(monkeypatch):
+    tracker = measured(14)
+    unsure = keyframe_uncertainty(tracker).depth
+    monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))
+    lens_known = keyframe_uncertainty(tracker).depth
+    monkeypatch.setattr(marginals, "COMMON_FLOW", 0.0)
+    monkeypatch.setattr(marginals, "COMMON_PLACE", 0.0)
+    own = keyframe_uncertainty(tracker).depth
+    assert (unsure > lens_known).all()
+    assert (lens_known > own).all()
+    matches = room._Matches.among(tracker, list(range(14)))
+    assert matches is not None
+    alone = marginals.marginals(matches.grid, matches.problem, room.OPTIONS, room.CELLS)
+    assert own == pytest.approx(alone.depth_deviation.numpy())
+
+
 def test_parts_of_a_long_walk_follow_each_other(monkeypatch):
     tracker = measured(14)
     whole = keyframe_uncertainty(tracker)

@@ -14,7 +14,7 @@ from geogs.bundle.projection import CellProjection, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.gauge import deviations_after_alignment
 from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence
-from geogs.bundle.uncertainty.marginals import Marginals, common_covariance, marginals
+from geogs.bundle.uncertainty.marginals import Marginals, common_errors, marginals
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
@@ -162,14 +162,14 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     if matches is None:
         return None
     found = marginals(matches.grid, matches.problem, OPTIONS, CELLS)
-    covariance, said = found.covariance, matches.lens() if found.is_bounded else None
+    said = matches.lens() if found.is_bounded else None
     if said is not None:
-        common = common_covariance(matches.grid, matches.problem, OPTIONS, found, CELLS)
+        common = common_errors(matches.grid, matches.problem, OPTIONS, found, CELLS)
         lens = tracker.keyframes.table.lens
         focal = 0.0 if lens is None else lens.deviation_focal
-        covariance = covariance + common + said.considered(focal)
+        found = found.beside(common).beside(said.considered(focal))
     own = torch.tensor([matches.frames.index(k) for k in ids])
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     return Marginals(
-        covariance[rows[:, None], rows], found.relative_depth[own], found.normalised_residual[own]
+        found.covariance[rows[:, None], rows], found.relative_depth[own], found.normalised_residual[own]
     )

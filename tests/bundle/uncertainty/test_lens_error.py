@@ -124,9 +124,9 @@ def test_noise_alone_is_no_evidence():
         assert found.evidence < 20
 
 
-def test_poses_move_by_what_the_lens_does_to_them():
+def test_poses_and_depths_move_by_what_the_lens_does_to_them():
     """Against adjustments of what a lens shows."""
-    size = 0.004
+    size = 0.001
     grid, straight = walk()
     found = evidence(grid, straight)
     for n in range(3):
@@ -137,7 +137,14 @@ def test_poses_move_by_what_the_lens_does_to_them():
         # An error of the lens that is taken off moves poses back.
         move = -same_length(solved.T_cw, straight.T_cw).reshape(-1)
         foretold = size * found.moves[:, n]
-        assert float((move - foretold).norm() / move.norm()) < 0.1
+        assert float((move - foretold).norm() / move.norm()) < 0.03
+        t = straight.T_cw[:, :3, 3]
+        length = float((solved.T_cw[:, :3, 3] * t).sum() / t.square().sum())
+        move = 1 - solved.inverse_depth * length / straight.inverse_depth
+        foretold = size * found.depth_moves[..., n]
+        seen = torch.zeros_like(move).index_add(0, straight.source, straight.weight[..., 0]) > 0
+        assert not foretold[~seen].any()
+        assert float((move - foretold)[seen].norm() / move[seen].norm()) < 0.03
 
 
 def same_length(T: Tensor, truth: Tensor) -> Tensor:
@@ -174,17 +181,21 @@ def test_what_is_said_of_poses_is_the_mean_square_over_lenses():
         seen = (
             seen + least * torch.randn(3, generator=g, dtype=torch.float64) / noise.square() / count
         )
-        found = LensEvidence(each, each @ lens + seen, moves)
-        said += found.considered().diagonal()
+        found = LensEvidence(each, each @ lens + seen, moves, moves[None])
+        considered = found.considered()
+        torch.testing.assert_close(
+            considered.covariance.diagonal(), considered.relative_depth[0].double()
+        )
+        said += considered.covariance.diagonal()
         true += (moves @ lens).square()
     assert float((said / true).log().abs().max()) < 0.2
 
 
 def test_without_evidence_the_lens_is_as_unsure_as_before():
     moves = torch.eye(3).double()
-    found = LensEvidence(torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves)
+    found = LensEvidence(torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves, moves[None])
     wanted = torch.diag(torch.tensor(PRIOR).double().square())
     # Nothing is said of it, whatever is estimated.
-    assert float((found.considered() - wanted).abs().max()) < 1e-3 * float(wanted.max())
-    more = found.considered(0.01) - found.considered()
+    assert float((found.considered().covariance - wanted).abs().max()) < 1e-3 * float(wanted.max())
+    more = found.considered(0.01).covariance - found.considered().covariance
     assert torch.allclose(more, torch.diag(torch.tensor([1e-4, 0, 0]).double()))

@@ -18,7 +18,7 @@ from geogs.bundle.uncertainty.marginals import (
     COMMON_FLOW,
     COMMON_PLACE,
     Marginals,
-    common_covariance,
+    common_errors,
     marginals,
 )
 from geogs.geometry.camera import Camera
@@ -123,13 +123,14 @@ def of_common_length(T: Tensor, truth: BundleProblem) -> Tensor:
     return se3_log(T @ se3_inverse(truth.T_cw))
 
 
-def test_errors_in_common_move_poses_as_foretold(monkeypatch):
+def test_errors_in_common_move_poses_and_depths_as_foretold(monkeypatch):
     monkeypatch.setattr(room, "PLACES", (2, 1))
     grid, truth = turning(0.05)
-    found = common_covariance(grid, truth, EXACT, marginals(grid, truth, EXACT))
+    known = marginals(grid, truth, EXACT)
+    found, depths = common_errors(grid, truth, EXACT, known)
     left = (grid.pixels[:, 0] < CAMERA.width / 2).float()
     onward = (truth.target - truth.source).sign()[:, None].float()
-    expected = torch.zeros_like(found)
+    expected, expected_depths = torch.zeros_like(found), torch.zeros_like(depths)
     for part in (left, 1 - left):
         for axis in (0, 1):
             for size in (COMMON_FLOW * onward, torch.full_like(onward, COMMON_PLACE)):
@@ -140,6 +141,14 @@ def test_errors_in_common_move_poses_as_foretold(monkeypatch):
                 )
                 move = of_common_length(solved.T_cw, truth).reshape(-1)
                 expected += move[:, None] * move
+                t = truth.T_cw[:, :3, 3]
+                length = float((solved.T_cw[:, :3, 3] * t).sum() / t.square().sum())
+                relative = solved.inverse_depth * length / truth.inverse_depth - 1
+                expected_depths += relative.square()
+    assert float((depths.sum(1) / expected_depths.sum(1)).log().abs().max()) < 0.1
+    both = known.beside(room.Considered(found, depths))
+    torch.testing.assert_close(both.relative_depth, (known.relative_depth**2 + depths).sqrt())
+    torch.testing.assert_close(both.covariance, known.covariance + found)
     got, wanted = (m.diagonal().reshape(-1, 6)[1:] for m in (found, expected))
     assert float((got.sum(0) / wanted.sum(0)).log().abs().max()) < 0.1
     assert float(found[:6].abs().max()) == 0
@@ -155,7 +164,7 @@ def test_cells_do_not_average_what_matches_have_in_common(monkeypatch):
     for camera in (CAMERA, double):
         grid, problem = turning(0.05, camera=camera)
         known = marginals(grid, problem, EXACT)
-        common = common_covariance(grid, problem, EXACT, known)
+        common = common_errors(grid, problem, EXACT, known).covariance
         variances.append([m.diagonal().sum() for m in (known.covariance, common)])
     (own, common), (finer_own, finer_common) = variances
     # Half a pixel is half the angle; there are four times as many cells.
@@ -167,7 +176,7 @@ def test_where_nothing_is_known_errors_in_common_add_nothing():
     grid, problem = turning(0.05)
     known = marginals(grid, problem, EXACT)
     unknown = replace(known, covariance=torch.full_like(known.covariance, torch.inf))
-    assert not common_covariance(grid, problem, EXACT, unknown).any()
+    assert not any(m.any() for m in common_errors(grid, problem, EXACT, unknown))
 
 
 def test_what_nothing_measures_is_open():

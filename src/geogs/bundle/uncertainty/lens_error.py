@@ -26,7 +26,7 @@ from geogs.bundle.projection import (
     relative_motion,
 )
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.marginals import pose_covariance
+from geogs.bundle.uncertainty.marginals import Considered, pose_covariance
 from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
@@ -105,6 +105,8 @@ class LensEvidence:
     """The direction of descent; likewise."""
     moves: Float[Tensor, "m k"]
     """By how much an error of size one moves all poses, left perturbations; m = 6n."""
+    depth_moves: Float[Tensor, "n c k"]
+    """And the inverse depths of some cells of each frame, as parts of these."""
 
     def joined(self, other: "LensEvidence") -> "LensEvidence":
         """Of both, poses of one after those of the other."""
@@ -112,6 +114,7 @@ class LensEvidence:
             torch.cat([self.information, other.information]),
             torch.cat([self.gradient, other.gradient]),
             torch.cat([self.moves, other.moves]),
+            torch.cat([self.depth_moves, other.depth_moves]),
         )
 
     @property
@@ -127,10 +130,10 @@ class LensEvidence:
             self.information, self.gradient, (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
         )
 
-    def considered(self, focal: float = 0.0) -> Float[Tensor, "m m"]:
-        """Second moment of the moves of all poses by the error that the lens has.
+    def considered(self, focal: float = 0.0) -> Considered:
+        """The error that the lens has, and what it does to poses and depths.
 
-        By what matches say of it and ``PRIOR`` together: their estimate moves poses as far as it
+        By what matches say of it and ``PRIOR`` together: their estimate moves them as far as it
         would if it were taken off, and what it leaves open does too; and by a deviation of the
         logarithm of the ``focal`` length that they do not tell of.
         """
@@ -140,7 +143,11 @@ class LensEvidence:
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
         left[0, 0] += focal**2
-        return self.moves @ (left + size[:, None] * size) @ self.moves.mT
+        square = left + size[:, None] * size
+        depth = self.depth_moves.to(square)
+        return Considered(
+            self.moves @ square @ self.moves.mT, ((depth @ square) * depth).sum(-1).float()
+        )
 
 
 class LensEstimate(NamedTuple):
@@ -222,7 +229,12 @@ def lens_evidence(
     moves = covariance @ pull
     information = [s.information - s.pull.mT @ moves[s.rows] for s in each]
     gradient = [s.gradient + moves[s.rows].mT @ s.descent for s in each]
-    return LensEvidence(scale * torch.stack(information), scale * torch.stack(gradient), moves)
+    depth = torch.zeros(len(problem.T_cw), thinned.count, shapes)
+    for s, source in zip(each, thinned.sources(options), strict=True):
+        depth[source.frame] = thinned.depth_moves(source, s.on_depth.mT, moves)
+    return LensEvidence(
+        scale * torch.stack(information), scale * torch.stack(gradient), moves, depth
+    )
 
 
 class _Reduced(NamedTuple):
@@ -234,6 +246,8 @@ class _Reduced(NamedTuple):
     """Of matches that are off by a size of one on the poses."""
     descent: Float[Tensor, "c"]
     """Of the residuals on the poses."""
+    on_depth: Float[Tensor, "k p"]
+    """Of matches that are off by a size of one on the depths."""
     information: Float[Tensor, "k k"]
     gradient: Float[Tensor, "k"]
     """Direction of descent of the sizes, poses being held."""
@@ -262,6 +276,7 @@ def _reduced(
                 poses,
                 chain.mT @ (along - follow @ on_depth.mT).double(),
                 descent,
+                on_depth,
                 (information - (on_depth * free) @ on_depth.mT).double(),
                 (gradient + (on_depth * free) @ depth.gradient).double(),
             )

@@ -6,13 +6,14 @@ the poses do. Source: the block inverse; Rosinol et al. 2023 use it for dense bu
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import linearised_sources, weighed_residuals
+from geogs.bundle.flow_term import SourceFlow, linearised_sources, weighed_residuals
 from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.problem import sources_within
 from geogs.bundle.projection import linearise, relative_motion
@@ -40,6 +41,15 @@ COMMON_PLACE = 0.15
 lens does (:mod:`geogs.bundle.uncertainty.lens_error`)."""
 
 
+class Considered(NamedTuple):
+    """Second moments of the moves of a solution by errors that are not solved for."""
+
+    covariance: Float[Tensor, "m m"]
+    """Of all poses, as that of :class:`Marginals`."""
+    relative_depth: Float[Tensor, "n c"]
+    """Squares of the moves of its cells' inverse depths, as parts of these."""
+
+
 @dataclass(frozen=True)
 class Marginals:
     """Variances of the free unknowns of a problem, in units and radians; on the CPU.
@@ -65,6 +75,11 @@ class Marginals:
     def is_bounded(self) -> bool:
         """Whether matches tell of all poses."""
         return bool(self.covariance.isfinite().all())
+
+    def beside(self, errors: Considered) -> "Marginals":
+        """With errors that are independent of these."""
+        relative = (self.relative_depth.square() + errors.relative_depth).sqrt()
+        return replace(self, covariance=self.covariance + errors.covariance, relative_depth=relative)
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
@@ -107,41 +122,44 @@ def marginals(
     return Marginals(covariance, relative, _normalised_residual(problem, part, options))
 
 
-def common_covariance(
+def common_errors(
     grid: SampleGrid,
     problem: AnyProblem,
     options: BundleOptions,
     found: Marginals,
     cells: int = 1024,
-) -> Float[Tensor, "m m"]:
-    """Covariance of all poses by what matches have wrong in common, beside that of ``found``.
+) -> Considered:
+    """What matches have wrong in common, beside what ``found`` says of poses and depths.
 
     A glossy floor, a slanted wall, a texture that is smoothed alike in all images: such errors are
     small beside those of a single match, but neither cells nor keyframes average them. No residual
-    tells of them, as the poses follow them. Each is a number of its own, for a part of the image
-    and an axis, that is not solved for; by how much it moves the solution follows from the
+    tells of them, as the solution follows them. Each is a number of its own, for a part of the
+    image and an axis, that is not solved for; by how much it moves the solution follows from the
     equations that ``found`` is the inverse of. Source: consider analysis (Schmidt 1966; Bierman
     1977). Zero where ``found`` knows nothing.
 
     Args:
         grid, problem, options, cells: as of :func:`marginals`, which gave ``found``.
     """
+    relative = torch.zeros_like(found.relative_depth)
     if not found.is_bounded:
-        return torch.zeros_like(found.covariance)
+        return Considered(torch.zeros_like(found.covariance), relative)
     part = ThinnedProblem(grid, problem, cells)
     n = len(problem.T_cw)
     pull = torch.zeros(6 * n, 4 * PLACES[0] * PLACES[1], dtype=torch.float64)
-    for rows, gradient in _common_gradients(part, options):
-        pull[rows] += gradient / part.fraction
+    for source, on_poses, _ in _common_pulls(part, options):
+        pull[source.edges.rows(n)] += on_poses / part.fraction
     moves = found.covariance / ALIKE @ pull
-    return moves @ moves.mT
+    for source, _, on_depths in _common_pulls(part, options):
+        relative[source.frame] = part.depth_moves(source, on_depths, moves).square().sum(1)
+    return Considered(moves @ moves.mT, relative)
 
 
-def _common_gradients(
+def _common_pulls(
     thinned: ThinnedProblem, options: BundleOptions
-) -> Iterator[tuple[Int[Tensor, "c"], Float[Tensor, "c k"]]]:
-    """Each source in order: which unknowns of the poses it joins, and by how much each error
-    that matches have in common, at its deviation, pulls at them once depths have followed."""
+) -> Iterator[tuple[SourceFlow, Float[Tensor, "c k"], Float[Tensor, "p k"]]]:
+    """Each source in order, and by how much each error that matches have in common, at its
+    deviation, pulls at the poses that it joins once depths have followed, and at its depths."""
     camera, rays, place = thinned.flow.camera, thinned.flow.rays, _places(thinned)
     for part in thinned.parts(options):
         i, j = part.source, part.target
@@ -154,14 +172,15 @@ def _common_gradients(
             depth, chain = source.edges.depth, source.edges.chain
             assert depth is not None
             follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
-            pulls = []
+            pulls, owns = [], []
             for axis in (0, 1):
                 pose = p.pose_jacobian[e, :, axis] * unit[e, None, :, axis]
                 own = p.depth_jacobian[e, :, axis] * unit[e, :, axis]
                 for size in (onward[e], torch.full_like(onward[e], COMMON_PLACE)):
                     along = (pose * size[:, None, None]).flatten(0, 1)
-                    pulls.append((along - follow * (size[:, None] * own).sum(0)) @ place)
-            yield source.edges.rows(len(part.T_cw)), chain.mT @ torch.cat(pulls, 1).double()
+                    owns.append((size[:, None] * own).sum(0)[:, None] * place)
+                    pulls.append(along @ place - follow @ owns[-1])
+            yield source, chain.mT @ torch.cat(pulls, 1).double(), torch.cat(owns, 1)
 
 
 def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:

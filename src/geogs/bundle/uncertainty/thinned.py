@@ -6,6 +6,7 @@ Linearised on the CPU, some edges at a time, wherever the matches lie.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -41,6 +42,21 @@ class ThinnedProblem:
         """All sources, in order."""
         for part in self.parts(options):
             yield from linearised_sources(self.flow, part, part.start, options)
+
+    def depth_moves(
+        self, source: SourceFlow, pull: Float[Tensor, "c k"], moves: Float[Tensor, "m k"]
+    ) -> Float[Tensor, "c k"]:
+        """By how much errors of matches, of size one each, move the inverse depths of a source.
+
+        As parts of these: ``C^-1 (pull - E^T moves)``, with what they pull at the depths and the
+        ``moves`` of all poses by them. Zero for what is fixed, or no match tells of.
+        """
+        depth, rows = source.edges.depth, source.edges.rows(len(moves) // 6)
+        assert depth is not None
+        left = pull - source.edges.chained_coupling().mT @ moves[rows].to(pull)
+        scale = depth.curvature * self.inverse_depth[source.frame].clamp(min=1e-12)
+        told = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
+        return torch.where(told[:, None], left / scale[:, None], 0.0)
 
     def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
         """Each source in order, and norms of its matches' residuals in standard deviations."""
