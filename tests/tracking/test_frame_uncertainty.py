@@ -115,7 +115,7 @@ def test_a_frame_is_known_less_than_the_keyframes_around_it():
     frame, blind = (seen(tracker, T, n, (1, 3), 0.5, seed=0).records[0] for n in (2, 3))
     blind.observations = []
     log.records[:] = sorted([*log.records, frame, blind], key=lambda r: r.index)
-    known = keyframe_uncertainty(tracker).calibrated(tracker)
+    known = keyframe_uncertainty(tracker)
     found = frame_uncertainty(tracker)
     own = own_deviations(log, tracker.keyframes)
     assert list(own) == [25]

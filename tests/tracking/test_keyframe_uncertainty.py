@@ -10,11 +10,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.tracking import keyframe_uncertainty as room
-from geogs.tracking.keyframe_uncertainty import (
-    USUAL_RESIDUAL,
-    KeyframeUncertainty,
-    keyframe_uncertainty,
-)
+from geogs.tracking.keyframe_uncertainty import USUAL_RESIDUAL, keyframe_uncertainty
 from planted_walk import drift, planted_tracker
 
 EXACT = BundleOptions(iterations=10, huber=50.0)
@@ -28,27 +24,37 @@ def measured(count: int):
     return tracker
 
 
+def matches_alone(tracker):
+    """What the matches of a tracker say without what is wrong with all of them."""
+    matches = room._Matches.among(tracker, tracker.segment.free)
+    assert matches is not None
+    return marginals.marginals(matches.grid, matches.problem, room.OPTIONS, room.CELLS)
+
+
 def test_the_ends_of_a_walk_without_loops_are_known_least():
-    found = keyframe_uncertainty(measured(14))
-    assert found.keyframes == tuple(range(14))
+    tracker = measured(14)
+    found = keyframe_uncertainty(tracker)
+    assert found.timestamps == pytest.approx([k.timestamp for k in tracker.keyframes])
     for deviation in (found.position, found.rotation):
         assert min(deviation[0], deviation[13]) > 1.2 * deviation.min() > 0
     assert np.isfinite(found.depth).all()
-    assert 1.0 < float(np.median(found.residual)) < 1.4  # of a norm in two dimensions: 1.18
+    residual = matches_alone(tracker).normalised_residual
+    assert 1.0 < float(residual.median()) < 1.4  # of a norm in two dimensions: 1.18
 
 
 def test_a_bent_walk_strains_its_matches():
     tracker = measured(14)
-    before = keyframe_uncertainty(tracker)
+    before = matches_alone(tracker).normalised_residual
     drift(tracker, scale=0.3, yaw=0.4)
-    after = keyframe_uncertainty(tracker)
-    assert float(np.median(after.residual)) > float(np.median(before.residual)) + 0.5
+    after = matches_alone(tracker).normalised_residual
+    assert float(after.median()) > float(before.median()) + 0.5
 
 
 def test_errors_that_all_matches_have_in_common_are_foretold(monkeypatch):
     """Errors of either half of the image in all keyframes, several times as large as usual."""
     flow_size, place_size = 0.5, 1.0
     monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))  # the lens is known
+    monkeypatch.setattr(room, "USUAL_RESIDUAL", np.inf)
     monkeypatch.setattr(marginals, "PLACES", (2, 1))
     monkeypatch.setattr(marginals, "COMMON_FLOW", flow_size)
     monkeypatch.setattr(marginals, "COMMON_PLACE", place_size)
@@ -80,13 +86,12 @@ def test_depths_are_as_unsure_as_lens_and_common_errors_leave_them(monkeypatch):
     lens_known = keyframe_uncertainty(tracker).depth
     monkeypatch.setattr(marginals, "COMMON_FLOW", 0.0)
     monkeypatch.setattr(marginals, "COMMON_PLACE", 0.0)
-    own = keyframe_uncertainty(tracker).depth
+    strained = keyframe_uncertainty(tracker).depth
     assert (unsure > lens_known).all()
-    assert (lens_known > own).all()
-    matches = room._Matches.among(tracker, list(range(14)))
-    assert matches is not None
-    alone = marginals.marginals(matches.grid, matches.problem, room.OPTIONS, room.CELLS)
-    assert own == pytest.approx(alone.depth_deviation.numpy())
+    assert (lens_known > strained).all()
+    monkeypatch.setattr(room, "USUAL_RESIDUAL", np.inf)
+    own = keyframe_uncertainty(tracker).depth
+    assert own == pytest.approx(matches_alone(tracker).depth_deviation.numpy())
 
 
 def test_parts_of_a_long_walk_follow_each_other(monkeypatch):
@@ -101,16 +106,23 @@ def test_parts_of_a_long_walk_follow_each_other(monkeypatch):
     assert parts.position[4:].max() >= 0.5 * whole.position[4:].max()
 
 
-def test_strain_makes_deviations_larger():
+def test_strain_makes_matches_as_much_less_sure_and_the_lens_no_less(monkeypatch):
     tracker = measured(6)
-    one = np.ones(6)
-    calm = KeyframeUncertainty(tuple(range(6)), one, one, one, 0.5 * USUAL_RESIDUAL * one)
-    strained = KeyframeUncertainty(tuple(range(6)), one, one, one, 2 * USUAL_RESIDUAL * one)
-    assert calm.calibrated(tracker).position == pytest.approx(one)
-    found = strained.calibrated(tracker)
-    assert found.position == pytest.approx(2 * one)
-    assert found.depth == pytest.approx(2 * one)
-    assert found.timestamps == pytest.approx([k.timestamp for k in tracker.keyframes])
+    residual = matches_alone(tracker).normalised_residual.numpy() / USUAL_RESIDUAL
+    monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))
+    strained = keyframe_uncertainty(tracker)
+    monkeypatch.setattr(room, "USUAL_RESIDUAL", np.inf)
+    calm = keyframe_uncertainty(tracker)
+    factor = np.sqrt(np.mean(np.square(residual)))
+    assert factor > 2
+    assert strained.position == pytest.approx(factor * calm.position)
+    assert strained.depth == pytest.approx(residual * calm.depth)
+    monkeypatch.setattr(lens_error, "PRIOR", (3e2, 1e-9, 1e-9))
+    lens_open = keyframe_uncertainty(tracker)
+    monkeypatch.setattr(room, "USUAL_RESIDUAL", USUAL_RESIDUAL)
+    both = keyframe_uncertainty(tracker)
+    by_lens = np.square(lens_open.position) - np.square(calm.position)
+    assert np.square(both.position) - np.square(strained.position) == pytest.approx(by_lens)
 
 
 def test_without_matches_nothing_is_known():

@@ -28,14 +28,14 @@ in common. Read off rendered videos (docs/tracking.md has the table)."""
 def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     """Deviations of all tracked frames of a tracker that has a map, by its present edges.
 
-    A frame between keyframes is as far off as they are (their calibrated deviations, interpolated
-    in time), and by what its own few matches leave open beside (:func:`own_deviations`); the two
+    A frame between keyframes is as far off as they are (their deviations, interpolated in
+    time), and by what its own few matches leave open beside (:func:`own_deviations`); the two
     are independent. Depths are those of the keyframes around.
     """
     log, keyframes = tracker.map.recorder.log, tracker.keyframes
     tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
     times = np.array([r.timestamp for r in tracked], np.float64)
-    around = keyframe_uncertainty(tracker).calibrated(tracker).at(times)
+    around = keyframe_uncertainty(tracker).at(times)
     known = {k.frame_index: PoseDeviation(0.0, 0.0) for k in keyframes}
     known |= own_deviations(log, keyframes)
     unknown = PoseDeviation(np.inf, np.inf)

@@ -1,12 +1,12 @@
 """How well a tracker knows its keyframes, by what all its matches leave open."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import methodcaller
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.problem import BundleProblem, StreamedProblem
@@ -34,36 +34,7 @@ USUAL_RESIDUAL = 0.23
 videos (docs/tracking.md has the table)."""
 
 
-@dataclass(frozen=True)
-class KeyframeUncertainty:
-    """What matches leave open, and how far they contradict the model; earliest keyframe first."""
-
-    keyframes: tuple[int, ...]
-    """Ids."""
-    position: Float64[np.ndarray, "n"]
-    """Standard deviation of the camera's centre, map units, all axes together; infinite where
-    nothing is known, as the others."""
-    rotation: Float64[np.ndarray, "n"]
-    """Likewise of its orientation, radians."""
-    depth: Float64[np.ndarray, "n"]
-    """Relative deviation of the best known of its depths (:class:`Marginals`)."""
-    residual: Float64[np.ndarray, "n"]
-    """Median residual of its matches, in their deviations."""
-
-    def calibrated(self, tracker: Tracker) -> Uncertainty:
-        """Deviations that hold where the scene is not as modelled, too: matches are as many times
-        as unsure as they say as their residuals are longer than usual."""
-        residual = np.where(np.isfinite(self.residual), self.residual / USUAL_RESIDUAL, 1.0)
-        residual = np.maximum(residual, 1.0)
-        factor = float(np.sqrt(np.mean(np.square(residual)))) if len(residual) else 1.0
-        times = [tracker.keyframes[k].timestamp for k in self.keyframes]
-        return Uncertainty(
-            np.array(times, np.float64), factor * self.position, factor * self.rotation,
-            residual * self.depth,
-        )  # fmt: skip
-
-
-def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
+def keyframe_uncertainty(tracker: Tracker) -> Uncertainty:
     """Uncertainty of all keyframes of a tracker that has a map, from its present edges.
 
     What it says of poses is what is left of their errors when the trajectory is laid over the truth
@@ -76,17 +47,15 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
     say, and what is said of it is rather too much.
     """
     ids = tracker.segment.free
-    position, rotation, depth, residual = (np.full(len(ids), np.inf) for _ in range(4))
+    times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
+    position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
     propagated = np.zeros(2)
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
         found = _marginals(tracker, ids[part])
         if found is None:
             continue
-        depth[part], residual[part] = (
-            found.depth_deviation.numpy(),
-            found.normalised_residual.numpy(),
-        )
+        depth[part] = found.depth_deviation.numpy()
         if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
             T_cw = tracker.keyframes.poses(ids)
             position[:], rotation[:] = deviations_after_alignment(T_cw, found.covariance)
@@ -95,7 +64,7 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
         squares = squares + propagated
         position[part], rotation[part] = np.sqrt(squares).T
         propagated = squares[-1] if not tracker.segment.fixed else propagated
-    return KeyframeUncertainty(tuple(ids), position, rotation, depth, residual)
+    return Uncertainty(times, position, rotation, depth)
 
 
 def said_of_lens(
@@ -157,19 +126,32 @@ class _Matches:
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
-    """Marginals of some keyframes, with what all their matches have wrong in common."""
+    """Marginals of some keyframes, with what all their matches have wrong in common.
+
+    They hold where the scene is not as modelled, too: matches are as many times as unsure as they
+    say as their residuals are longer than usual. What is known of the lens does not hang on that.
+    """
     matches = _Matches.among(tracker, ids)
     if matches is None:
         return None
+    own = torch.tensor([matches.frames.index(k) for k in ids])
     found = marginals(matches.grid, matches.problem, OPTIONS, CELLS)
+    longer = (found.normalised_residual / USUAL_RESIDUAL).clamp(min=1)
+    longer = torch.where(longer.isfinite(), longer, 1.0)
     said = matches.lens() if found.is_bounded else None
     if said is not None:
-        common = common_errors(matches.grid, matches.problem, OPTIONS, found, CELLS)
+        found = found.beside(common_errors(matches.grid, matches.problem, OPTIONS, found, CELLS))
+    found = replace(
+        found,
+        covariance=longer[own].square().mean() * found.covariance,
+        relative_depth=longer[:, None] * found.relative_depth,
+    )
+    if said is not None:
         lens = tracker.keyframes.table.lens
-        focal = 0.0 if lens is None else lens.deviation_focal
-        found = found.beside(common).beside(said.considered(focal))
-    own = torch.tensor([matches.frames.index(k) for k in ids])
+        found = found.beside(said.considered(0.0 if lens is None else lens.deviation_focal))
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     return Marginals(
-        found.covariance[rows[:, None], rows], found.relative_depth[own], found.normalised_residual[own]
+        found.covariance[rows[:, None], rows],
+        found.relative_depth[own],
+        found.normalised_residual[own],
     )

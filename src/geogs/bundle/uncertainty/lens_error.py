@@ -121,23 +121,24 @@ class LensEvidence:
     def bend(self) -> "LensEstimate":
         """Of k1 and k2, the focal length being right."""
         k = slice(1, SHAPES)
-        return _estimate(self.information[:, k, k], self.gradient[:, k], LEAST[1:])
+        return _estimate(self.information[:, k, k], self.gradient[:, k]).floored(LEAST[1:])
 
     @property
     def whole(self) -> "LensEstimate":
         """Of all sizes together."""
-        return _estimate(
-            self.information, self.gradient, (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
-        )
+        least = (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
+        return _estimate(self.information, self.gradient).floored(least)
 
     def considered(self, focal: float = 0.0) -> Considered:
         """The error that the lens has, and what it does to poses and depths.
 
         By what matches say of it and ``PRIOR`` together: their estimate moves them as far as it
         would if it were taken off, and what it leaves open does too; and by a deviation of the
-        logarithm of the ``focal`` length that they do not tell of.
+        logarithm of the ``focal`` length that they do not tell of. Without ``LEAST``: what matches
+        have wrong in common is taken for an error of the lens that hardly moves a pose, and three
+        sizes that were each so unsure would move them two to five times as far.
         """
-        said = self.whole
+        said = _estimate(self.information, self.gradient)
         prior = self.moves.new_tensor(PRIOR).square()
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
@@ -173,15 +174,18 @@ class LensEstimate(NamedTuple):
         moved = self.size + gain * (value - self.size[size])
         return LensEstimate(moved, self.covariance - gain[:, None] * column)
 
+    def floored(self, least: tuple[float, ...]) -> "LensEstimate":
+        """With no size known better than so."""
+        floor = torch.diag(self.size.new_tensor(least).square())
+        return LensEstimate(self.size, self.covariance + floor)
+
     @property
     def evidence(self) -> float:
         """Square of the sizes in their deviations."""
         return float(self.size @ torch.linalg.solve(self.covariance, self.size))
 
 
-def _estimate(
-    each: Float[Tensor, "s k k"], gradient: Float[Tensor, "s k"], least: tuple[float, ...]
-) -> LensEstimate:
+def _estimate(each: Float[Tensor, "s k k"], gradient: Float[Tensor, "s k"]) -> LensEstimate:
     """The sizes that matches want, and their covariance.
 
     That is what the matches themselves leave open, and a cluster-robust one beside, by source
@@ -193,8 +197,7 @@ def _estimate(
     inverse = torch.linalg.inv(information + damping)
     size = inverse @ gradient.sum(0)
     left = gradient - each @ size
-    floor = torch.diag(information.new_tensor(least).square())
-    return LensEstimate(size, inverse + inverse @ left.mT @ left @ inverse + floor)
+    return LensEstimate(size, inverse + inverse @ left.mT @ left @ inverse)
 
 
 def lens_evidence(
