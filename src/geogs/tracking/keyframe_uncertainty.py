@@ -170,6 +170,5 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
         found = found.beside(common).beside(said.considered(focal))
     own = torch.tensor([matches.frames.index(k) for k in ids])
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
-    return Marginals(
-        found.covariance[rows[:, None], rows], found.relative_depth[own], found.normalised_residual[own]
-    )
+    covariance = found.covariance[rows[:, None], rows]
+    return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])

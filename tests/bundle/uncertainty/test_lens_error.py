@@ -193,7 +193,9 @@ def test_what_is_said_of_poses_is_the_mean_square_over_lenses():
 
 def test_without_evidence_the_lens_is_as_unsure_as_before():
     moves = torch.eye(3).double()
-    found = LensEvidence(torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves, moves[None])
+    found = LensEvidence(
+        torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves, moves[None]
+    )
     wanted = torch.diag(torch.tensor(PRIOR).double().square())
     # Nothing is said of it, whatever is estimated.
     assert float((found.considered().covariance - wanted).abs().max()) < 1e-3 * float(wanted.max())
