@@ -217,8 +217,8 @@ class Uncertainty(ShortRepr):
     rotation: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """That of its orientation, radians."""
     depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
-    """That of its depths, as a part of them: of the best known quarter of what it sees, as bare
-    walls tell nothing."""
+    """That of its depths, as a part of them, where the trajectory is as long as the true one: of
+    the best known quarter of what it sees, as bare walls tell nothing."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""

@@ -150,8 +150,5 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
         lens = tracker.keyframes.table.lens
         found = found.beside(said.considered(0.0 if lens is None else lens.deviation_focal))
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
-    return Marginals(
-        found.covariance[rows[:, None], rows],
-        found.relative_depth[own],
-        found.normalised_residual[own],
-    )
+    covariance = found.covariance[rows[:, None], rows]
+    return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])

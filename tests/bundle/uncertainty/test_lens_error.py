@@ -190,7 +190,9 @@ def test_what_is_said_of_poses_is_the_mean_square_over_lenses():
 
 def test_no_size_is_said_to_be_known_better_than_least():
     each = 1e12 * torch.eye(3).double().expand(2, 3, 3)
-    found = LensEvidence(each, torch.zeros(2, 3).double(), torch.eye(3).double(), torch.eye(3)[None])
+    found = LensEvidence(
+        each, torch.zeros(2, 3).double(), torch.eye(3).double(), torch.eye(3)[None]
+    )
     assert found.whole.deviation.tolist() == pytest.approx(LEAST, rel=1e-5)
     assert found.bend.deviation.tolist() == pytest.approx(LEAST[1:], rel=1e-5)
     assert float(found.considered().covariance.max()) < 1e-11  # which moves no pose
@@ -198,7 +200,9 @@ def test_no_size_is_said_to_be_known_better_than_least():
 
 def test_without_evidence_the_lens_is_as_unsure_as_before():
     moves = torch.eye(3).double()
-    found = LensEvidence(torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves, moves[None])
+    found = LensEvidence(
+        torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves, moves[None]
+    )
     wanted = torch.diag(torch.tensor(PRIOR).double().square())
     # Nothing is said of it, whatever is estimated.
     assert float((found.considered().covariance - wanted).abs().max()) < 1e-3 * float(wanted.max())

@@ -6,7 +6,7 @@ the poses do. Source: the block inverse; Rosinol et al. 2023 use it for dense bu
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -79,7 +79,7 @@ class Marginals:
     def beside(self, errors: Considered) -> "Marginals":
         """With errors that are independent of these."""
         relative = (self.relative_depth.square() + errors.relative_depth).sqrt()
-        return replace(self, covariance=self.covariance + errors.covariance, relative_depth=relative)
+        return Marginals(self.covariance + errors.covariance, relative, self.normalised_residual)
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
