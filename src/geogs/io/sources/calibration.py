@@ -97,8 +97,12 @@ class Calibration:
 
     @property
     def is_found_lens(self) -> bool:
-        """Whether focal length and distortion are what the video itself said of them."""
-        return self.refinement is not None and self.refinement.deviations is not None
+        """Whether the focal length is what the video itself said of it, and the distortion, too; a
+        lens of which it said that it does not bend counts as found."""
+        said = self.refinement
+        if said is None or said.failure is not None:
+            return False
+        return said.deviations is not None or not self.is_distorted
 
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
