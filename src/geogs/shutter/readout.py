@@ -16,22 +16,23 @@ from jaxtyping import Float
 
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.clip_tracks import ClipTracks, clip_tracks
+from geogs.shutter.clip_tracks import LEAST_IMAGES, ClipTracks, clip_tracks
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.neighbours import Image
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.row_adjustment import ReadoutEquation, readout_equation
 from geogs.threads import thread_map
 
-CLIP = 30
-"""Neighbouring images that points are followed through."""
+CLIP, SPAN = 30, 3.0
+"""Neighbouring images that points are followed through, and seconds that these last, at most: where
+images are far apart, the first and the last of so many would show other places."""
 CLIPS = 12
 """That are worth giving, from all over the video."""
 ENOUGH_CLIPS, ENOUGH = (5, 7, 9), 0.002
 """No more clips are looked at where so many leave a standard error of so many seconds."""
 CONFIDENT, SMALL = 3.0, 0.01
 """Nor where the readout is less than so many seconds by so many standard errors."""
-LONGEST_INTERVAL = 0.12
+LONGEST_INTERVAL = 0.26
 """Seconds between two images; over more, nothing says how points move from one to the next."""
 FIRST_TOLERANCE = 1.2
 """Pixels of an inlier between the two views that a clip begins with."""
@@ -154,8 +155,8 @@ def find_readout(
     """Find the readout with which clips of a video fit best; 0 unless it is clearly better.
 
     Args:
-        clips: ``CLIP`` neighbours in the video each; no more are taken than are needed, and the
-            points of several are followed at a time.
+        clips: up to ``CLIP`` neighbours in the video each; no more are taken than are needed, and
+            the points of several are followed at a time.
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
         lens_is_known: else its k1 and k2 are estimated, too; they would be taken for rows.
@@ -186,7 +187,7 @@ def _reported(report: Report, before: int, group: int, fraction: float) -> None:
 def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
     """A clip whose points are followed and whose poses are known roughly."""
     intervals = np.diff([image.timestamp for image in clip])
-    if len(clip) < CLIP or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
+    if len(clip) < LEAST_IMAGES or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
         return None
     tracks = clip_tracks(clip, camera)
     if tracks is None:
