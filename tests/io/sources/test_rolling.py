@@ -136,6 +136,15 @@ def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
     assert given == [[1, 2, 3], [3, 4, 5], [5, 6, 7], [7, 8, 9], [9, 10, 11]]
 
 
+@pytest.mark.parametrize(("interval", "images"), [(200, 15), (10_000, 1)])
+def test_clips_of_few_images_a_second_last_three_seconds(tmp_path, interval, images):
+    shown = [np.full((48, 64, 3), 6 * k, np.uint8) for k in range(40)]
+    times = [interval * k for k in range(40)]
+    write_video(tmp_path / "video.mp4", shown, times)
+    source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5"))
+    assert {len(clip) for clip in source.clips()} == {images}
+
+
 def test_who_says_what_the_shutter_is(folder):
     unsaid, given = open_source(folder, InputConfig(INTRINSICS)), opened(folder)
     assert unsaid.is_shutter_open

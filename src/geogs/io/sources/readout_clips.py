@@ -19,7 +19,7 @@ def read_clips(
     they come from its first minute.
     """
     ends = [n for n in (config.stop, reader.info.length) if n is not None]
-    clip = min(CLIP, round(SPAN * reader.info.fps))
+    clip = min(CLIP, max(1, round(SPAN * reader.info.fps)))
     count = min(ends) - config.start if ends else clip * CLIPS
     if len(reader.paths) > 1:
         starts = clip_starts(config.start, count, clip)
