@@ -10,7 +10,7 @@ from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.runners.runner import Task
 
 SCALE = 0.25
@@ -39,7 +39,7 @@ def write_truth(folder: Path, name: str = "hall") -> BenchmarkScene:
     folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "traj.txt", poses().reshape(-1, 16))
     write_mesh(folder / "mesh.ply", *wall())
-    truth = Truth(TruePoses(folder / "traj.txt"), folder / "mesh.ply", culling="done")
+    truth = Truth(folder / "traj.txt", folder / "mesh.ply", culling="done")
     return BenchmarkScene(name, folder, truth)
 
 
