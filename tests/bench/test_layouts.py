@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench_results import options_of
 from flat_rooms import SIZE, flat_room
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
@@ -96,9 +97,9 @@ def test_a_mix_of_rooms_and_objects_is_run_and_reconstructed(tmp_path):
     commands = {(j.scene.name, j.variant): j.task.command for j in jobs}
     assert commands["den", "paper"] == "run"
     assert commands["vase", "default"] == commands["vase", "paper"] == "reconstruct"
-    vase = next(j.task for j in jobs if (j.scene.name, j.variant) == ("vase", "paper"))
-    assert vase.option("online-results") is None
-    assert (vase.option("budget"), vase.option("preset")) == ("120s", "paper")
+    vase = next(options_of(j.task) for j in jobs if (j.scene.name, j.variant) == ("vase", "paper"))
+    assert "online-results" not in vase
+    assert (vase["budget"], vase["preset"]) == ("120s", "paper")
 
 
 def test_known_poses_use_about_a_hundred_images(tmp_path):
