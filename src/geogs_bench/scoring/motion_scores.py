@@ -7,7 +7,12 @@ from jaxtyping import Float
 
 from geogs.errors import InputError
 from geogs.evaluation.rotation_errors import best_rotation, rotation_angle
-from geogs.evaluation.trajectory_errors import associate, evaluate_trajectory, finite_poses
+from geogs.evaluation.trajectory_errors import (
+    associate,
+    evaluate_trajectory,
+    extent_of,
+    finite_poses,
+)
 from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses
@@ -74,7 +79,7 @@ def compare_motion(
         ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
     except InputError:  # they are on a line
         return MotionScore(percentage, rotation=rotation)
-    extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
+    extent = extent_of(reference.T_wc[i])
     turned = 0 if oriented is None else len(finite_poses(oriented).timestamps) - len(i)
     followed = percentage + 100 * turned / len(reference.timestamps)
     good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent
