@@ -146,7 +146,7 @@ def score_given(
     summary = result.summary
     seconds = float(summary.get("seconds", {}).get("total", 0.0))
     provenance = Provenance(
-        benchmark.command, str(summary.get("version", "")), machine_name(),
+        benchmark.command, str(summary.get("versions", {}).get("geogs", "")), machine_name(),
         str(summary.get("device", "")), int(summary.get("seed", 0)), "",
     )  # fmt: skip
     record = Record(benchmark.name, scene.name, "", str(result.path), provenance)
