@@ -10,8 +10,9 @@ from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
-from geogs_bench.runners.runner import Task
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
+from geogs_bench.runners.runner import Runner
+from geogs_bench.runners.task import Task
 
 SCALE = 0.25
 """Map units per metre of the results."""
@@ -24,6 +25,10 @@ def wall(offset: float = 0.0, n: int = 41) -> tuple[np.ndarray, np.ndarray]:
     i = np.arange(n * n).reshape(n, n)
     a, b, c, d = (x.ravel() for x in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
     return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+
+
+def options_of(task: Task) -> dict[str, str | None]:
+    return {option.name: option.value for option in task.options}
 
 
 def poses(n: int = 20) -> np.ndarray:
@@ -39,7 +44,7 @@ def write_truth(folder: Path, name: str = "hall") -> BenchmarkScene:
     folder.mkdir(parents=True, exist_ok=True)
     np.savetxt(folder / "traj.txt", poses().reshape(-1, 16))
     write_mesh(folder / "mesh.ply", *wall())
-    truth = Truth(TruePoses(folder / "traj.txt"), folder / "mesh.ply", culling="done")
+    truth = Truth(folder / "traj.txt", folder / "mesh.ply", culling="done")
     return BenchmarkScene(name, folder, truth)
 
 
@@ -76,7 +81,7 @@ def write_result(
     (folder / "summary.json").write_text(json.dumps(summary))
 
 
-class FakeRunner:
+class FakeRunner(Runner):
     """Leaves a hand-made trajectory; fails for the sources that it is told to."""
 
     def __init__(self, failing: dict[str, BaseException] | None = None) -> None:
@@ -84,7 +89,7 @@ class FakeRunner:
         self.done: list[str] = []
 
     def settings(self, task: Task) -> dict[str, object]:
-        return {"seed": 3, **{option.name: option.value for option in task.options}}
+        return {"seed": 3, **options_of(task)}
 
     def run(self, task: Task) -> None:
         self.done.append(task.source.name)

@@ -47,11 +47,16 @@ def scattered(seed: int, count: int = 60) -> np.ndarray:
 
 
 def clip_of(
-    path: Path, points: np.ndarray, readout: float, images: int = 30, noise: float = 0.05
+    path: Path,
+    points: np.ndarray,
+    readout: float,
+    images: int = 30,
+    noise: float = 0.05,
+    rate: float = RATE,
 ) -> ClipTracks:
     """What is seen of points, with that many pixels of noise; every tenth view is missing."""
     rng = np.random.default_rng(0)
-    times = (np.arange(images) - images // 2) / RATE
+    times = (np.arange(images) - images // 2) / rate
     pixels = np.stack([seen(path, points, t, readout) for t in times])
     pixels += rng.normal(0, noise, pixels.shape)
     rays = np.stack([WIDE.rays(p) for p in pixels])

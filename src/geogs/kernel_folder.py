@@ -47,7 +47,7 @@ def temporary_folder() -> Path:
     """
     import tempfile  # a tenth of the time of ``geogs --version``, and seldom needed
 
-    user = os.getuid() if hasattr(os, "getuid") else 0
+    user = os.getuid()
     folder = Path(tempfile.gettempdir()) / f"geogs-kernels-{user}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -26,7 +26,7 @@ def available_cores() -> int:
     """CPUs that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
+    except AttributeError:  # not on macOS
         return os.cpu_count() or 1
 
 

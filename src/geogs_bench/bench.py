@@ -13,7 +13,7 @@ from geogs_bench.data.motion_cells import render_cells
 from geogs_bench.harness import Harness, score_given
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
 from geogs_bench.results.record import Record
-from geogs_bench.runners.command_runners import runners
+from geogs_bench.runners.runner import Runner
 
 _FRAMES, _WIDTH, _HEIGHT = 280, 640, 480
 """As long as the path takes to come back to its start."""
@@ -46,7 +46,7 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:
     scenes = find_scenes(benchmark, data.expanduser(), wishes.scenes)
     jobs = make_jobs(benchmark, scenes, output, wishes)
     harness = Harness(
-        benchmark, output, runners(), say, fresh=settings.fresh, rescore=settings.rescore
+        benchmark, output, Runner(), say, fresh=settings.fresh, rescore=settings.rescore
     )
     return Benched(benchmark, output, harness.run(jobs))
 

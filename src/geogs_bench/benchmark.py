@@ -8,7 +8,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
 from geogs_bench.data.motion_cells import Cell
 from geogs_bench.published import PublishedTable
 from geogs_bench.results.record import Record
-from geogs_bench.runners.runner import Command
+from geogs_bench.runners.task import Command
 
 
 @dataclass(frozen=True)

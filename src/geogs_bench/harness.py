@@ -24,7 +24,7 @@ from geogs_bench.results.store import (
     records_below,
     write_completed_run,
 )
-from geogs_bench.runners.runner import Command, Runner
+from geogs_bench.runners.runner import Runner
 from geogs_bench.scoring.scores import scored
 from geogs_bench.tables.benchmark_report import write_report
 
@@ -38,7 +38,7 @@ class Harness:
         self,
         benchmark: Benchmark,
         output: Path,
-        runners: Mapping[Command, Runner],
+        runner: Runner,
         say: Callable[[str], None] = print,
         fresh: bool = False,
         rescore: bool = False,
@@ -46,7 +46,7 @@ class Harness:
         """``fresh`` runs everything anew; ``rescore`` only scores it anew."""
         self._benchmark = benchmark
         self._output = output
-        self._runners = runners
+        self._runner = runner
         self._say = say
         self._fresh = fresh
         self._rescore = rescore
@@ -63,7 +63,7 @@ class Harness:
             InputError: an option does not exist or fit; found before anything is run.
             OutputError: the folder cannot be written.
         """
-        settings = [self._runners[job.task.command].settings(job.task) for job in jobs]
+        settings = [self._runner.settings(job.task) for job in jobs]
         prepare_output_folder(self._output)
         records: list[Record] = []
         for number, (job, values) in enumerate(zip(jobs, settings, strict=True), start=1):
@@ -119,7 +119,7 @@ class Harness:
         folder = clear(job.task.output)
         forget_peak_memory()
         start = time.perf_counter()
-        self._runners[job.task.command].run(job.task)
+        self._runner.run(job.task)
         seconds = time.perf_counter() - start
         result = ResultFolder(folder)
         if result.summary.get("interrupted"):
@@ -146,7 +146,7 @@ def score_given(
     summary = result.summary
     seconds = float(summary.get("seconds", {}).get("total", 0.0))
     provenance = Provenance(
-        benchmark.command, str(summary.get("version", "")), machine_name(),
+        benchmark.command, str(summary.get("versions", {}).get("geogs", "")), machine_name(),
         str(summary.get("device", "")), int(summary.get("seed", 0)), "",
     )  # fmt: skip
     record = Record(benchmark.name, scene.name, "", str(result.path), provenance)

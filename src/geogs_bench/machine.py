@@ -2,20 +2,19 @@
 
 import ctypes
 import gc
-import os
 import platform
 import subprocess
 from contextlib import suppress
 from pathlib import Path
 
 from geogs.gpu.kernel_source import PACKAGE
+from geogs.threads import available_cores
 from geogs.version import __version__
 
 
 def machine_name() -> str:
     """Processor and the number of cores that may be used."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{_processor()}, {cores} cores"
+    return f"{_processor()}, {available_cores()} cores"
 
 
 def first_processor() -> dict[str, str]:

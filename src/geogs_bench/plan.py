@@ -7,7 +7,7 @@ from pathlib import Path
 from geogs.errors import InputError
 from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
-from geogs_bench.runners.runner import Command, Task
+from geogs_bench.runners.task import Command, Task
 
 _BUDGET = 120.0
 """Seconds of reconstructions beside runs."""

@@ -25,9 +25,8 @@ class WorkFolder:
     def __init__(self, place: StoragePath) -> None:
         self._place = place
         mark = sha256(place.address.encode("utf-8", "backslashreplace")).hexdigest()[:16]
-        user = os.getuid() if hasattr(os, "getuid") else ""
         # The same path on every node: a checkpoint holds that of its source.
-        self.scratch = Path(tempfile.gettempdir()) / f"geogs-fleet-{user}" / mark
+        self.scratch = Path(tempfile.gettempdir()) / f"geogs-fleet-{os.getuid()}" / mark
         self.path = place.path or self.scratch / "result"
         self._kept: tuple[int, int] | None = None
         try:

@@ -38,21 +38,11 @@ FEWEST_MATCHES = 15
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
-    """A photograph that has no pose."""
-
-    name: str
-    reason: str
-    """A clause that goes on after the name."""
-
-
-@dataclass(frozen=True, slots=True)
 class FoundPoses:
     """What structure from motion came to."""
 
-    placed: tuple[str, ...]
-    """Names of the photographs that have a pose."""
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[tuple[str, str], ...]
+    """Names of photographs that have no pose, each with the reason as a clause."""
     error: float
     """Mean distance of the points from where they were seen, pixels of the stored pictures."""
 
@@ -99,7 +89,7 @@ def find_poses(
     with tempfile.TemporaryDirectory(prefix="geogs-photos-") as work:
         database = Path(work) / "database.db"
         parts, kept = structure_of(database, cameras, entries, pairs, seed, progress)
-    left_out = [LeftOut(name, "cannot be read") for name in folder.damaged]
+    left_out = [(name, "cannot be read") for name in folder.damaged]
     left_out += reasons(entries, kept, [_names(part) for part in parts])
     if not parts:
         raise InputError(_nothing_found(folder.root, entries, kept))
@@ -110,8 +100,7 @@ def find_poses(
     best.extract_colors_for_all_images(folder.root, worker_count())
     model.mkdir(parents=True, exist_ok=True)
     best.write(model)
-    placed = tuple(name for name in names if name in _names(best))
-    return FoundPoses(placed, tuple(left_out), float(best.compute_mean_reprojection_error()))
+    return FoundPoses(tuple(left_out), float(best.compute_mean_reprojection_error()))
 
 
 def structure_of(
@@ -149,8 +138,10 @@ def shared_cameras(
     return cameras, [places[photograph.lens] for photograph in photographs]
 
 
-def reasons(entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]]) -> list[LeftOut]:
-    """Why each picture that is not in the first part is not."""
+def reasons(
+    entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]]
+) -> list[tuple[str, str]]:
+    """Names of the pictures that are not in the first part, and why they are not."""
     left_out = []
     for place, entry in enumerate(entries):
         if parts and entry.name in parts[0]:
@@ -167,7 +158,7 @@ def reasons(entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]
             most = int(kept[place].max())
             with_name = entries[int(kept[place].argmax())].name
             reason = f"shares too little with the others (most, {most} matches, with {with_name})"
-        left_out.append(LeftOut(entry.name, reason))
+        left_out.append((entry.name, reason))
     return left_out
 
 

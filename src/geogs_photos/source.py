@@ -17,7 +17,7 @@ from geogs.io.writers.atomic import write_text
 from geogs.io.writers.replacement import replaced
 from geogs_photos.effort import features_for, stages_of_poses, what_does_not_fit
 from geogs_photos.photograph import PhotoFolder, find_photographs
-from geogs_photos.poses import FoundPoses, LeftOut, find_poses
+from geogs_photos.poses import FoundPoses, find_poses
 
 NAMED = 8
 """Photographs that were left out and are named one by one on the terminal."""
@@ -80,11 +80,10 @@ def _source(
     auto = replace(config.input, intrinsics="auto", start=0, stop=None, stride=1)
     unlike = OneCamera(posed.files, auto).unlike()
     names = [file.path.relative_to(chosen.root).as_posix() for file in posed.files]
-    left_out = [(out.name, out.reason) for out in found.left_out]
-    left_out += [(names[i], "was taken with quite another camera than most") for i in unlike]
+    others = [(names[i], "was taken with quite another camera than most") for i in unlike]
     posed = posed.only([i for i in range(len(names)) if i not in set(unlike)])
     name = expanded(folder).resolve().name
-    posed = replace(posed, kind="photographs", name=name, left_out=tuple(left_out))
+    posed = replace(posed, kind="photographs", name=name, left_out=(*found.left_out, *others))
     return PosedSource(posed, auto, hold_out)
 
 
@@ -108,7 +107,7 @@ def _read(note: Path) -> FoundPoses:
     """What an earlier call found. Raises InputError if that cannot be read."""
     try:
         values = read_json(note)
-        left_out = tuple(LeftOut(str(o["name"]), str(o["reason"])) for o in values["left_out"])
-        return FoundPoses(tuple(map(str, values["placed"])), left_out, float(values["error"]))
+        left_out = tuple((str(name), str(why)) for name, why in values["left_out"])
+        return FoundPoses(left_out, float(values["error"]))
     except UNUSABLE as error:
         raise InputError(f"{note} is damaged; leave out --resume.") from error

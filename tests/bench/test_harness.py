@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bench_results import FakeRunner, write_truth
+from bench_results import FakeRunner, options_of, write_truth
 from geogs.errors import InputError
 from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
@@ -37,8 +37,7 @@ def scenes(tmp_path) -> list[BenchmarkScene]:
 
 def run(test: Benchmark, scenes, output: Path, runner: FakeRunner, wishes=None, **how):
     jobs = make_jobs(test, scenes, output, wishes or Wishes())
-    runners = dict.fromkeys(("run", "reconstruct", "colour-2dgs"), runner)
-    return Harness(test, output, runners, lambda text: None, **how).run(jobs)
+    return Harness(test, output, runner, lambda text: None, **how).run(jobs)
 
 
 def test_every_scene_is_run_scored_and_reported(scenes, tmp_path):
@@ -122,8 +121,8 @@ def test_variants_have_folders_and_their_options_win(scenes, tmp_path):
     wishes = Wishes(options=(Option("mapping.iterations", "5"), Option("seed", "1")))
     jobs = make_jobs(test, scenes[:1], tmp_path, wishes)
     assert [job.task.output for job in jobs] == [tmp_path / "attic/slow", tmp_path / "attic/fast"]
-    assert [job.task.option("mapping.iterations") for job in jobs] == ["20", "2"]
-    assert jobs[0].task.option("seed") == "1"
+    assert [options_of(job.task)["mapping.iterations"] for job in jobs] == ["20", "2"]
+    assert options_of(jobs[0].task)["seed"] == "1"
     with pytest.raises(InputError, match="no variant medium, only slow, fast"):
         make_jobs(test, scenes, tmp_path, Wishes(variants=("medium",)))
 
@@ -133,7 +132,7 @@ def test_depth_is_used_where_it_is_there(scenes, tmp_path):
     test = benchmark(scenes, variants=(Variant("rgb"), depth))
     scenes = [scenes[0], replace(scenes[1], has_depth=True)]
     jobs = make_jobs(test, scenes, tmp_path, Wishes())
-    assert [(job.scene.name, job.variant, job.task.option("depth")) for job in jobs] == [
+    assert [(job.scene.name, job.variant, options_of(job.task).get("depth")) for job in jobs] == [
         ("attic", "rgb", None), ("cellar", "rgb", None), ("cellar", "rgb-d", "sensor"),
     ]  # fmt: skip
     with pytest.raises(InputError, match="No scene has depth images, which rgb-d needs"):
@@ -144,7 +143,7 @@ def test_budgets_and_the_baseline_make_variants(scenes, tmp_path):
     test = benchmark(scenes, command="reconstruct", budgets=(120.0,))
     wishes = Wishes(budgets=(20.0, 60.0), baseline=True)
     jobs = make_jobs(test, scenes[:1], tmp_path, wishes)
-    assert [(job.variant, job.task.command, job.task.option("budget")) for job in jobs] == [
+    assert [(job.variant, job.task.command, options_of(job.task)["budget"]) for job in jobs] == [
         ("20s", "reconstruct", "20s"),
         ("60s", "reconstruct", "60s"),
         ("colour-2dgs-20s", "colour-2dgs", "20s"),

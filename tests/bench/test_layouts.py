@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench_results import options_of
 from flat_rooms import SIZE, flat_room
 from geogs.errors import InputError
+from geogs.io.sources.sniff import open_source
 from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
 from geogs_bench.data.benchmark_scene import Option
 from geogs_bench.data.dtu_scenes import find_dtu
@@ -70,7 +72,7 @@ def test_rooms_objects_and_light(tmp_path):
     rooms = find_rooms(tmp_path)
     assert [s.name for s in rooms] == ["hall", "hall-light"]
     assert rooms[1].truth.points == seen
-    assert rooms[1].truth.poses.path == tmp_path / "hall-light" / "traj.txt"
+    assert rooms[1].truth.poses == tmp_path / "hall-light" / "traj.txt"
     assert [s.name for s in find_relighted(tmp_path)] == ["hall", "hall-light"]
     jug = replica_scene(tmp_path / "objects" / "jug")
     touch(jug / "mesh_object.ply")
@@ -95,9 +97,9 @@ def test_a_mix_of_rooms_and_objects_is_run_and_reconstructed(tmp_path):
     commands = {(j.scene.name, j.variant): j.task.command for j in jobs}
     assert commands["den", "paper"] == "run"
     assert commands["vase", "default"] == commands["vase", "paper"] == "reconstruct"
-    vase = next(j.task for j in jobs if (j.scene.name, j.variant) == ("vase", "paper"))
-    assert vase.option("online-results") is None
-    assert (vase.option("budget"), vase.option("preset")) == ("120s", "paper")
+    vase = next(options_of(j.task) for j in jobs if (j.scene.name, j.variant) == ("vase", "paper"))
+    assert "online-results" not in vase
+    assert (vase["budget"], vase["preset"]) == ("120s", "paper")
 
 
 def test_known_poses_use_about_a_hundred_images(tmp_path):
@@ -119,8 +121,9 @@ def test_scannet_poses_follow_the_numbers_of_the_images(tmp_path):
     calibration = str(scene / "intrinsic" / "intrinsic_color.txt")
     assert found.options == (Option("input.intrinsics", calibration),)
     poses = read_true_poses(found)
-    # Images 0, 1, 3 are read as a folder: the third comes at 2/30 s. Image 1 has no pose.
-    np.testing.assert_allclose(poses.timestamps, [0, 2 / 30])
+    # There is no image 2, and image 1 has no pose.
+    np.testing.assert_allclose(poses.timestamps, [0, 3 / 30])
+    assert {frame.timestamp for frame in open_source(found.source)} >= {*poses.timestamps}
     np.testing.assert_allclose(poses.T_wc[:, 0, 3], [0, -3])
 
 
@@ -134,7 +137,9 @@ def test_scannetpp_frames_as_images_or_video(tmp_path):
     (scene,) = find_scannetpp(tmp_path)
     assert (scene.name, scene.source, scene.truth.surface) == ("8b5caf3398", phone / "rgb", mesh)
     assert Option("input.stride", "2") in scene.options
-    np.testing.assert_allclose(read_true_poses(scene).timestamps, np.arange(4) / 30)
+    times = read_true_poses(scene).timestamps
+    np.testing.assert_allclose(times, 10 * np.arange(4) / 60)
+    assert [frame.timestamp for frame in open_source(scene.source)] == times.tolist()
     for name in names:
         (phone / "rgb" / name).unlink()
     video = touch(phone / "rgb.mkv")

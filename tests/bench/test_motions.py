@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
-from geogs.io.writers.trajectories import write_tum_trajectory
+from geogs.io.writers.trajectories import write_trajectories
 from geogs.types import Trajectory
 from geogs_bench.data.motion_cells import FULL, SMALL, find_motions, render_cells
 from geogs_bench.results.result_folder import ResultFolder
@@ -93,7 +93,9 @@ def test_what_a_run_says_of_itself_is_compared_with_the_truth(tmp_path: Path) ->
     output.mkdir()
     np.savetxt(sequence / "traj.txt", truth.reshape(-1, 16))
     (sequence / "cam_params.json").write_text("{}")
-    write_tum_trajectory(output / "trajectory.tum", _trajectory(estimate))
+    frame = np.arange(40)
+    known = Trajectory(frame / 30, estimate, frame >= 4, (frame >= 2) & (frame < 4))
+    write_trajectories(output, known, known.of("tracked"))
     states = ["lost"] * 2 + ["orientation only"] * 2 + ["tracked"] * 36
     rows = [
         f"{k / 30!r},{state},{0.001 if state == 'tracked' else ''},,"

@@ -8,9 +8,9 @@ import pytest
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.map_file import load_map
 from geogs_bench.data.benchmark_scene import Option
-from geogs_bench.runners.command_runners import CommandRunner
-from geogs_bench.runners.runner import Task
+from geogs_bench.runners.runner import Runner
 from geogs_bench.runners.saved_map import FOLDER
+from geogs_bench.runners.task import Task
 
 pytestmark = pytest.mark.system
 
@@ -27,7 +27,7 @@ def test_every_rule_moves_the_same_map_by_the_same_correction(small_room, tmp_pa
     for rule in rules:
         options = {**TINY, "mapping.ablation.map-update": rule}
         given = (*(Option(k, v) for k, v in options.items()), Option("loop.no-enabled"))
-        CommandRunner().run(Task("update", small_room, tmp_path / rule, given))
+        Runner().run(Task("update", small_room, tmp_path / rule, given))
         manifest = tmp_path / FOLDER / "checkpoint" / "manifest.json"
         checkpoints.append((manifest.stat().st_mtime_ns, manifest.read_text()))
     assert checkpoints[0] == checkpoints[1]

@@ -9,6 +9,9 @@ from geogs.evaluation.held_camera import level_axes, look_at_one_place
 from geogs.evaluation.pages import plots
 from geogs.evaluation.pages.run_page import write_run_page
 from geogs.evaluation.pages.shading import Viewpoint, look, viewpoints
+from geogs.evaluation.surfaces.reconstruction_errors import ReconstructionScores
+from geogs.evaluation.surfaces.surface import Surface
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 
 
 def test_level_axes_stand_upright():
@@ -102,18 +105,25 @@ def test_page_of_a_run_holds_its_numbers_and_pictures(tmp_path):
         assert text not in page
 
 
+def compared_at(points, distance, reach=np.inf) -> SurfaceComparison:
+    """Distances in metres, of which 9 cm are shown as the worst."""
+    scores = ReconstructionScores(*[0.0] * 8, 4.5, 0, 0, 0.0)
+    mesh = Surface(points, np.zeros((0, 3), int))
+    return SurfaceComparison(scores, mesh, None, points, distance, reach)
+
+
 def test_uncompared_vertices_stay_grey():
     samples = np.array([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]])
     vertices = np.array([[0.0, 0, 0.05], [5.0, 0, 0]])
-    colours = plots.error_colours(vertices, samples, np.full(3, 9.0), 9.0, 1.0)
+    colours = plots.error_colours(vertices, compared_at(samples, np.full(3, 0.09), 1.0))
     assert colours[1].tolist() == [190, 190, 190]
     assert colours[0][1] < 30
 
 
 def test_error_colours_go_from_pale_to_red():
     samples = np.array([[0.0, 0, 0], [10, 0, 0]])
-    errors = np.array([0, 0, 0, 9, 9, 9.0])
-    colours = plots.error_colours(samples, samples.repeat(3, 0), errors, 9.0)
+    distance = np.array([0, 0, 0, 0.09, 0.09, 0.09])
+    colours = plots.error_colours(samples, compared_at(samples.repeat(3, 0), distance))
     assert colours[0].sum() > 600
     assert colours[1][0] > 100
     assert colours[1][1] < 30

@@ -9,22 +9,12 @@ import pytest
 
 from disk_faults import contents, every_fault, full_disk, kill
 from geogs.errors import OutputError
-from geogs.io.writers import directory
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.directory import Directory
 from geogs.io.writers.replacement import LIST, is_half_done, recover, replaced
 
 OLD = {"mesh.ply": "old mesh", "keyframes/000001.jpg": "a", "keyframes/000002.jpg": "b"}
 NEW = {"mesh.ply": "new mesh", "keyframes/000001.jpg": "c", "report/index.html": "page"}
-
-
-@pytest.fixture(params=["by handle", "by path"])
-def ways(request, monkeypatch) -> None:
-    """Both ways to reach what is in a folder."""
-    monkeypatch.setattr(directory, "_BY_HANDLE", request.param == "by handle")
-
-
-pytestmark = pytest.mark.usefixtures("ways")
 
 
 def write(folder: Path, files: dict[str, str], what: str = "result") -> None:

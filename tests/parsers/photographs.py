@@ -8,7 +8,7 @@ import mutations
 from geogs.application.structure_from_motion.photos import open_photographs
 from geogs.config import ReconstructConfig
 from geogs_photos.photograph import find_photographs
-from geogs_photos.poses import FoundPoses, LeftOut
+from geogs_photos.poses import FoundPoses
 from io_samples import gradient_image, write_image
 from parsers.base import Parser, tiny_room
 from parsers.recordings import write_photograph
@@ -39,7 +39,7 @@ def located(folder: Path) -> None:
     images = write_room_images(room, folder / "photos", "{:d}.png")
     write_image(folder / "photos" / "left.png", gradient_image(7))
     write_colmap_binary(room, folder / "sparse" / "0", images)
-    found = FoundPoses(tuple(images), (LeftOut("left.png", "shows little"),), 0.4)
+    found = FoundPoses((("left.png", "shows little"),), 0.4)
     (folder / "photographs.json").write_text(json.dumps(asdict(found)))
 
 

@@ -49,7 +49,7 @@ def states() -> dict[str, Parser]:
     )
     found["bench-uncertainty"] = Parser(
         complete, ("trajectory_uncertainty.csv",), mutations.text,
-        lambda f: ResultFolder(f).uncertainty(),
+        lambda f: ResultFolder(f).states(),
     )  # fmt: skip
     return found
 

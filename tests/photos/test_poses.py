@@ -61,12 +61,12 @@ def test_places_are_found_and_what_is_left_out_is_named(photographs, tmp_path, c
     )
     assert capfd.readouterr() == ("", "")
     assert list(dict.fromkeys(stages)) == ["features", "matching", "finding poses", "adjusting"]
-    assert found.placed == tuple(f"{i}.png" for i in range(FRAMES))
-    why = {out.name: out.reason for out in found.left_out}
+    why = dict(found.left_out)
     assert why["broken.jpg"] == "cannot be read"
     assert "features" in why["bare.png"]
     assert why["other.png"] == "shows nothing that another photograph shows"
     posed = open_colmap(tmp_path, folder)
+    assert sorted(file.path.name for file in posed.files) == [f"{i}.png" for i in range(FRAMES)]
     T_wc = np.linalg.inv(np.stack([file.T_cw for file in posed.files]))
     truth = room.T_wc
     places = (torch.from_numpy(T[:, :3, 3].copy()) for T in (T_wc, truth))
@@ -104,7 +104,7 @@ def test_reasons_say_what_was_missing():
     kept[:3, :3] = kept[3:6, 3:6] = 80
     kept[6, 0] = kept[0, 6] = 21
     parts = [{"0.jpg", "1.jpg", "2.jpg"}, {"3.jpg", "4.jpg", "5.jpg"}]
-    why = {out.name: out.reason for out in reasons(entries, kept, parts)}
+    why = dict(reasons(entries, kept, parts))
     assert sorted(why) == ["3.jpg", "4.jpg", "5.jpg", "6.jpg", "7.jpg"]
     assert "a part of 3 photographs" in why["4.jpg"]
     assert "21 matches, with 0.jpg" in why["6.jpg"]

@@ -17,9 +17,12 @@ TRUE = 0.0216
 
 
 @functools.cache
-def clips_of_points(readout: float, motion=shaken) -> list[_Adjusted]:
+def clips_of_points(readout: float, motion=shaken, rate: float = RATE) -> list[_Adjusted]:
     """Four of them."""
-    clips = [clip_of(motion(seed), scattered(seed, 35), readout, images=18) for seed in range(4)]
+    clips = [
+        clip_of(motion(seed), scattered(seed, 35), readout, images=18, rate=rate)
+        for seed in range(4)
+    ]
     starts = [(clip, first_reconstruction(clip, 1.2 / FOCAL)) for clip in clips]
     return [_Adjusted(clip, start) for clip, start in starts if start is not None]
 
@@ -37,6 +40,31 @@ def test_points_seen_at_once_tell_a_global_shutter():
     assert not found.is_believed
     assert found.readout == 0.0
     assert abs(found.best) < 0.001
+
+
+def slowly(seed: int):
+    """Waves of half a hertz to 1.1 Hz."""
+    path = shaken(seed)
+    return lambda time: path(time / 2)
+
+
+@pytest.mark.parametrize("readout", [0.0, TRUE])
+def test_few_images_a_second_tell_it_where_the_motion_is_slow(readout):
+    found = _verdict(clips_of_points(readout, slowly, 5.0), FOCAL)
+    print(found)
+    assert found.is_believed == (readout > 0)
+    assert found.best == pytest.approx(readout, abs=max(2 * found.error, 0.0005))
+    assert found.error < 0.0015
+
+
+@pytest.mark.parametrize(("rate", "least_error"), [(5.0, 0.003), (4.0, 0.006)])
+def test_images_too_far_apart_for_the_motion_have_a_larger_error(rate, least_error):
+    """Of waves of up to 2.2 Hz they tell another velocity, in all clips alike."""
+    found = _verdict(clips_of_points(TRUE, shaken, rate), FOCAL)
+    print(found)
+    assert found.error > least_error
+    assert abs(found.best - TRUE) < 2 * found.error
+    assert not _verdict(clips_of_points(0.0, shaken, rate), FOCAL).is_believed
 
 
 def test_a_lens_that_nobody_told_is_not_taken_for_rows():

@@ -1,5 +1,8 @@
 """A clip's equation for the readout, against least squares over all unknowns at once."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -24,35 +27,57 @@ def start(tracks) -> ClipReconstruction:
     return found
 
 
-def test_interpolation_is_exact_for_polynomials(tracks):
+@pytest.mark.parametrize("around", [NODES, 3])
+def test_interpolation_is_exact_for_polynomials(tracks, around):
     def path(t):
-        return 0.3 - t + 4 * t**2 + 20 * t**3 - 70 * t**4
+        return 0.3 - t + 4 * t**2 + (20 * t**3 - 70 * t**4 if around == NODES else 0)
 
-    share, count = interpolation(tracks, READOUT), len(tracks.times)
+    share, count = interpolation(tracks, READOUT, around), len(tracks.times)
     when = tracks.times[:, None] + READOUT * tracks.line_times
     for k in range(count):
-        first = min(max(k - NODES // 2, 0), count - NODES)
-        value = share[k] @ path(tracks.times[first : first + NODES])
+        first = min(max(k - around // 2, 0), count - around)
+        value = share[k] @ path(tracks.times[first : first + around])
         np.testing.assert_allclose(value, path(when[k]), atol=1e-12)
     small = 1e-4
-    ends = [interpolation(tracks, READOUT + by) for by in (small, -small)]
+    ends = [interpolation(tracks, READOUT + by, around) for by in (small, -small)]
     slope = (ends[0] - ends[1]) / (2 * small)
-    np.testing.assert_allclose(interpolation_slope(tracks, READOUT), slope, rtol=1e-3, atol=0.02)
+    found = interpolation_slope(tracks, READOUT, around)
+    np.testing.assert_allclose(found, slope, rtol=1e-3, atol=0.02)
 
 
-def errors(tracks, at: ClipReconstruction, readout: float) -> np.ndarray:
+def test_of_the_velocity_of_a_wave_three_poses_miss_the_root_of_what_five_do(tracks):
+    middle, interval = tracks.middle, tracks.times[1] - tracks.times[0]
+    at_middle = replace(tracks, line_times=np.zeros_like(tracks.line_times))
+    for angle in (0.3, 0.6):
+        missing = []
+        for around in (3, NODES):
+            # What a point moves as the readout grows is its velocity times the time of its row.
+            slope = interpolation_slope(tracks, 0.0, around) - interpolation_slope(
+                at_middle, 0.0, around
+            )
+            nodes = np.sin(angle * (np.arange(around) - around // 2))
+            late = np.argmax(np.abs(tracks.line_times[middle]))
+            moved = slope[middle, late] @ nodes / tracks.line_times[middle, late]
+            missing.append(1 - moved / (angle / interval))
+        assert missing[0] == pytest.approx(angle**2 / 6, rel=0.1)
+        assert missing[1] == pytest.approx(angle**4 / 30, rel=0.1)
+
+
+def errors(tracks, at: ClipReconstruction, readout: float, around: int = NODES) -> np.ndarray:
     """One by one, 0 where nothing is seen."""
-    share, count = interpolation(tracks, readout), len(tracks.times)
+    share, count = interpolation(tracks, readout, around), len(tracks.times)
     projected, left = at.projected(), np.zeros_like(tracks.plane)
     for k, n in np.argwhere(tracks.seen):
-        first = min(max(k - NODES // 2, 0), count - NODES)
-        left[k, n] = tracks.plane[k, n] - share[k, n] @ projected[first : first + NODES, n]
+        first = min(max(k - around // 2, 0), count - around)
+        left[k, n] = tracks.plane[k, n] - share[k, n] @ projected[first : first + around, n]
     return left
 
 
-def test_the_equation_is_that_of_least_squares_over_everything(tracks, start, monkeypatch):
+@pytest.mark.parametrize("around", [NODES, 3])
+def test_the_equation_is_that_of_least_squares_over_everything(tracks, start, monkeypatch, around):
     monkeypatch.setattr(row_adjustment, "DAMPING", 1e-12)
-    here = errors(tracks, start, READOUT)
+    left = partial(errors, tracks, around=around)
+    here = left(start, READOUT)
     square = (here**2).sum(axis=-1, keepdims=True)
     root = np.sqrt(tracks.seen[..., None] / (1 + square / TOLERANCE**2) ** 2) / TOLERANCE
     (count, n), small = tracks.seen.shape, 1e-6
@@ -62,23 +87,20 @@ def test_the_equation_is_that_of_least_squares_over_everything(tracks, start, mo
     for k, c in poses:
         by = np.zeros((count, 6))
         by[k, c] = small
-        ends = [errors(tracks, start.stepped(s * by, np.zeros((n, 3))), READOUT) for s in (1, -1)]
+        ends = [left(start.stepped(s * by, np.zeros((n, 3))), READOUT) for s in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2 * small))
     for p in range(n):
         for c in range(3):
             by = np.zeros((n, 3))
             by[p, c] = small
-            ends = [
-                errors(tracks, start.stepped(np.zeros((count, 6)), s * by), READOUT)
-                for s in (1, -1)
-            ]
+            ends = [left(start.stepped(np.zeros((count, 6)), s * by), READOUT) for s in (1, -1)]
             columns.append((ends[0] - ends[1]) / (2 * small))
-    slope = [errors(tracks, start, READOUT + by) for by in (1e-4, -1e-4)]
+    slope = [left(start, READOUT + by) for by in (1e-4, -1e-4)]
     of_readout = (root * (slope[0] - slope[1]) / 2e-4).ravel()
     J = np.stack([(root * c).ravel() for c in columns], axis=1)
     right = (root * here).ravel()
     free_slope = of_readout - J @ np.linalg.lstsq(J, of_readout, rcond=1e-9)[0]
-    found = readout_equation(tracks, start, np.array([READOUT]), TOLERANCE)
+    found = readout_equation(tracks, start, np.array([READOUT]), TOLERANCE, around)
     assert found.curvature[0, 0] == pytest.approx(free_slope @ free_slope, rel=0.01)
     free_right = right - J @ np.linalg.lstsq(J, right, rcond=1e-9)[0]
     assert found.gradient[0] == pytest.approx(-free_slope @ free_right, rel=0.02)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from geogs.application.evaluate_surface import (
-    SurfaceComparison,
     compare_surface,
     photoconsistency,
 )
@@ -24,6 +23,7 @@ from geogs.evaluation.pages.evaluation_page import SAME_POSES_CM, Evaluation, wr
 from geogs.evaluation.pages.run_page import PICTURES, figures, run_figures, run_sections
 from geogs.evaluation.reliability import Reliability, reliability
 from geogs.evaluation.surfaces.surface import read_surface
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import (
     Alignment,
     TrajectoryErrors,
@@ -180,13 +180,9 @@ def _draw(
         plots.plot_reliability(folder / "reliability.png", evaluation.reliability)
         titles["reliability.png"] = "Are errors as large as foretold?"
     if surface is not None:
-        mesh, truth, limit = surface.mesh, surface.truth, surface.scores.colour_limit_cm
         camera = read_camera(settings.output / "intrinsics.json")
-        colours = plots.error_colours(
-            mesh.vertices, surface.points, 100 * surface.distance, limit, surface.reach
-        )
-        views = viewpoints(mesh.vertices, trajectory.aligned, camera)
-        plots.plot_beside_truth(folder / "mesh_truth.png", mesh, truth, colours, views, limit)
+        views = viewpoints(surface.mesh.vertices, trajectory.aligned, camera)
+        plots.plot_beside_truth(folder / "mesh_truth.png", surface, views)
         titles = {"mesh_truth.png": "Surface beside the truth", **titles}
     own = [(title, folder / name) for name, title in titles.items()]
     return own + _run_pictures(settings)
@@ -221,9 +217,7 @@ def _model_beside_truth(
         if surface is None:
             return ()
         vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
-        limit = surface.scores.colour_limit_cm
-        errors = 100 * surface.distance
-        colours = error_colours(vertices, surface.points, errors, limit, surface.reach)
+        colours, limit = error_colours(vertices, surface), surface.scores.colour_limit_cm
         ends = ("0", f"{float(f'{limit:.2g}'):g} cm and more")
         legend = Legend("Distance to the truth", ends, ERROR_STOPS, "grey: not compared")
         return [Colouring("Error", colours, legend)]

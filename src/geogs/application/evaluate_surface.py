@@ -1,9 +1,7 @@
 """The part of an evaluation that compares surfaces, by the protocol that was asked for."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -13,33 +11,19 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import PhotoScores, evaluate_photoconsistency
 from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks, mesh_silhouettes
 from geogs.evaluation.surfaces.surface import Surface, read_surface
-from geogs.evaluation.surfaces.surface_errors import SurfaceScores
+from geogs.evaluation.surfaces.surface_errors import (
+    SurfaceComparison,
+    SurfaceErrors,
+    SurfaceScores,
+)
 from geogs.evaluation.surfaces.visibility import Visibility, cull_mesh
 from geogs.evaluation.true_scene import TrueScene, photographs, silhouettes
 from geogs.geometry.camera import Camera
 from geogs.io.writers.intrinsics_file import read_camera
 
-if TYPE_CHECKING:
-    from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
-
 _MASK_EDGE, _PHOTO_EDGE = 1600, 800
 _MILLIMETRES = 1000.0
 _REACH = 0.003
-
-
-@dataclass(frozen=True)
-class SurfaceComparison:
-    """Scores, and what pictures of the errors need (metres, frame of the truth)."""
-
-    scores: SurfaceScores
-    mesh: Surface
-    truth: Surface
-    points: Float[np.ndarray, "n 3"]
-    """Where the reconstruction was compared."""
-    distance: Float[np.ndarray, "n"]
-    """To the truth; inf where it did not count."""
-    reach: float = np.inf
-    """How far from the points the mesh was still compared; beyond, pictures show no error."""
 
 
 def compare_surface(
@@ -151,11 +135,10 @@ def _dtu(settings: EvalSettings, scene: TrueScene, mesh: Surface) -> SurfaceComp
     if masks is not None:
         cut = cull_by_masks(cut, [mask.dilated() for mask in masks])
     errors = evaluate_dtu(cut, reference, settings.seed)
-    scan = Surface(reference.points / _MILLIMETRES, np.zeros((0, 3), np.int64))
     return SurfaceComparison(
         errors.scores,
         Surface(cut.vertices / _MILLIMETRES, cut.faces),
-        scan,
+        None,
         errors.reconstruction_points / _MILLIMETRES,
         errors.accuracy / _MILLIMETRES,
         _REACH,
@@ -200,7 +183,7 @@ def _occluder(truth: Surface) -> Surface:
 
 
 def _comparison(
-    errors: "SurfaceErrors[SurfaceScores]", mesh: Surface, truth: Surface
+    errors: SurfaceErrors[SurfaceScores], mesh: Surface, truth: Surface
 ) -> SurfaceComparison:
     return SurfaceComparison(
         errors.scores, mesh, truth, errors.reconstruction_points, errors.accuracy

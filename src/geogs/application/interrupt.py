@@ -6,8 +6,7 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
-SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Those that ask to stop: of a terminal, of systems and schedulers, of a terminal that is gone."""
 _AGAIN = 0.02
 """Seconds until it is looked again whether modules are still being imported."""
@@ -27,8 +26,6 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     in an import ends the process where that seems to hang, and changes nothing before: an end at
     once would leave behind what was begun, such as an empty folder.
     """
-    if not hasattr(signal, "setitimer"):
-        raise KeyboardInterrupt
     is_waiting, left = signal.getitimer(signal.ITIMER_REAL)
     if not _is_importing(frame):
         signal.setitimer(signal.ITIMER_REAL, 0)

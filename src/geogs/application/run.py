@@ -81,12 +81,14 @@ def run(
             progress.plan(plan)
         if settings.offline:
             from geogs.application.structure_from_motion.offline import (
+                FEW,
                 PlacedOffline,
                 beginning_with,
             )
 
             told = self_calibrated(opened, config, device, progress, stop)
-            told = with_shutter_found(told, progress, stop)
+            if told.recorded_fps >= FEW:
+                told = with_shutter_found(told, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
         return _completed(driver, settings, work)

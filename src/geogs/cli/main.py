@@ -7,6 +7,7 @@ import errno
 import math
 import os
 import re
+import resource
 import sys
 from collections.abc import Callable, Sequence
 
@@ -144,10 +145,6 @@ def _of_the_system(error: Exception) -> str | None:
 
 def _memory_limit() -> float:
     """Bytes of addresses that the process may use."""
-    try:
-        import resource
-    except ImportError:  # not on this system
-        return math.inf
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     return math.inf if limit == resource.RLIM_INFINITY else limit
 

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from geogs.cli.candidates import ASKED, candidates, matching
 from geogs.cli.help import first_clause, help_text
 from geogs.config.leaves import Leaf, default_of, leaves
-from geogs.config.old_names import present_name
 from geogs.config.setting import Positional, dashed, group_of, refusal
 from geogs.errors import InputError
 
@@ -103,8 +102,6 @@ def _named(
     for word in words:
         name, equals, text = word.partition("=")
         name = dashed(name)
-        if name.startswith("--") and name not in names and name not in switches:
-            name = f"--{present_name(name[2:])}"
         if word == "--":
             loose += words
         elif not word.startswith("-") or word == "-":

@@ -1,9 +1,8 @@
 """What speaks against the comparison of two trajectories, in sentences."""
 
 import numpy as np
-from jaxtyping import Float
 
-from geogs.evaluation.trajectory_errors import MAX_ROLL, TrajectoryErrors
+from geogs.evaluation.trajectory_errors import MAX_ROLL, TrajectoryErrors, extent_of
 from geogs.types import Trajectory
 
 FEWEST_MATCHED = 0.5
@@ -65,7 +64,7 @@ def _of_times(
 def _of_alignment(errors: TrajectoryErrors) -> str:
     if errors.pairs < FEWEST_PAIRS:
         return f"{errors.pairs} poses are so few that a similarity fits them whatever they are."
-    extent = _extent(errors.truth)
+    extent = extent_of(errors.truth)
     if 0.01 * errors.ate_rmse_cm > MAX_ERROR * extent:
         return (
             f"The error is {errors.ate_rmse_cm / max(extent, 1e-9):.0f} % of the true path's "
@@ -82,7 +81,7 @@ def _of_alignment(errors: TrajectoryErrors) -> str:
 
 
 def _of_size(errors: TrajectoryErrors, is_metric: bool) -> str:
-    ratio = max(_extent(errors.truth), 1e-9) / max(_extent(errors.aligned), 1e-9)
+    ratio = max(extent_of(errors.truth), 1e-9) / max(extent_of(errors.aligned), 1e-9)
     factor = errors.scale if errors.alignment == "sim3" else ratio
     if not is_metric or 1 / MAX_FACTOR < factor < MAX_FACTOR:
         return ""
@@ -100,12 +99,6 @@ def _of_speed(errors: TrajectoryErrors) -> str:
         f"The true camera moves {errors.path_length_m / max(seconds, 1e-9):.0f} metres a second: "
         "true poses should be in metres, and their times in seconds."
     )
-
-
-def _extent(T_wc: Float[np.ndarray, "n 4 4"]) -> float:
-    """Root of the mean squared distance from the middle."""
-    places = T_wc[:, :3, 3]
-    return float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
 
 
 def _span(trajectory: Trajectory) -> str:

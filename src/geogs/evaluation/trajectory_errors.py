@@ -236,3 +236,11 @@ def _no_match(reference: Trajectory, estimate: Trajectory, pairs: int, maximum: 
         f"Only {pairs} poses match within {maximum:g} s (estimate {spans[0]}, reference "
         f"{spans[1]}); check that both use the same clock, or raise --max-diff."
     )
+
+
+def extent_of(T_wc: Float[np.ndarray, "n 4 4"]) -> float:
+    """Root of the mean squared distance of the places from their middle; 0 where there is none."""
+    places = T_wc[:, :3, 3]
+    if not len(places):
+        return 0.0
+    return float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))

@@ -16,22 +16,23 @@ from jaxtyping import Float
 
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.clip_tracks import ClipTracks, clip_tracks
+from geogs.shutter.clip_tracks import LEAST_IMAGES, ClipTracks, clip_tracks
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.neighbours import Image
 from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.row_adjustment import ReadoutEquation, readout_equation
+from geogs.shutter.row_adjustment import NODES, ReadoutEquation, readout_equation
 from geogs.threads import thread_map
 
-CLIP = 30
-"""Neighbouring images that points are followed through."""
+CLIP, SPAN = 30, 3.0
+"""Neighbouring images that points are followed through, and seconds that these last, at most: where
+images are far apart, the first and the last of so many would show other places."""
 CLIPS = 12
 """That are worth giving, from all over the video."""
 ENOUGH_CLIPS, ENOUGH = (5, 7, 9), 0.002
 """No more clips are looked at where so many leave a standard error of so many seconds."""
 CONFIDENT, SMALL = 3.0, 0.01
 """Nor where the readout is less than so many seconds by so many standard errors."""
-LONGEST_INTERVAL = 0.12
+LONGEST_INTERVAL = 0.26
 """Seconds between two images; over more, nothing says how points move from one to the next."""
 FIRST_TOLERANCE = 1.2
 """Pixels of an inlier between the two views that a clip begins with."""
@@ -52,6 +53,11 @@ COMMON = 0.03
 less."""
 TREMOR = 0.02
 """Fraction of the readout that is added for tremor between the images (jerks: 2 % too much)."""
+FEWER, BETWEEN = 3, 4.0
+"""Poses by which the readout is asked for once more, in one step, and what the square of the
+fraction by which it changes then is worth of error. Of a wave, θ radians from image to image, three
+poses miss θ²/6 of the velocity, five θ⁴/30: the one is seen, the other goes with its square. As
+much more as waves of 2.2 Hz want at 4 to 10 images a second (docs/tracking.md)."""
 
 LONGEST, SHORTEST = 0.036, 0.002
 """Seconds of a readout that is believed; less is nothing to care about."""
@@ -113,6 +119,8 @@ class _CommonReadout:
 
     tolerance: float
     """Fraction of the focal length."""
+    around: int = NODES
+    """Images whose poses say where a point is between them."""
 
     def linearise(self, state: _AdjustedClips) -> _AdjustedClips:
         """The clips that one readout may explain, with their equations; none if too few."""
@@ -124,7 +132,9 @@ class _CommonReadout:
         return _AdjustedClips(clips, state.shared, equations)
 
     def _equation(self, shared: Float[np.ndarray, "s"], clip: _Adjusted) -> ReadoutEquation:
-        return readout_equation(clip.tracks, clip.reconstruction, shared, self.tolerance)
+        return readout_equation(
+            clip.tracks, clip.reconstruction, shared, self.tolerance, self.around
+        )
 
     def step(
         self, state: _AdjustedClips, linear: _AdjustedClips, damping: float
@@ -154,8 +164,8 @@ def find_readout(
     """Find the readout with which clips of a video fit best; 0 unless it is clearly better.
 
     Args:
-        clips: ``CLIP`` neighbours in the video each; no more are taken than are needed, and the
-            points of several are followed at a time.
+        clips: up to ``CLIP`` neighbours in the video each; no more are taken than are needed, and
+            the points of several are followed at a time.
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
         lens_is_known: else its k1 and k2 are estimated, too; they would be taken for rows.
@@ -186,7 +196,7 @@ def _reported(report: Report, before: int, group: int, fraction: float) -> None:
 def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
     """A clip whose points are followed and whose poses are known roughly."""
     intervals = np.diff([image.timestamp for image in clip])
-    if len(clip) < CLIP or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
+    if len(clip) < LEAST_IMAGES or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
         return None
     tracks = clip_tracks(clip, camera)
     if tracks is None:
@@ -223,9 +233,12 @@ def _verdict(clips: list[_Adjusted], focal: float, lens_is_known: bool = True) -
         if not solution.finite:
             return FoundReadout(clips=len(state.finite))
     readout, parts = float(state.shared[0]), state.equations
-    if len(parts) < LEAST_CLIPS:
+    fewer = _CommonReadout(TOLERANCES[-1][0] / focal, FEWER)
+    by_fewer = fewer.step(state, fewer.linearise(state), 0.0)
+    if len(parts) < LEAST_CLIPS or by_fewer is None:
         return FoundReadout(clips=len(parts))
     error = float(np.hypot(_standard_error(parts, state.shared), TREMOR * readout))
+    error = float(np.hypot(error, BETWEEN * by_fewer.size**2 / max(abs(readout), error)))
     confident = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = confident and SHORTEST <= readout <= LONGEST
     return FoundReadout(readout if believed else 0.0, readout, error, len(state.clips))

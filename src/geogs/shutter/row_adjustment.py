@@ -56,7 +56,11 @@ class ReadoutEquation:
 
 
 def readout_equation(
-    tracks: ClipTracks, at: ClipReconstruction, shared: Float[np.ndarray, "s"], tolerance: float
+    tracks: ClipTracks,
+    at: ClipReconstruction,
+    shared: Float[np.ndarray, "s"],
+    tolerance: float,
+    around: int = NODES,
 ) -> ReadoutEquation:
     """Linearised, what is measured weighted by Geman and McClure's loss.
 
@@ -65,13 +69,14 @@ def readout_equation(
         at: poses and points.
         shared: the readout, seconds; then k1 and k2, where they are not known.
         tolerance: error at which a measurement counts for a quarter, fraction of the focal length.
+        around: images whose poses say where a point is between them.
     """
     count = len(tracks.times)
-    nodes = _nodes(count)
+    nodes = _nodes(count, around)
     readout, *sizes = shared
-    blend, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
-    around = at.projected()[nodes]
-    pinhole = _blended(blend, around)
+    blend, slope = (of(tracks, readout, around) for of in (interpolation, interpolation_slope))
+    places = at.projected()[nodes]
+    pinhole = _blended(blend, places)
     radius = np.linalg.norm(pinhole, axis=-1, keepdims=True)
     shapes = [radius**power * pinhole for power, _ in zip(POWERS, sizes, strict=False)]
     error = tracks.plane - pinhole
@@ -81,23 +86,25 @@ def readout_equation(
     weight = tracks.seen * geman_mcclure_weight(square / tolerance**2) / tolerance**2
     root = np.sqrt(weight)
     by_own_pose, by_own_point = at.derivatives()
-    by_poses = np.empty((*tracks.seen.shape, 2, NODES, 6))
+    by_poses = np.empty((*tracks.seen.shape, 2, around, 6))
     by_point = np.zeros_like(by_own_point)
     for j, node in enumerate(nodes.T):
         part = (root * blend[..., j])[..., None, None]
         np.multiply(part, by_own_pose[node], out=by_poses[..., j, :])
         by_point += part * by_own_point[node]
-    other = root[..., None, None] * np.stack([error, _blended(slope, around), *shapes], axis=-1)
+    other = root[..., None, None] * np.stack([error, _blended(slope, places), *shapes], axis=-1)
     joined = np.concatenate([by_poses.reshape(*tracks.seen.shape, 2, -1), other], axis=-1)
     # The middle pose stays where it is.
     free = np.arange(count) != tracks.middle
-    return _eliminated(joined, by_point, free, float(weight.sum()), float((weight * square).sum()))
+    total = float(weight.sum()), float((weight * square).sum())
+    return _eliminated(joined, by_point, free, nodes, *total)
 
 
 def _eliminated(
     joined: Float[np.ndarray, "k n 2 w"],
     by_point: Float[np.ndarray, "k n 2 3"],
     free: Bool[np.ndarray, "k"],
+    around: Int[np.ndarray, "k j"],
     weight: float,
     square: float,
 ) -> ReadoutEquation:
@@ -108,6 +115,7 @@ def _eliminated(
             derivatives of the predictions by the readout and the lens.
         by_point: by the point.
         free: of all images, whether their pose is free.
+        around: the nodes of each image.
         weight: of the result.
         square: of the result.
     """
@@ -118,10 +126,10 @@ def _eliminated(
     normal += (DAMPING / 3 * trace + 1e-9) * np.eye(3)
     root = np.linalg.cholesky(np.linalg.inv(normal))
     # What an image sees concerns the poses around it alone, so each adds to few columns.
-    others = joined.shape[-1] - 6 * NODES
+    others = joined.shape[-1] - 6 * around.shape[1]
     size = 6 * count + others
     H, by_points = np.zeros((size, size)), np.zeros((n, 3, size))
-    for own, point, nodes in zip(joined, by_point @ root, _nodes(count), strict=True):
+    for own, point, nodes in zip(joined, by_point @ root, around, strict=True):
         columns = np.r_[6 * nodes[0] : 6 * nodes[-1] + 6, size - others : size]
         flat = own.reshape(2 * n, -1)
         H[columns[:, None], columns] += flat.T @ flat
@@ -151,32 +159,36 @@ def _blended(
 ) -> Float[np.ndarray, "k n 2"]:
     """Sums over the nodes."""
     blended = weights[..., 0, None] * around[:, 0]
-    for j in range(1, NODES):
+    for j in range(1, weights.shape[-1]):
         blended += weights[..., j, None] * around[:, j]
     return blended
 
 
-def _nodes(count: int) -> Int[np.ndarray, "k j"]:
+def _nodes(count: int, around: int) -> Int[np.ndarray, "k j"]:
     """The images around each, itself among them."""
-    first = np.clip(np.arange(count) - NODES // 2, 0, count - NODES)
-    return first[:, None] + np.arange(NODES)
+    first = np.clip(np.arange(count) - around // 2, 0, count - around)
+    return first[:, None] + np.arange(around)
 
 
-def interpolation(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
+def interpolation(
+    tracks: ClipTracks, readout: float, around: int = NODES
+) -> Float[np.ndarray, "k n j"]:
     """Weights of the nodes in where a point is at the time of its row (Lagrange)."""
     when = tracks.times[:, None] + readout * tracks.line_times
-    at = tracks.times[_nodes(len(tracks.times))].T[..., None]
+    at = tracks.times[_nodes(len(tracks.times), around)].T[..., None]
     ahead = when - at
-    weights = np.ones((*when.shape, NODES))
-    for j in range(NODES):
-        for other in range(NODES):
+    weights = np.ones((*when.shape, around))
+    for j in range(around):
+        for other in range(around):
             if other != j:
                 weights[..., j] *= ahead[other] / (at[j] - at[other])
     return weights
 
 
-def interpolation_slope(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
+def interpolation_slope(
+    tracks: ClipTracks, readout: float, around: int = NODES
+) -> Float[np.ndarray, "k n j"]:
     """Derivatives of the weights by the readout, 1 / s."""
     small = 5e-4
-    after, before = (interpolation(tracks, readout + by) for by in (small, -small))
+    after, before = (interpolation(tracks, readout + by, around) for by in (small, -small))
     return (after - before) / (2 * small)

@@ -4,11 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-PoseFormat = Literal["poses", "scannet", "colmap"]
-"""A file or folder as ``geogs eval --gt`` takes it; ScanNet's ``pose/``; a COLMAP model whose image
-names carry the frame number."""
-
-
 Culling = Literal["done", "frustum", "occlusion"]
 """By its provider; to what lies inside the images; and of that to what is not hidden."""
 
@@ -29,16 +24,6 @@ class Option:
 
 
 @dataclass(frozen=True)
-class TruePoses:
-    """Where the true poses are."""
-
-    path: Path
-    format: PoseFormat = "poses"
-    rate: float = 30.0
-    """Frames per second by which frame numbers become times, where the format has numbers."""
-
-
-@dataclass(frozen=True)
 class DtuTruth:
     """The official files that DTU's protocol needs for a scan."""
 
@@ -51,7 +36,9 @@ class DtuTruth:
 class Truth:
     """What a result can be compared with; a part is none where it is not there."""
 
-    poses: TruePoses | None = None
+    poses: Path | None = None
+    """As ``geogs eval --gt`` takes it, or the COLMAP model of a video at 60 frames a second, whose
+    images are called by their frames."""
     surface: Path | None = None
     """PLY in metres, in the frame of the poses."""
     points: Path | None = None

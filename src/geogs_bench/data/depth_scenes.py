@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from geogs.io.sources.formats.tum import is_tum
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.motion_cells import Cell
 from geogs_bench.data.replica_scenes import find_replica
 from geogs_bench.data.scene_folders import folders_like
@@ -40,12 +40,12 @@ def _with_times(scene: BenchmarkScene) -> BenchmarkScene:
     """The scene with poses that have times, where ``geogs synth`` wrote them, too."""
     if not (scene.source / "groundtruth.txt").is_file():
         return scene
-    return replace(scene, truth=replace(scene.truth, poses=TruePoses(scene.source)))
+    return replace(scene, truth=replace(scene.truth, poses=scene.source))
 
 
 def _with_sensor(folder: Path) -> BenchmarkScene:
     poses = folder / "groundtruth.txt"
-    truth = Truth(TruePoses(poses) if poses.is_file() else None)
+    truth = Truth(poses if poses.is_file() else None)
     return BenchmarkScene(folder.resolve().name, folder, truth, has_depth=True)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geogs.errors import InputError
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import folders_like
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
 from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
@@ -131,7 +131,7 @@ def render_cells(
 def find_motions(root: Path) -> list[BenchmarkScene]:
     """Every sequence below ``root``, or ``root`` itself if it is one."""
     return [
-        BenchmarkScene(folder.resolve().name, folder, Truth(poses=TruePoses(folder)), kind="motion")
+        BenchmarkScene(folder.resolve().name, folder, Truth(poses=folder), kind="motion")
         for folder in folders_like(root, _is_sequence)
     ]
 

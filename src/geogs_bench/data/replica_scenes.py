@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from geogs.io.sources.formats.replica import is_replica
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import first_file, folders_like
 
 _RELIGHTED = "-light"
@@ -46,7 +46,7 @@ def _scene(folder: Path) -> BenchmarkScene:
     truth = _truth(folder)
     if truth.surface is None and folder.name.endswith(_RELIGHTED):
         truth = _truth(folder.with_name(folder.name.removesuffix(_RELIGHTED)))
-    poses = TruePoses(folder / "traj.txt")
+    poses = folder / "traj.txt"
     return BenchmarkScene(folder.resolve().name, folder, replace(truth, poses=poses))
 
 

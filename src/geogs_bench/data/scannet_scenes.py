@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from geogs.io.sources.formats.scannet import is_posed_scannet
-from geogs_bench.data.benchmark_scene import BenchmarkScene, Option, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Option, Truth
 from geogs_bench.data.scene_folders import first_file, folders_like
 
 
@@ -27,8 +27,7 @@ def _scene(folder: Path) -> BenchmarkScene:
     calibration = frames / "intrinsic" / "intrinsic_color.txt"
     options = (Option("input.intrinsics", str(calibration)),) if calibration.is_file() else ()
     surface = first_file(folder / f"{name}_vh_clean_2.ply", folder / f"{name}_vh_clean.ply")
-    poses = TruePoses(frames, "scannet")
     has_depth = next((frames / "depth").glob("*.png"), None) is not None
     return BenchmarkScene(
-        name, frames / "color", Truth(poses, surface), options, has_depth=has_depth
+        name, frames / "color", Truth(frames, surface), options, has_depth=has_depth
     )

@@ -5,13 +5,9 @@
 
 from pathlib import Path
 
-from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.formats.colmap import is_model
-from geogs_bench.data.benchmark_scene import BenchmarkScene, Option, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Option, Truth
 from geogs_bench.data.scene_folders import first_file, folders_like
-
-_VIDEO_RATE = 60.0
-"""Frames per second of the iPhone videos."""
 
 _STRIDE = 2
 """Stride through the 60 frames a second; the paper does not say which it used."""
@@ -36,11 +32,9 @@ def _is_scene(folder: Path) -> bool:
 def _scene(folder: Path) -> BenchmarkScene:
     frames, model = _frames(folder), folder / "iphone" / "colmap"
     assert frames is not None  # it is a scene
-    # Images of a folder come at the default rate, those of a video at its own.
-    rate = FRAMES_PER_SECOND if frames.is_dir() else _VIDEO_RATE
     cameras = model / "cameras.txt"
     stride = Option("input.stride", str(_STRIDE))
     intrinsics = (Option("input.intrinsics", str(cameras)),) if cameras.is_file() else ()
     surface = first_file(folder / "scans" / "mesh_aligned_0.05.ply")
-    truth = Truth(TruePoses(model, "colmap", rate), surface)
+    truth = Truth(frames if frames.is_dir() else model, surface)
     return BenchmarkScene(folder.resolve().name, frames, truth, (stride, *intrinsics))

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from geogs.io.sources.formats.seven_scenes import is_posed_seven_scenes
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import first_file, folders_like
 
 
@@ -23,4 +23,4 @@ def _scene(sequence: Path) -> BenchmarkScene:
     surface = first_file(sequence.parent / "tsdf_pseudo_gt.ply", sequence.parent / "mesh.ply")
     name = f"{sequence.parent.name}-{sequence.name}"
     has_depth = next(sequence.glob("frame-*.depth.png"), None) is not None
-    return BenchmarkScene(name, sequence, Truth(TruePoses(sequence), surface), has_depth=has_depth)
+    return BenchmarkScene(name, sequence, Truth(sequence, surface), has_depth=has_depth)

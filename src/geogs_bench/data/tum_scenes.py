@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from geogs.io.sources.formats.tum import is_posed_tum
-from geogs_bench.data.benchmark_scene import BenchmarkScene, TruePoses, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import folders_like
 
 
@@ -13,7 +13,7 @@ def find_tum(root: Path) -> list[BenchmarkScene]:
         BenchmarkScene(
             folder.resolve().name,
             folder,
-            Truth(TruePoses(folder / "groundtruth.txt")),
+            Truth(folder / "groundtruth.txt"),
             has_depth=(folder / "depth.txt").is_file(),
         )
         for folder in folders_like(root, is_posed_tum)

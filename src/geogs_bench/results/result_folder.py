@@ -5,9 +5,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Bool, Float64
-
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface, read_surface
@@ -21,35 +18,6 @@ from geogs_bench.results.record import StageName
 _STAGE_FOLDERS: dict[StageName, str] = {
     "online": "online", "adjusted": "adjusted", "depth fusion": "depth_fusion", "final": "",
 }  # fmt: skip
-
-
-TRACKED, ORIENTED = "tracked", "orientation only"
-"""States of a frame that has a pose, and of one that has an orientation."""
-
-
-@dataclass(frozen=True)
-class FrameStates:
-    """What a result says of every frame."""
-
-    timestamps: Float64[np.ndarray, "n"]
-    state: np.ndarray
-    """Strings."""
-    sigma_position: Float64[np.ndarray, "n"]
-    """Map units; infinite where none is given."""
-
-    def tracked_of(self, trajectory: Trajectory) -> Trajectory:
-        """The poses of the frames that were tracked."""
-        return self._of(trajectory, self.state == TRACKED)
-
-    def oriented_of(self, trajectory: Trajectory) -> Trajectory:
-        """The poses of the frames that have an orientation at least."""
-        return self._of(trajectory, np.isin(self.state, (TRACKED, ORIENTED)))
-
-    def _of(self, trajectory: Trajectory, chosen: Bool[np.ndarray, "n"]) -> Trajectory:
-        keep = np.isin(trajectory.timestamps.round(6), self.timestamps[chosen].round(6))
-        return Trajectory(
-            trajectory.timestamps[keep], trajectory.T_wc[keep], trajectory.tracked[keep]
-        )
 
 
 @dataclass(frozen=True)
@@ -96,12 +64,13 @@ class ResultFolder:
         return {"online": folders["online"], "depth fusion": folders["depth fusion"],
                 "adjusted": folders["final"]}  # fmt: skip
 
-    def _file(self, stage: StageName, name: str) -> Path | None:
-        folder = self._folders.get(stage)
+    def _file(self, stage: StageName | None, name: str) -> Path | None:
+        folder = self.path if stage is None else self._folders.get(stage)
         return folder / name if folder is not None and (folder / name).is_file() else None
 
-    def mesh(self, stage: StageName) -> Surface | None:
-        """The surface of a stage, in map units; none where there is none."""
+    def mesh(self, stage: StageName | None = None) -> Surface | None:
+        """The surface of a stage, or of the result, whatever its last stage; none where there is
+        none. Map units."""
         file = self._file(stage, "mesh.ply")
         return None if file is None else read_surface(file)
 
@@ -110,32 +79,16 @@ class ResultFolder:
         file = self._file(stage, name)
         return None if file is None else read_tum_trajectory(file)
 
-    def final_mesh(self) -> Surface | None:
-        """The surface of the result, whatever its last stage; none where there is none."""
-        file = self.path / "mesh.ply"
-        return read_surface(file) if file.is_file() else None
-
-    def final_trajectory(self) -> Trajectory | None:
-        """The poses of the frames whose place is known; none where there are none."""
-        file = self.path / "trajectory.tum"
-        return read_tum_trajectory(file) if file.is_file() else None
-
     def poses(self) -> Trajectory | None:
         """All poses and orientations of the result, whatever its last stage, in order of time."""
-        is_there = (self.path / "trajectory.tum").is_file()
+        is_there = self._file(None, "trajectory.tum") is not None
         return read_frame_poses(self.path) if is_there else None
 
-    def uncertainty(self) -> FrameStates | None:
-        """``trajectory_uncertainty.csv``; none where it is not there.
-
-        Raises InputError if it is damaged.
-        """
+    def states(self) -> list[tuple[float, str, float]]:
+        """Time, state and deviation of the position of every frame, as of ``read_states``; none
+        where the result has no table of them. Raises InputError if that is damaged."""
         file = self.path / "trajectory_uncertainty.csv"
-        if not file.is_file():
-            return None
-        rows = read_states(file)
-        times, states, sigma = zip(*rows, strict=True) if rows else ((), (), ())
-        return FrameStates(np.array(times, float), np.array(states, str), np.array(sigma, float))
+        return read_states(file) if file.is_file() else []
 
     def snapshots(self) -> list[tuple[float, Path]]:
         """Folders of the map after so many seconds, in order of time."""

@@ -17,7 +17,7 @@ from geogs_bench.results.record import (
     read_record,
     write_json,
 )
-from geogs_bench.runners.runner import Command
+from geogs_bench.runners.task import Command
 
 RECORD_FILE = "bench.json"
 """What is known of the result."""

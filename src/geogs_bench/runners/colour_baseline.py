@@ -1,18 +1,17 @@
-"""Runs the baseline with colour as a task: the same images, the same seconds, its own folder."""
+"""The baseline with colour: the same images, the same seconds, its own folder."""
 
 import importlib.util
 import json
 import time
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geogs.config import InputConfig, MeshConfig
+from geogs.application.run_settings import ReconstructSettings
+from geogs.config import MeshConfig
 from geogs.errors import DeviceError, InputError
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-from geogs_bench.runners.runner import Task
 
 if TYPE_CHECKING:
     from geogs.io.sources.posed.posed_source import PosedSource
@@ -22,106 +21,69 @@ if TYPE_CHECKING:
     from geogs_bench.appearance.start_points import StartPoints
     from geogs_bench.appearance.training_views import TrainingView
 
-
-@dataclass(frozen=True)
-class BaselineSettings:
-    """What of a task's options concerns the baseline; those of the disk map do not."""
-
-    budget: float = 120.0
-    """Seconds of training; start points and mesh come on top."""
-    seed: int = 0
-    device: str = "auto"
-    hold_out: int | None = None
-    """Every so many-th image is not used; none uses all."""
-    snapshots: tuple[float, ...] = ()
-    """Seconds after which the mesh is written as it is then."""
-    input: InputConfig = field(default_factory=InputConfig)
-    mesh: MeshConfig = field(default_factory=MeshConfig)
+_BUDGET = 120.0
+"""Seconds of training where none are given; start points and mesh come on top."""
 
 
-class BaselineRunner:
-    """2D Gaussian splatting with colour, by gsplat, on an NVIDIA GPU."""
-
-    def settings(self, task: Task) -> dict[str, object]:
-        """What concerns the baseline. Raises InputError if gsplat is missing or a value wrong."""
-        for needed in ("gsplat", "pycolmap"):
-            if importlib.util.find_spec(needed) is None:
-                raise InputError(
-                    f"the baseline with colour needs {needed}: pip install 'geogs[bench]'."
-                )
-        return asdict(settings_of(task))
-
-    def run(self, task: Task) -> None:
-        """Start points, training, mesh.
-
-        Raises:
-            InputError: the source cannot be read, or has too little texture.
-            DeviceError: there is no GPU, or its memory is full.
-        """
-        import torch
-
-        from geogs.gpu.installation import require_device
-        from geogs.io.sources.sniff import open_posed_source
-        from geogs_bench.appearance.start_points import find_start_points
-        from geogs_bench.appearance.training_views import training_views
-
-        settings = settings_of(task)
-        device = require_device(settings.device)
-        if device.type != "cuda":
-            raise DeviceError("the baseline with colour needs an NVIDIA GPU.")
-        source = open_posed_source(task.source, settings.input, settings.hold_out)
-        views = training_views(source)
-        start = time.perf_counter()
-        points = find_start_points(views, settings.seed)
-        seconds = {"start points": time.perf_counter() - start}
-        output = prepare_output_folder(task.output)
-        result, mesh = _train(output, settings, views, points, str(device), seconds)
-        _write(output, source, result, mesh)
-        summary = {
-            "source": source.name,
-            "kind": source.kind,
-            "frames": len(views),
-            "held_out": list(source.held_out),
-            "start_points": len(points),
-            "disks": len(result.disks),
-            "map_bytes": result.disks.bytes,
-            "mesh_faces": len(mesh.faces),
-            "iterations": result.iterations,
-            "psnr": result.psnr,
-            "seconds": {name: round(value, 3) for name, value in seconds.items()},
-            "device": torch.cuda.get_device_name(device),
-            "peak_gpu_memory_bytes": torch.cuda.max_memory_allocated(device),
-            "seed": settings.seed,
-        }
-        write_text(output / "summary.json", json.dumps(summary, indent=2))
+def require_packages() -> None:
+    """Raises InputError where what trains the baseline is not installed."""
+    for needed in ("gsplat", "pycolmap"):
+        if importlib.util.find_spec(needed) is None:
+            raise InputError(
+                f"the baseline with colour needs {needed}: pip install 'geogs[bench]'."
+            )
 
 
-def settings_of(task: Task) -> BaselineSettings:
-    """Read a task's options. Raises InputError if a value is no number."""
-    try:
-        return BaselineSettings(
-            float((task.option("budget") or "120").removesuffix("s")),
-            int(task.option("seed") or 0),
-            task.option("device") or "auto",
-            int(every) if (every := task.option("hold-out")) else None,
-            tuple(float(s) for s in (task.option("snapshots") or "").split(",") if s),
-            InputConfig(
-                intrinsics=task.option("input.intrinsics") or "auto",
-                long_edge=int(task.option("input.long-edge") or InputConfig.long_edge),
-                stride=int(task.option("input.stride") or 1),
-            ),
-            MeshConfig(
-                voxel=_number(task.option("mesh.voxel")),
-                truncation=_number(task.option("mesh.truncation")) or MeshConfig.truncation,
-            ),
-        )
-    except ValueError:
-        raise InputError("an option of the baseline that has to be a number is none.") from None
+def train_baseline(settings: ReconstructSettings) -> None:
+    """2D Gaussian splatting with colour, by gsplat: start points, training, mesh.
+
+    Of the settings those of the disk map do not count, nor those of its mesh but for the voxels.
+
+    Raises:
+        InputError: the source cannot be read, or has too little texture.
+        DeviceError: there is no NVIDIA GPU, or its memory is full.
+    """
+    import torch
+
+    from geogs.gpu.installation import require_device
+    from geogs.io.sources.sniff import open_posed_source
+    from geogs_bench.appearance.start_points import find_start_points
+    from geogs_bench.appearance.training_views import training_views
+
+    assert settings.output is not None, "a task has a folder"
+    device, config = require_device(settings.device), settings.config
+    if device.type != "cuda":
+        raise DeviceError("the baseline with colour needs an NVIDIA GPU.")
+    source = open_posed_source(settings.source, config.input, settings.hold_out)
+    views = training_views(source)
+    start = time.perf_counter()
+    points = find_start_points(views, config.seed)
+    seconds = {"start points": time.perf_counter() - start}
+    output = prepare_output_folder(settings.output)
+    result, mesh = _train(output, settings, views, points, str(device), seconds)
+    _write(output, source, result, mesh)
+    summary = {
+        "source": source.name,
+        "kind": source.kind,
+        "frames": len(views),
+        "held_out": list(source.held_out),
+        "start_points": len(points),
+        "disks": len(result.disks),
+        "map_bytes": result.disks.bytes,
+        "mesh_faces": len(mesh.faces),
+        "iterations": result.iterations,
+        "psnr": result.psnr,
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        "device": torch.cuda.get_device_name(device),
+        "peak_gpu_memory_bytes": torch.cuda.max_memory_allocated(device),
+        "seed": config.seed,
+    }
+    write_text(output / "summary.json", json.dumps(summary, indent=2))
 
 
 def _train(
     output: Path,
-    settings: BaselineSettings,
+    settings: ReconstructSettings,
     views: "list[TrainingView]",
     points: "StartPoints",
     device: str,
@@ -139,21 +101,22 @@ def _train(
     from geogs_bench.appearance.crossing_depth import depth_views
     from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
 
-    config = AppearanceConfig()
+    config, given = AppearanceConfig(), settings.config
+    surface = MeshConfig(voxel=given.mesh.voxel, truncation=given.mesh.truncation)
     rasteriser = GsplatRasteriser(config.near)
 
     def meshed(disks: "AppearanceDisks") -> "Mesh":
-        return extract_mesh(depth_views(disks, views, rasteriser, config), settings.mesh)
+        return extract_mesh(depth_views(disks, views, rasteriser, config), surface)
 
     def snapshot(at: float, disks: "AppearanceDisks") -> None:
         folder = prepare_output_folder(output / "snapshots" / f"{at:g}")
         _write_mesh(folder / "mesh.ply", meshed(disks))
 
     trainer = AppearanceTrainer(
-        views, points.positions, points.colours, rasteriser, config, settings.seed, device
+        views, points.positions, points.colours, rasteriser, config, given.seed, device
     )
     try:
-        result = trainer.train(settings.budget, settings.snapshots, snapshot)
+        result = trainer.train(settings.budget or _BUDGET, settings.snapshots, snapshot)
     except torch.cuda.OutOfMemoryError as error:
         raise DeviceError(
             "The memory of the GPU is full; use fewer or smaller images for the baseline."
@@ -181,7 +144,3 @@ def _write_mesh(path: Path, mesh: "Mesh") -> None:
     from geogs.io.writers.ply_writer import write_mesh
 
     write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
-
-
-def _number(text: str | None) -> float | None:
-    return None if text is None else float(text)

@@ -1,46 +1,67 @@
-"""What the harness asks of the commands, so that it need not know the command line."""
+"""Runs tasks as ``geogs run`` and ``geogs reconstruct`` would, by the same options."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from dataclasses import asdict, replace
+from typing import cast
 
-from geogs_bench.data.benchmark_scene import Option
+from geogs.application.interrupt import Interruption
+from geogs.application.progress.terminal_progress import TerminalProgress
+from geogs.application.run_settings import ReconstructSettings, RunSettings
+from geogs.cli import reconstruct as reconstruct_command
+from geogs.cli import run as run_command
+from geogs.cli.options import record
+from geogs_bench.runners.colour_baseline import require_packages, train_baseline
+from geogs_bench.runners.task import Task
 
-Command = Literal["run", "track", "update", "reconstruct", "colour-2dgs"]
-"""SLAM, its tracking alone, one map of it moved by a rule of its update, the map from known poses,
-or the baseline with colour from known poses."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """One command on one source."""
-
-    command: Command
-    source: Path
-    output: Path
-    options: tuple[Option, ...] = ()
-
-    def option(self, name: str) -> str | None:
-        """The value of an option as given last, or none."""
-        return next((o.value for o in reversed(self.options) if o.name == name), None)
+_NO_SETTINGS = ("source", "output", "resume", "checkpoint_every")
+"""What changes nothing about a result."""
 
 
-@runtime_checkable
-class Runner(Protocol):
-    """Runs tasks into their folders."""
+class Runner:
+    """Runs tasks by what is behind the two commands, by a part of it, or by the baseline."""
 
     def settings(self, task: Task) -> dict[str, object]:
-        """Every setting with which the task would run, but for its output.
+        """Every setting of the command but its output.
 
         Raises:
-            InputError: an option does not exist, or its value is wrong.
+            InputError: an option is wrong, or what the baseline needs is not installed.
         """
-        ...
+        if task.command == "colour-2dgs":
+            require_packages()
+        settings = asdict(settings_of(task))
+        settings |= settings.pop("config")
+        return {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
 
     def run(self, task: Task) -> None:
-        """Run it; results lie in ``task.output`` then.
+        """Run the command; what ``geogs run`` does but for the map; move one map, as the stream
+        has left it, by the rule that the options name; or train the baseline.
 
         Raises:
             GeogsError: it failed, in a sentence.
         """
-        ...
+        from geogs.application.reconstruct import reconstruct_to_folder
+        from geogs.application.run import run
+        from geogs_bench.runners.saved_map import correct_saved_map
+        from geogs_bench.runners.tracking_only import track_to_folder
+
+        settings = replace(settings_of(task), checkpoint_every=0.0)
+        if isinstance(settings, RunSettings) and task.command == "track":
+            track_to_folder(settings, task.output)
+            return
+        with TerminalProgress() as progress:
+            if task.command == "colour-2dgs":
+                train_baseline(cast(ReconstructSettings, settings))
+            elif not isinstance(settings, RunSettings):
+                reconstruct_to_folder(settings, progress, Interruption())
+            elif task.command == "update":
+                correct_saved_map(settings, task.output, progress)
+            else:
+                run(settings, progress, Interruption())
+
+
+def settings_of(task: Task) -> RunSettings | ReconstructSettings:
+    """What a task's options say, by the command's own parser."""
+    argv = [str(task.source), "-o", str(task.output)]
+    argv += [argument for option in task.options for argument in option.arguments()]
+    if task.command in ("run", "track", "update"):
+        return record(RunSettings, run_command.parse(argv))
+    return record(ReconstructSettings, reconstruct_command.parse(argv))

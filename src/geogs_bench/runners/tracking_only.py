@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from geogs.application.calibrate import with_shutter_found
-from geogs.application.results.summary import lost_spans
+from geogs.application.results.summary import state_spans
 from geogs.application.results.verdict import verdict
 from geogs.application.run_settings import RunSettings
 from geogs.errors import TrackingLost
@@ -59,7 +59,7 @@ def track_to_folder(
         known = frame_uncertainty(slam.segments.main)
         write_trajectories(folder, trajectory, slam.keyframe_trajectory())
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
-        summary["lost_spans"] = lost_spans(trajectory)
+        summary["lost_spans"] = state_spans(trajectory, "lost")
         said = verdict(trajectory, slam.keyframe_trajectory(), known, slam.segments.table.why_not)
         summary["verdict"] = {"is_reliable": said.is_reliable, "sentence": said.sentence}
     except TrackingLost as error:

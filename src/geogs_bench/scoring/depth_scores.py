@@ -50,9 +50,10 @@ def score_depth(
     Raises:
         InputError: the result has no mesh or no poses, or the sequence no true depth.
     """
-    mesh, poses = result.final_mesh(), result.final_trajectory()
+    mesh, poses = result.mesh(), result.poses()
     if mesh is None or not mesh.is_mesh or poses is None:
         raise InputError(f"{result.path} holds no mesh with a trajectory to score.")
+    poses = poses.of("tracked")
     camera = result.camera
     truth = read_true_depths(scene, result, poses, VIEWS)
     depths = [

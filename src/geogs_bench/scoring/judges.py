@@ -14,15 +14,16 @@ from geogs.evaluation.surfaces.object_errors import (
 )
 from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks
 from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.true_scene import silhouettes
 from geogs.io.sources.sniff import open_posed_source
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses
 from geogs_bench.results.record import SurfaceScore
 from geogs_bench.results.result_folder import ResultFolder
-from geogs_bench.scoring.room_scores import Comparison, read_true_surface, score_surface
+from geogs_bench.scoring.room_scores import read_true_surface, score_surface
 
-Judge = Callable[[Surface], tuple[tuple[SurfaceScore, ...], Comparison]]
+Judge = Callable[[Surface], tuple[tuple[SurfaceScore, ...], SurfaceComparison]]
 """Scores of a mesh (the one to plot last) and where it is wrong."""
 
 _MASK_EDGE = 1600
@@ -59,11 +60,11 @@ def _object_judge(scene: BenchmarkScene, seed: int) -> Judge:
     points = None if scene.truth.points is None else read_surface(scene.truth.points)
     masks = _masks(scene)
 
-    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], Comparison]:
+    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
         found = evaluate_object(mesh, truth, masks, points, seed=seed)
-        errors = 100 * np.minimum(found.accuracy, MAX_DISTANCE)  # those left out are infinite
-        limit = found.scores.colour_limit_cm
-        comparison = Comparison(mesh, truth, found.reconstruction_points, errors, limit)
+        distance = np.minimum(found.accuracy, MAX_DISTANCE)  # those left out are infinite
+        compared_at = found.reconstruction_points
+        comparison = SurfaceComparison(found.scores, mesh, truth, compared_at, distance)
         return (_of_object(found.scores),), comparison
 
     return judge
@@ -74,12 +75,11 @@ def _scan_judge(scene: BenchmarkScene, seed: int) -> Judge:
     reference = read_dtu_reference(scene.truth.dtu.folder, scene.truth.dtu.scan)
     masks = _masks(scene)
 
-    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], Comparison]:
+    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
         found = evaluate_dtu(cull_by_masks(mesh, masks), reference, seed)
-        limit = found.scores.colour_limit_cm
-        return (_of_scan(found.scores),), Comparison(
-            mesh, None, found.reconstruction_points, found.accuracy / 10, limit
-        )
+        points, distance = found.reconstruction_points, found.accuracy / 1000
+        comparison = SurfaceComparison(found.scores, mesh, None, points, distance)
+        return (_of_scan(found.scores),), comparison
 
     return judge
 

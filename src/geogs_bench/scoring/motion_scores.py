@@ -7,12 +7,17 @@ from jaxtyping import Float
 
 from geogs.errors import InputError
 from geogs.evaluation.rotation_errors import best_rotation, rotation_angle
-from geogs.evaluation.trajectory_errors import associate, evaluate_trajectory, finite_poses
+from geogs.evaluation.trajectory_errors import (
+    associate,
+    evaluate_trajectory,
+    extent_of,
+    finite_poses,
+)
 from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.true_poses import read_true_poses
 from geogs_bench.results.record import MotionScore
-from geogs_bench.results.result_folder import ORIENTED, FrameStates, ResultFolder
+from geogs_bench.results.result_folder import ResultFolder
 
 _LEAST_PATH = 0.05
 """Metres of way below which positions have nothing to be compared with."""
@@ -39,15 +44,12 @@ def score_motion(scene: BenchmarkScene, result: ResultFolder) -> MotionScore:
     said = result.summary.get("verdict") or {}
     if estimate is None:
         return MotionScore(tracked=0.0, is_called_reliable=said.get("is_reliable"))
-    known = result.uncertainty()
-    if known is None:
-        return compare_motion(reference, _without_lost(estimate, result))
-    score = compare_motion(reference, known.tracked_of(estimate), known.oriented_of(estimate))
-    turned = 100 * float((known.state == ORIENTED).mean())
+    tracked, states = estimate.of("tracked"), result.states()
+    turned = sum(state == "orientation only" for _, state, _ in states)
     return replace(
-        score,
-        turned=turned,
-        within=_within(reference, known.tracked_of(estimate), known),
+        compare_motion(reference, tracked, estimate),
+        turned=100 * turned / max(len(states), 1),
+        within=_within(reference, tracked, states) if states else None,
         is_called_reliable=said.get("is_reliable"),
     )
 
@@ -77,7 +79,7 @@ def compare_motion(
         ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
     except InputError:  # they are on a line
         return MotionScore(percentage, rotation=rotation)
-    extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
+    extent = extent_of(reference.T_wc[i])
     turned = 0 if oriented is None else len(finite_poses(oriented).timestamps) - len(i)
     followed = percentage + 100 * turned / len(reference.timestamps)
     good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent
@@ -93,13 +95,16 @@ def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
     return rotation_error(oriented.T_wc[j, :3, :3], reference.T_wc[i, :3, :3])
 
 
-def _within(reference: Trajectory, tracked: Trajectory, known: FrameStates) -> float | None:
+def _within(
+    reference: Trajectory, tracked: Trajectory, states: list[tuple[float, str, float]]
+) -> float | None:
     """Percent of the positions that are off by no more than three deviations, aligned."""
     try:
         errors = evaluate_trajectory(tracked, reference, _SAME_TIME)
     except InputError:
         return None
-    claimed = errors.scale * np.interp(errors.timestamps, known.timestamps, known.sigma_position)
+    times, _, sigma = zip(*states, strict=True)
+    claimed = errors.scale * np.interp(errors.timestamps, times, sigma)
     return 100 * float((errors.position_error <= 3 * claimed).mean())
 
 
@@ -109,11 +114,3 @@ def rotation_error(
     """RMS angle in degrees after the rotation of the world that fits best (chordal mean)."""
     aligned = best_rotation(estimate, truth) @ estimate
     return float(np.sqrt((rotation_angle(aligned, truth) ** 2).mean()))
-
-
-def _without_lost(estimate: Trajectory, result: ResultFolder) -> Trajectory:
-    """The poses that are not only interpolated, by the result's own summary."""
-    keep = np.ones(len(estimate.timestamps), bool)
-    for first, last in result.summary.get("lost_spans", []):
-        keep &= (estimate.timestamps < first - 1e-6) | (estimate.timestamps > last + 1e-6)
-    return Trajectory(estimate.timestamps[keep], estimate.T_wc[keep], estimate.tracked[keep])

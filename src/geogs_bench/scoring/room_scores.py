@@ -4,13 +4,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
 from geogs.evaluation.surfaces.reconstruction_errors import (
     ReconstructionScores,
     evaluate_reconstruction,
 )
 from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.surfaces.toolbox import evaluate_vertices
 from geogs.evaluation.surfaces.visibility import cull_mesh
 from geogs.geometry.camera import Camera
@@ -23,19 +24,6 @@ _LONGEST_EDGE = 0.05
 """Metres; coarser true meshes are cut into smaller triangles."""
 
 _MOST_FACES = 4_000_000
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A mesh in the frame of the truth, and its errors at points on it."""
-
-    mesh: Surface
-    truth: Surface | None
-    """None where the truth is no mesh."""
-    points: Float[np.ndarray, "n 3"]
-    errors_cm: Float[np.ndarray, "n"]
-    limit_cm: float
-    """What pictures show as the worst."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +60,7 @@ def read_true_surface(
 
 def score_surface(
     mesh: Surface, truth: TrueSurface, use_icp: bool, seed: int, threshold: float = 0.05
-) -> tuple[tuple[SurfaceScore, ...], Comparison]:
+) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
     """Vertex-weighted and, last, area-weighted scores in cm, and where the mesh is wrong.
 
     ``use_icp`` moves the mesh rigidly by ICP (0.1 m) before, as the scripts of the SLAM tables do.
@@ -86,9 +74,8 @@ def score_surface(
     if truth.seen.is_mesh:
         vertices = evaluate_vertices(mesh, truth.seen, use_icp, threshold, seed)
         scores.insert(0, in_cm("vertices", vertices.scores))
-    shown = truth.whole if truth.whole.is_mesh else None
-    points, errors = area.reconstruction_points, 100 * area.accuracy
-    return tuple(scores), Comparison(mesh, shown, points, errors, 200 * threshold)
+    points, distance = area.reconstruction_points, area.accuracy
+    return tuple(scores), SurfaceComparison(area.scores, mesh, truth.whole, points, distance)
 
 
 def in_cm(weighting: Literal["area", "vertices"], scores: ReconstructionScores) -> SurfaceScore:

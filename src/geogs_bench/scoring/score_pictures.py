@@ -1,7 +1,5 @@
 """Pictures of one result beside the truth, in the report folder of the result."""
 
-from pathlib import Path
-
 import numpy as np
 from jaxtyping import Float
 
@@ -9,7 +7,6 @@ from geogs.evaluation.pages import plots
 from geogs.evaluation.pages.shading import viewpoints
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.depth_pictures import DEPTH_PICTURE, DEPTH_TITLE
-from geogs_bench.scoring.room_scores import Comparison
 from geogs_bench.scoring.slam_scores import StageErrors
 
 PICTURES = {
@@ -31,13 +28,5 @@ def draw(errors: StageErrors, result: ResultFolder, T_wc: Float[np.ndarray, "k 4
     if errors.trajectory is not None:
         plots.plot_trajectory(folder / "bench_trajectory.png", errors.trajectory)
     if errors.comparison is not None:
-        _draw_surface(folder / "bench_surface.png", errors.comparison, result, T_wc)
-
-
-def _draw_surface(
-    path: Path, found: Comparison, result: ResultFolder, T_wc: Float[np.ndarray, "k 4 4"]
-) -> None:
-    mesh, truth, limit = found.mesh, found.truth, found.limit_cm
-    colours = plots.error_colours(mesh.vertices, found.points, found.errors_cm, limit)
-    views = viewpoints(mesh.vertices, T_wc, result.camera)
-    plots.plot_beside_truth(path, mesh, truth, colours, views, limit)
+        views = viewpoints(errors.comparison.mesh.vertices, T_wc, result.camera)
+        plots.plot_beside_truth(folder / "bench_surface.png", errors.comparison, views)

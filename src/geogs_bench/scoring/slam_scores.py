@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geogs.errors import InputError
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import TrajectoryErrors, evaluate_trajectory
 from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
@@ -12,7 +13,6 @@ from geogs_bench.data.true_poses import read_true_poses
 from geogs_bench.results.record import StageName, StageScore, SurfaceScore, TrajectoryScore
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.room_scores import (
-    Comparison,
     TrueSurface,
     read_true_surface,
     score_surface,
@@ -25,7 +25,7 @@ class StageErrors:
 
     score: StageScore
     trajectory: TrajectoryErrors | None = None
-    comparison: Comparison | None = None
+    comparison: SurfaceComparison | None = None
 
 
 def score_slam(scene: BenchmarkScene, result: ResultFolder, seed: int) -> list[StageErrors]:

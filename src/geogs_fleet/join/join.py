@@ -13,7 +13,7 @@ import torch
 from geogs.application.machine.device import device_summary, peak_memory
 from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.results.summary import lost_spans
+from geogs.application.results.summary import state_spans
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
@@ -217,7 +217,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         **_statistics(list(results.values()), gauge, unjoined, adjust),
         "videos": [asdict(span) for span in spans],
         "frames": len(trajectory.timestamps),
-        "lost_spans": lost_spans(trajectory),
+        "lost_spans": state_spans(trajectory, "lost"),
         "disks": len(disks),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
         "seconds": {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geogs.application.results.summary import lost_spans, time_summary
+from geogs.application.results.summary import state_spans, time_summary
 from geogs.stopwatch import Stopwatch
 from geogs.types import Trajectory
 
@@ -29,14 +29,14 @@ def test_what_knows_no_stream_has_one_rate():
 
 
 @pytest.mark.parametrize(
-    ("tracked", "spans"),
+    ("tracked", "expected"),
     [
         ([1, 1, 1, 1, 1], []),
         ([0, 1, 0, 0, 1], [[0.0, 0.0], [1.0, 1.5]]),
         ([0, 0, 0, 0, 0], [[0.0, 2.0]]),
     ],
 )
-def test_lost_spans_begin_and_end_with_lost_frames(tracked, spans):
+def test_lost_spans_begin_and_end_with_lost_frames(tracked, expected):
     times = 0.5 * np.arange(5)
     poses = np.tile(np.eye(4), (5, 1, 1))
-    assert lost_spans(Trajectory(times, poses, np.array(tracked, bool))) == spans
+    assert state_spans(Trajectory(times, poses, np.array(tracked, bool)), "lost") == expected

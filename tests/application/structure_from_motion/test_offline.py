@@ -7,16 +7,31 @@ import pytest
 import torch
 
 from geogs.application.structure_from_motion import chosen_frames, offline_plan
+from geogs.application.structure_from_motion.offline import beginning_with
 from geogs.cli.main import main
+from geogs.config import InputConfig
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.sources.sniff import open_source
+from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
 from geogs_photos.localise import Localiser
-from io_samples import write_image
+from io_samples import write_image, write_video
 from posed_layouts import render_room
 from posed_scene import SMALL
 
 FRAMES = 12
+
+
+@pytest.mark.parametrize(("interval", "begins_with"), [(33, 0.02), (200, 0.0)])
+def test_a_readout_found_of_few_images_a_second_is_left_to_their_residuals(
+    tmp_path, interval, begins_with
+):
+    images = [np.full((48, 64, 3), 8 * k, np.uint8) for k in range(12)]
+    write_video(tmp_path / "video.mp4", images, [interval * k for k in range(12)])
+    video = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5"))
+    found = video.with_shutter(Shutter(0.02, "found"))
+    assert beginning_with(video, found).shutter.readout == begins_with
 
 
 @pytest.mark.system

@@ -122,9 +122,9 @@ def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
     source = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=1, stop=13, stride=2))
     given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.clips()]
     assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
-    assert clips.clip_starts(0, 2) == []
-    assert clips.clip_starts(4, 5) == [4, 6]
-    assert clips.clip_starts(4, 4) == [4]
+    assert clips.clip_starts(0, 2, 3) == []
+    assert clips.clip_starts(4, 5, 3) == [4, 6]
+    assert clips.clip_starts(4, 4, 3) == [4]
 
 
 def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
@@ -134,6 +134,15 @@ def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
     source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5", start=1))
     given = [[round(raw.image.mean() / 12) for raw in clip] for clip in source.clips()]
     assert given == [[1, 2, 3], [3, 4, 5], [5, 6, 7], [7, 8, 9], [9, 10, 11]]
+
+
+@pytest.mark.parametrize(("interval", "images"), [(200, 15), (10_000, 1)])
+def test_clips_of_few_images_a_second_last_three_seconds(tmp_path, interval, images):
+    shown = [np.full((48, 64, 3), 6 * k, np.uint8) for k in range(40)]
+    times = [interval * k for k in range(40)]
+    write_video(tmp_path / "video.mp4", shown, times)
+    source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5"))
+    assert {len(clip) for clip in source.clips()} == {images}
 
 
 def test_who_says_what_the_shutter_is(folder):

@@ -10,7 +10,6 @@ from geogs.application.results.result_page import write_page_anew
 from geogs.application.results.saved_result import SavedResult, load_result, result_folder
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
-from geogs.config.old_names import present_values
 from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
@@ -29,7 +28,7 @@ def mesh_settings(folder: Path) -> MeshConfig:
     if not path.is_file():
         return MeshConfig()
     try:
-        said = present_values(read_yaml(path)["mesh"], "mesh", path.name)
+        said = read_yaml(path)["mesh"]
         known = {name.name: said[name.name] for name in fields(MeshConfig) if name.name in said}
     except UNUSABLE:
         raise InputError(f"{path} is damaged; give the settings of the mesh anew.") from None

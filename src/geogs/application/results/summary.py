@@ -31,8 +31,8 @@ def summarise(result: Result) -> dict[str, object]:
         **source_summary(source),
         "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
         "keyframes": len(result.keyframes.timestamps),
-        "lost_spans": lost_spans(result.trajectory),
-        "orientation_only_spans": spans(result.trajectory, "orientation only"),
+        "lost_spans": state_spans(result.trajectory, "lost"),
+        "orientation_only_spans": state_spans(result.trajectory, "orientation only"),
         **statistics(scene),
         "disks": len(result.map),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
@@ -105,12 +105,7 @@ def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
     return {"seconds": {**seconds, "total": round(total, 3)}, "frames_per_second": rates}
 
 
-def lost_spans(trajectory: Trajectory) -> list[list[float]]:
-    """First and last time of every stretch where the camera was lost."""
-    return spans(trajectory, "lost")
-
-
-def spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:
+def state_spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:
     """First and last time of every stretch of frames in a state."""
     inside = np.array([False, *(s == state for s in trajectory.states), False]).astype(int)
     first, last = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1) - 1

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geogs.evaluation.trajectory_errors import extent_of
 from geogs.types import Trajectory, Uncertainty
 
 MAX_LOST = 0.2
@@ -55,7 +56,7 @@ def verdict(
         known: how well frames are known.
         why_not: why no map could be started, if so.
     """
-    extent = extent_of(keyframes)
+    extent = extent_of(keyframes.T_wc)
     states = trajectory.states
     lost = states.count("lost") / len(states) if states else 1.0
     orientation_only = states.count("orientation only") / max(len(states), 1)
@@ -81,14 +82,6 @@ def verdict(
             f"{_finely(position)} of the extent of its path, the best known depths to {depth:.1%}."
         )
     return Verdict(not reasons, sentence, lost, orientation_only, position, rotation, depth)
-
-
-def extent_of(path: Trajectory) -> float:
-    """Root of the mean squared distance of its places from their middle."""
-    centres = path.T_wc[:, :3, 3]
-    return (
-        float(np.sqrt(np.square(centres - centres.mean(0)).sum(1).mean())) if len(centres) else 0.0
-    )
 
 
 def _median(values: np.ndarray) -> float:

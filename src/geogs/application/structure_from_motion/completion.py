@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.application.driver import Driver
-from geogs.application.results.verdict import MAX_POSITION_DEVIATION, extent_of
+from geogs.application.results.verdict import MAX_POSITION_DEVIATION
 from geogs.application.structure_from_motion.photos import SECONDS_PER_FRAME, place_lost
 from geogs.errors import InputError
 from geogs.evaluation.duration import duration
+from geogs.evaluation.trajectory_errors import extent_of
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
@@ -57,7 +58,7 @@ class LostFrames:
         """
         # A copy, as a source knows how far it has been read.
         self._video, self._seen_by, self._seed = copy.copy(video), seen_by, seed
-        self._most_deviation = MAX_POSITION_DEVIATION * extent_of(keyframes)
+        self._most_deviation = MAX_POSITION_DEVIATION * extent_of(keyframes.T_wc)
         self._times = trajectory.timestamps
         states, T_wc = trajectory.states, trajectory.T_wc
         self.known = {k: np.linalg.inv(T_wc[k]) for k in sharp if states[k] == "tracked"}

@@ -29,6 +29,10 @@ from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
 
+FEW = 8.0
+"""Images a second, as recorded, below which a readout that nobody gave is not searched in clips:
+all images are placed then, and their residuals tell it with its error (docs/photographs.md)."""
+
 
 class PlacedOffline(Work):
     """Sharp frames of a video placed by structure from motion, all others against them.
@@ -144,8 +148,8 @@ class PlacedOffline(Work):
 
 def beginning_with(video: Source, found: Source) -> Source:
     """A video with the shutter that was found of it, and the focal length, where nobody gave one:
-    that is where structure from motion begins, which finds its own."""
-    begun = video.with_shutter(found.shutter)
+    that is where structure from motion begins, which finds its own; the shutter of ``FEW``, too."""
+    begun = video if video.recorded_fps < FEW else video.with_shutter(found.shutter)
     if not video.is_calibration_open:
         return begun
     told = found.calibration

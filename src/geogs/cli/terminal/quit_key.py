@@ -3,7 +3,9 @@
 import os
 import select
 import sys
+import termios
 import threading
+import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,16 +17,12 @@ PAUSE = 0.2
 def quit_key(stop: Callable[[], None]) -> Iterator[bool]:
     """While it is entered, ``stop`` is called when q is pressed; gives whether keys can be heard.
 
-    They cannot where standard input is no terminal, or the system has no terminals of that kind.
-    The terminal is as it was afterwards.
+    They cannot where standard input is no terminal. It is as it was afterwards.
     """
     try:
-        import termios
-        import tty
-
         keys = sys.stdin.fileno()
         before = termios.tcgetattr(keys)
-    except (ImportError, AttributeError, OSError, ValueError, termios.error):
+    except (AttributeError, OSError, ValueError, termios.error):
         yield False
         return
     ended = threading.Event()

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from geogs.evaluation.held_camera import level_axes
 from geogs.evaluation.pages.shading import Sight, Viewpoint, look
 from geogs.evaluation.reliability import Reliability
-from geogs.evaluation.surfaces.surface import Surface
+from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
 from geogs.io.writers.atomic import atomic_file
 from geogs.threads import thread_map
@@ -127,47 +127,39 @@ def plot_meshes(
     save_figure(figure, path)
 
 
-def plot_beside_truth(
-    path: Path,
-    mesh: Surface,
-    truth: Surface | None,
-    colours: UInt8[np.ndarray, "n 3"],
-    views: Sequence[Viewpoint],
-    limit_cm: float,
-) -> None:
+def plot_beside_truth(path: Path, compared: SurfaceComparison, views: Sequence[Viewpoint]) -> None:
     """A mesh, the truth if that is one, and the mesh in the colours of its error."""
+    mesh, truth = compared.mesh, compared.truth
+    colours = error_colours(mesh.vertices, compared)
     rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
         ("reconstruction", mesh.vertices, mesh.faces, None),
         ("its error", mesh.vertices, mesh.faces, colours),
     ]
     if truth is not None and truth.is_mesh:
         rows.insert(1, ("truth", truth.vertices, truth.faces, None))
-    plot_meshes(path, rows, views, limit_cm)
+    plot_meshes(path, rows, views, compared.scores.colour_limit_cm)
 
 
 def error_colours(
-    vertices: Float[np.ndarray, "n 3"],
-    samples: Float[np.ndarray, "k 3"],
-    errors: Float[np.ndarray, "k"],
-    limit: float,
-    reach: float = np.inf,
+    vertices: Float[np.ndarray, "n 3"], compared: SurfaceComparison
 ) -> UInt8[np.ndarray, "n 3"]:
-    """Colour of each vertex by the mean error of the three samples nearest to it.
+    """Colour of each vertex by the mean error of the three compared points nearest to it.
 
-    Pale is 0, dark red ``limit`` (in the unit of the errors) and more; grey are vertices without a
-    sample within ``reach``, which were not compared.
+    Pale is 0, dark red the limit of the scores and more; grey are vertices without a point within
+    reach, which were not compared.
     """
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
 
-    k = min(3, len(samples))
+    k = min(3, len(compared.points))
     distance, nearest = (
         found.reshape(len(vertices), k)
-        for found in cKDTree(samples).query(vertices, k=k, workers=-1)
+        for found in cKDTree(compared.points).query(vertices, k=k, workers=-1)
     )
-    fraction = (errors[nearest].mean(1) / limit).clip(0, 1)
+    errors = 100 * compared.distance
+    fraction = (errors[nearest].mean(1) / compared.scores.colour_limit_cm).clip(0, 1)
     colours = (255 * colormaps[_ERROR_MAP](fraction)[:, :3]).round().astype(np.uint8)
-    return np.where(distance[:, :1] <= reach, colours, np.uint8(_UNKNOWN))
+    return np.where(distance[:, :1] <= compared.reach, colours, np.uint8(_UNKNOWN))
 
 
 def new_figure(width: float, height: float) -> "Figure":

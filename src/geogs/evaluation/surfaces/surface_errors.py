@@ -6,6 +6,8 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from geogs.evaluation.surfaces.surface import Surface
+
 
 @runtime_checkable
 class SurfaceScores(Protocol):
@@ -42,3 +44,19 @@ class SurfaceErrors(Generic[S_co]):
     truth_points: Float[np.ndarray, "m 3"]
     completeness: Float[np.ndarray, "m"]
     """Distance of each to the reconstruction; inf where it is left out."""
+
+
+@dataclass(frozen=True)
+class SurfaceComparison:
+    """Scores, and what pictures of the errors need, in the frame of the truth."""
+
+    scores: SurfaceScores
+    mesh: Surface
+    truth: Surface | None
+    """None where the truth is no surface."""
+    points: Float[np.ndarray, "n 3"]
+    """Where the reconstruction was compared."""
+    distance: Float[np.ndarray, "n"]
+    """To the truth, metres; inf where it did not count."""
+    reach: float = np.inf
+    """How far from the points the mesh was still compared; beyond, pictures show no error."""

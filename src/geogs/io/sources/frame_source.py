@@ -114,6 +114,8 @@ class Source:
         """Pixels of every frame that may show the scene; none where all do."""
         self.fps = first.fps
         """Frames per second after the stride, nominal."""
+        self.recorded_fps = first.reader.info.fps
+        """Images per second before it."""
         lengths = [images.length for images in recordings]
         self.length = None if None in lengths else sum(n for n in lengths if n is not None)
         """Frames to expect, unreadable ones included; none where it is not known beforehand."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Generator
 
 from geogs.config import InputConfig
 from geogs.io.sources.reader import RawFrame, Reader, read_side_by_side
-from geogs.shutter.readout import CLIP, CLIPS
+from geogs.shutter.readout import CLIP, CLIPS, SPAN
 
 MINUTE = 60.0
 """Seconds of a video that are looked at for its readout."""
@@ -19,30 +19,31 @@ def read_clips(
     they come from its first minute.
     """
     ends = [n for n in (config.stop, reader.info.length) if n is not None]
-    count = min(ends) - config.start if ends else CLIP * CLIPS
+    clip = min(CLIP, max(1, round(SPAN * reader.info.fps)))
+    count = min(ends) - config.start if ends else clip * CLIPS
     if len(reader.paths) > 1:
-        starts = clip_starts(config.start, count)
+        starts = clip_starts(config.start, count, clip)
         yield from read_side_by_side(
-            lambda n: list(map(resized, reader.read(n, n + CLIP, 1))), starts
+            lambda n: list(map(resized, reader.read(n, n + clip, 1))), starts
         )
         return
-    starts = clip_starts(config.start, min(count, round(MINUTE * reader.info.fps)))
+    starts = clip_starts(config.start, min(count, round(MINUTE * reader.info.fps)), clip)
     if not starts:
         return
-    clip: list[RawFrame] = []
-    raws = reader.read(starts[0], starts[-1] + CLIP, 1)
+    images: list[RawFrame] = []
+    raws = reader.read(starts[0], starts[-1] + clip, 1)
     for position, raw in enumerate(raws, starts[0]):
-        if any(start <= position < start + CLIP for start in starts):
-            clip.append(resized(raw))
-        if position - CLIP + 1 in starts:
-            yield clip[-CLIP:]
-        del clip[:-CLIP]
+        if any(start <= position < start + clip for start in starts):
+            images.append(resized(raw))
+        if position - clip + 1 in starts:
+            yield images[-clip:]
+        del images[:-clip]
 
 
-def clip_starts(first: int, count: int) -> list[int]:
-    """Where clips begin that spread over ``count`` images from ``first`` on.
+def clip_starts(first: int, count: int, clip: int) -> list[int]:
+    """Where clips of ``clip`` images begin that spread over ``count`` images from ``first`` on.
 
     Those of a short video overlap by half.
     """
-    clips = min(CLIPS, max(0, count - CLIP // 2) // (CLIP - CLIP // 2))
-    return [first + round(k * (count - CLIP) / max(clips - 1, 1)) for k in range(clips)]
+    clips = min(CLIPS, max(0, count - clip // 2) // (clip - clip // 2))
+    return [first + round(k * (count - clip) / max(clips - 1, 1)) for k in range(clips)]

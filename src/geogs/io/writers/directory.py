@@ -10,15 +10,12 @@ from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
-_BY_HANDLE = hasattr(os, "O_NOFOLLOW") and os.supports_dir_fd >= {
-    os.open, os.mkdir, os.rename, os.unlink, os.rmdir, os.stat,
-}  # fmt: skip
-_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
-_FILE = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 class Directory:
-    """A folder, by its handle; where the system has none, by its path, looked at before each use.
+    """A folder, by its handle.
 
     Names have ``/`` between folders. Whatever a name leads through has to be a folder in the one
     before, and what it names is taken as it is: a link is moved or deleted itself.
@@ -26,7 +23,7 @@ class Directory:
     Every method raises OSError, also for a name that leads elsewhere.
     """
 
-    def __init__(self, path: Path, handle: int | None) -> None:
+    def __init__(self, path: Path, handle: int) -> None:
         self.path = path
         self._handle = handle
 
@@ -34,9 +31,6 @@ class Directory:
     @contextmanager
     def opened(path: Path) -> Iterator["Directory"]:
         """The folder of a path that the user gave: links may lead to it, but not on from it."""
-        if not _BY_HANDLE:
-            yield Directory(path, None)
-            return
         handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:
             yield Directory(path, handle)
@@ -51,7 +45,7 @@ class Directory:
 
     def names(self) -> list[str]:
         """What is in it, in order."""
-        return sorted(os.listdir(self.path if self._handle is None else self._handle))
+        return sorted(os.listdir(self._handle))
 
     def folders(self) -> Iterator[str]:
         """Names of all folders below, each before those in it."""
@@ -98,7 +92,7 @@ class Directory:
             if parent.is_folder(last):
                 return False
             try:
-                os.mkdir(parent._at(last), dir_fd=parent._handle)
+                os.mkdir(last, dir_fd=parent._handle)
             except FileExistsError:
                 with parent._folder(last):
                     return False
@@ -107,14 +101,12 @@ class Directory:
     def move(self, name: str, target: "Directory", new_name: str) -> None:
         """Give it a name in another folder, in place of what had that."""
         with self._parent(name) as (here, old), target._parent(new_name) as (there, new):
-            os.replace(
-                here._at(old), there._at(new), src_dir_fd=here._handle, dst_dir_fd=there._handle
-            )
+            os.replace(old, new, src_dir_fd=here._handle, dst_dir_fd=there._handle)
 
     def delete(self, name: str) -> None:
         """Delete a file, and the folders that it lay in as far as they are empty now."""
         with self._parent(name) as (parent, last):
-            os.unlink(parent._at(last), dir_fd=parent._handle)
+            os.unlink(last, dir_fd=parent._handle)
         with suppress(OSError):
             while "/" in name:
                 name = name.rpartition("/")[0]
@@ -123,25 +115,20 @@ class Directory:
     def delete_empty(self, name: str) -> None:
         """Delete a folder that has nothing in it."""
         with self._parent(name) as (parent, last):
-            os.rmdir(parent._at(last), dir_fd=parent._handle)
+            os.rmdir(last, dir_fd=parent._handle)
 
     def delete_all(self, name: str) -> None:
         """Delete a folder with all that is in it, as far as that can be."""
         with self._parent(name) as (parent, last):
-            shutil.rmtree(parent._at(last), ignore_errors=True, dir_fd=parent._handle)
+            shutil.rmtree(last, ignore_errors=True, dir_fd=parent._handle)
 
     def sync(self) -> None:
         """Wait until its names are on the disk."""
-        if self._handle is not None:
-            with suppress(OSError):  # not every file system does that
-                os.fsync(self._handle)
-
-    def _at(self, name: str) -> str:
-        """What the system is given for a name in this folder."""
-        return name if self._handle is not None else str(self.path / name)
+        with suppress(OSError):  # not every file system does that
+            os.fsync(self._handle)
 
     def _status(self, name: str) -> os.stat_result:
-        return os.stat(self._at(name), dir_fd=self._handle, follow_symlinks=False)
+        return os.stat(name, dir_fd=self._handle, follow_symlinks=False)
 
     @contextmanager
     def _parent(self, name: str) -> Iterator[tuple["Directory", str]]:
@@ -161,9 +148,6 @@ class Directory:
         if not stat.S_ISDIR(self._status(name).st_mode):
             reason = f"{path} is a link or no folder, and no link is followed"
             raise NotADirectoryError(errno.ENOTDIR, reason)
-        if self._handle is None:
-            yield Directory(path, None)
-            return
         handle = os.open(name, _FOLDER, dir_fd=self._handle)
         try:
             yield Directory(path, handle)
@@ -173,9 +157,7 @@ class Directory:
     @contextmanager
     def _file(self, name: str) -> Iterator[BufferedReader]:
         with self._parent(name) as (parent, last):
-            if self._handle is None and not stat.S_ISREG(parent._status(last).st_mode):
-                raise FileNotFoundError(f"{name} is no plain file")
-            number = os.open(parent._at(last), _FILE, dir_fd=parent._handle)
+            number = os.open(last, _FILE, dir_fd=parent._handle)
         with os.fdopen(number, "rb") as file:
             if not stat.S_ISREG(os.fstat(number).st_mode):
                 raise FileNotFoundError(f"{name} is no plain file")

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from geogs.config import Config, ReconstructConfig
-from geogs.config.document import document
 from geogs.config.leaves import leaves
+from settings_page import document
 
 PAGE = Path(__file__).parents[2] / "docs" / "configuration.md"
 
 
 def test_the_page_is_that_of_the_code():
-    assert PAGE.read_text() == document(), "python -m geogs.config.document > docs/configuration.md"
+    assert PAGE.read_text() == document(), "python tests/settings_page.py > docs/configuration.md"
 
 
 def test_every_setting_has_a_row_with_its_default_its_range_and_its_meaning():

@@ -1,4 +1,4 @@
-"""Writes docs/configuration.md: ``python -m geogs.config.document > docs/configuration.md``."""
+"""Writes docs/configuration.md: ``python tests/settings_page.py > docs/configuration.md``."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from geogs.config.setting import Basic, Only, Settings
 _INTRODUCTION = """\
 # Settings
 
-Made from the classes in `src/geogs/config` by `python -m geogs.config.document`; a test holds this
+Made from the classes in `src/geogs/config` by `python tests/settings_page.py`; a test holds this
 page to them.
 
 No setting is needed. On the command line a setting is an option with its dotted name
