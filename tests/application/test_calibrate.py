@@ -152,6 +152,18 @@ def test_what_was_found_at_working_size_is_carried_to_the_source():
     assert "k1 -0.0800 +- 0.0040, k2 0.0200 +- 0.0030 (EXIF says 1500.0)" in after.origin
 
 
+def test_a_lens_is_found_where_the_video_told_its_focal_length_and_nobody_how_it_bends():
+    nominal = Calibration(600.0, 600.0, 319.5, 239.5, width=640, height=480, is_nominal=True)
+    camera = replace(nominal.camera(), fx=630.0, fy=630.0)
+    pinhole = SelfCalibration(camera, None, 0.01, None, 12, 80)
+    nothing = replace(pinhole, failure="the camera stands still")
+    bent = replace(nominal, distortion=(-0.1, 0.0, 0.0, 0.0))
+    assert refined(nominal, 600.0, pinhole).is_found_lens
+    assert not refined(nominal, 600.0, nothing).is_found_lens
+    assert not refined(bent, 600.0, pinhole).is_found_lens
+    assert not nominal.is_found_lens
+
+
 def test_a_focal_length_that_all_matches_find_takes_the_place_of_the_guess():
     guess = Calibration(200.0, 202.0, 159.5, 119.5, (), 320, 240, "auto", is_guess=True)
     found = FoundLens(0.1, -0.2, 0.002, 0.003, focal=0.95, deviation_focal=0.01)
