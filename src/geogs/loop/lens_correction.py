@@ -13,7 +13,7 @@ from dataclasses import replace
 from operator import methodcaller
 
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.lens_error import PRIOR, SHAPES, LensBend
+from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, PRIOR, SHAPES, LensBend
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
 from geogs.tracking.frames.row_errors import TOGETHER, RowErrors
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -38,9 +38,6 @@ it was given it is 0 to 2.2 (docs/tracking.md)."""
 READOUT_DOUBT = 0.05
 """Part of the readout that its deviation has to be for matches to be asked for it, too: what they
 say of it comes out 2 to 6 % short itself (docs/tracking.md)."""
-FOCAL_LEFT = 0.2
-"""What the focal length is off by after its correction, of the correction: a tenth and a quarter of
-it in two rendered rooms, whatever matches say."""
 
 
 def correct_lens(

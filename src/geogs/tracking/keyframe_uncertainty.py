@@ -148,7 +148,7 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     )
     if said is not None:
         lens = tracker.keyframes.table.lens
-        found = found.beside(said.considered(0.0 if lens is None else lens.deviation_focal))
+        found = found.beside(said.considered(1.0 if lens is None else lens.focal))
     rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[rows[:, None], rows]
     return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])

@@ -1,5 +1,6 @@
 """The error of a lens against lenses that bend, and against adjustments of what they show."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,6 +13,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import (
+    FOCAL_LEFT,
     LEAST,
     PRIOR,
     LensBend,
@@ -206,5 +208,6 @@ def test_without_evidence_the_lens_is_as_unsure_as_before():
     wanted = torch.diag(torch.tensor(PRIOR).double().square())
     # Nothing is said of it, whatever is estimated.
     assert float((found.considered().covariance - wanted).abs().max()) < 1e-3 * float(wanted.max())
-    more = found.considered(0.01).covariance - found.considered().covariance
-    assert torch.allclose(more, torch.diag(torch.tensor([1e-4, 0, 0]).double()))
+    more = found.considered(0.95).covariance - found.considered().covariance
+    left = (FOCAL_LEFT * math.log(0.95)) ** 2
+    assert torch.allclose(more, torch.diag(torch.tensor([left, 0, 0]).double()))

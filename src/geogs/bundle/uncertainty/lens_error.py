@@ -8,6 +8,7 @@ They are estimated, and what is left open of them is considered in what is said 
 Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bierman 1977).
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -42,6 +43,9 @@ LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001), 0.005
 error (docs/tracking.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Deviations of the sizes before any match is asked."""
+FOCAL_LEFT = 0.2
+"""What the focal length is off by after its correction, of the correction: a tenth and a quarter of
+it in two rendered rooms, whatever matches say."""
 
 
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "3 *b 2"]:
@@ -129,21 +133,21 @@ class LensEvidence:
         least = (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
         return _estimate(self.information, self.gradient).floored(least)
 
-    def considered(self, focal: float = 0.0) -> Considered:
+    def considered(self, corrected: float = 1.0) -> Considered:
         """The error that the lens has, and what it does to poses and depths.
 
         By what matches say of it and ``PRIOR`` together: their estimate moves them as far as it
-        would if it were taken off, and what it leaves open does too; and by a deviation of the
-        logarithm of the ``focal`` length that they do not tell of. Without ``LEAST``: what matches
-        have wrong in common is taken for an error of the lens that hardly moves a pose, and three
-        sizes that were each so unsure would move them two to five times as far.
+        would if it were taken off, and what it leaves open does too; and by what is left of a focal
+        length that was ``corrected`` by a factor, which they do not tell of. Without ``LEAST``:
+        what matches have wrong in common is taken for an error of the lens that hardly moves a
+        pose, and three sizes that were each so unsure would move them two to five times as far.
         """
         said = _estimate(self.information, self.gradient)
         prior = self.moves.new_tensor(PRIOR).square()
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
-        left[0, 0] += focal**2
+        left[0, 0] += (FOCAL_LEFT * math.log(corrected)) ** 2
         square = left + size[:, None] * size
         depth = self.depth_moves.to(square)
         return Considered(
