@@ -107,11 +107,11 @@ class _Matches:
         """Of their cells."""
         return self.keyframes.grid
 
-    def lens(self, rows: RowErrors | None = None) -> LensEvidence | None:
+    def lens(self, rows: RowErrors | None = None, of_depths: bool = False) -> LensEvidence | None:
         """What they say of the lens, and of the readout that ``rows`` are for; nothing where they
         do not tell of all poses."""
         slope = None if rows is None else partial(self._slope, rows)
-        return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope)
+        return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope, of_depths)
 
     def _slope(
         self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
@@ -138,7 +138,7 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     found = marginals(matches.grid, matches.problem, OPTIONS, CELLS)
     longer = (found.normalised_residual / USUAL_RESIDUAL).clamp(min=1)
     longer = torch.where(longer.isfinite(), longer, 1.0)
-    said = matches.lens() if found.is_bounded else None
+    said = matches.lens(of_depths=True) if found.is_bounded else None
     if said is not None:
         found = found.beside(common_errors(matches.grid, matches.problem, OPTIONS, found, CELLS))
     found = replace(

@@ -63,7 +63,7 @@ def rays(pixels: Tensor) -> Tensor:
 
 
 def evidence(grid: SampleGrid, problem: BundleProblem, chunk: int = 24) -> LensEvidence:
-    found = lens_evidence(grid, problem, replace(EXACT, chunk=chunk), grid.size)
+    found = lens_evidence(grid, problem, replace(EXACT, chunk=chunk), grid.size, of_depths=True)
     assert found is not None
     return found
 
@@ -103,6 +103,7 @@ def test_a_readout_that_is_off_is_told_beside_the_lens():
     pixels = problem.pixels - 0.03 * rows(problem, grid.rays, at)
     found = lens_evidence(grid, replace(problem, pixels=pixels), EXACT, grid.size, rows)
     assert found is not None
+    assert not found.depth_moves.numel()  # nobody asked
     said = found.whole
     wanted = torch.tensor([0.004, 0.01, -0.02, 0.03]).double()
     torch.testing.assert_close(said.size, wanted, atol=1e-3, rtol=0.06)

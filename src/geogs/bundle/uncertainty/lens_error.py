@@ -110,7 +110,8 @@ class LensEvidence:
     moves: Float[Tensor, "m k"]
     """By how much an error of size one moves all poses, left perturbations; m = 6n."""
     depth_moves: Float[Tensor, "n c k"]
-    """And the inverse depths of some cells of each frame, as parts of these."""
+    """And the inverse depths of some cells of each frame, as parts of these; none (c = 0) where
+    nobody asked."""
 
     def joined(self, other: "LensEvidence") -> "LensEvidence":
         """Of both, poses of one after those of the other."""
@@ -210,6 +211,7 @@ def lens_evidence(
     options: BundleOptions,
     cells: int = 1024,
     rows: Rows | None = None,
+    of_depths: bool = False,
 ) -> LensEvidence | None:
     """What the matches of a problem at its solution say of the error of the lens.
 
@@ -221,6 +223,7 @@ def lens_evidence(
         options: Huber's limit and the damping of depths.
         cells: most cells of a frame that are asked; the others are taken to say the same.
         rows: shape of an error of the readout, which is the last size then.
+        of_depths: whether to tell by how much depths move, too.
     """
     thinned = ThinnedProblem(grid, problem, cells)
     scale = 1 / thinned.fraction
@@ -236,9 +239,10 @@ def lens_evidence(
     moves = covariance @ pull
     information = [s.information - s.pull.mT @ moves[s.rows] for s in each]
     gradient = [s.gradient + moves[s.rows].mT @ s.descent for s in each]
-    depth = torch.zeros(len(problem.T_cw), thinned.count, shapes)
-    for s, source in zip(each, thinned.sources(options), strict=True):
-        depth[source.frame] = thinned.depth_moves(source, s.on_depth.mT, moves)
+    depth = torch.zeros(len(problem.T_cw), thinned.count * of_depths, shapes)
+    if of_depths:
+        for s, source in zip(each, thinned.sources(options), strict=True):
+            depth[source.frame] = thinned.depth_moves(source, s.on_depth.mT, moves)
     return LensEvidence(
         scale * torch.stack(information), scale * torch.stack(gradient), moves, depth
     )
