@@ -116,10 +116,10 @@ def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
         deviation = found.deviation_focal * after.fx
         focal = f"fx {after.fx:.1f} +- {deviation:.1f} instead of {before.fx:.1f}, "
     return (
-        f"Lens: images straightened by what was said of its distortion ({was}) still bend: {focal}"
+        f"Lens, by all matches, beside what was said of its distortion ({was}): {focal}"
         f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "
-        f"{found.deviation_k2:.4f} by all matches; poses, depths and the images of the map are "
-        f"corrected. Next time give --intrinsics {after.numbers} (intrinsics.json has it)."
+        f"{found.deviation_k2:.4f}; poses, depths and the images of the map are corrected. Next "
+        f"time give --intrinsics {after.numbers} (intrinsics.json has it)."
     )
 
 
