@@ -17,6 +17,7 @@ from geogs.shutter.shutter import Shutter
 from geogs.types import FoundLens
 
 if TYPE_CHECKING:
+    from geogs.io.sources.reader import RawFrame
     from geogs.shutter.readout import FoundReadout
     from geogs.tracking.calibration.self_calibration import SelfCalibration
 
@@ -46,14 +47,15 @@ def self_calibrated(
         return source
     from geogs.tracking.calibration.self_calibration import self_calibrate
 
-    given = source.calibration
-    found = _found_in(
-        source.linked_frames(), "calibration", progress, stop,
-        lambda frames, report: self_calibrate(
-            frames, source.camera, config.calibration.radial and not given.is_distorted,
-            torch.device(device), report, source.mask, source.black_is_masked,
-        ),
-    )  # fmt: skip
+    given, rows, found = source.calibration, _with_rows_rectified(source, progress, stop), None
+    if rows is not None:
+        found = _found_in(
+            rows.linked_frames(), "calibration", progress, stop,
+            lambda frames, report: self_calibrate(
+                frames, source.camera, config.calibration.radial and not given.is_distorted,
+                torch.device(device), report, source.mask, source.black_is_masked,
+            ),
+        )  # fmt: skip
     if found is None:
         progress.write(
             f"Calibration stopped; going on with {source.intrinsics_origin}. "
@@ -134,13 +136,9 @@ def with_shutter_found(
     progress, stop = progress or RunProgress(), stop or Stop()
     if not source.is_shutter_open:
         return source
-    from geogs.shutter.readout import find_readout
-
     found = _found_in(
         source.clips(), "shutter", progress, stop,
-        lambda clips, report: find_readout(
-            clips, source.rolling_camera, report, not source.calibration.is_unknown_lens
-        ),
+        lambda clips, report: _readout(source, clips, report),
     )  # fmt: skip
     if found is None:
         progress.write(
@@ -156,6 +154,28 @@ def with_shutter_found(
     )
     origin = f"found in the video: {_evidence(found)}"
     return source.with_shutter(Shutter(found.readout, origin, found.error))
+
+
+def _with_rows_rectified(source: Source, progress: RunProgress, stop: Stop) -> Source | None:
+    """The source as its focal length is asked for: a turn that stretches what is seen row by row
+    looks like another lens. By its guess, the readout is known to a sixth or so; none after a
+    request to stop."""
+    if not source.is_shutter_open:
+        return source
+    found = _found_in(
+        source.clips(), "calibration", progress, stop,
+        lambda clips, report: _readout(source, clips, lambda fraction: report(0.0)),
+    )  # fmt: skip
+    return None if found is None else source.with_shutter(Shutter(found.readout))
+
+
+def _readout(
+    source: Source, clips: "Iterator[list[RawFrame]]", report: Callable[[float], None]
+) -> "FoundReadout":
+    from geogs.shutter.readout import find_readout
+
+    known = not source.calibration.is_unknown_lens
+    return find_readout(clips, source.rolling_camera, report, known)
 
 
 def _evidence(found: "FoundReadout") -> str:
