@@ -15,6 +15,7 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, weighed_residuals
 from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import sources_within
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -160,14 +161,15 @@ def _common_pulls(
 ) -> Iterator[tuple[SourceFlow, Float[Tensor, "c k"], Float[Tensor, "p k"]]]:
     """Each source in order, and by how much each error that matches have in common, at its
     deviation, pulls at the poses that it joins once depths have followed, and at its depths."""
-    camera, rays, place = thinned.flow.camera, thinned.flow.rays, _places(thinned)
+    camera, rays, place = thinned.camera, thinned.rays, _places(thinned)
+    flow = LensFlow(thinned.lens)
     for part in thinned.parts(options):
         i, j = part.source, part.target
         p = linearise(camera, rays, relative_motion(part.T_cw, i, j), part.inverse_depth[i])
         _, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
         unit = w * part.weight.clamp(min=1e-12).rsqrt()  # weight times one deviation
         onward = (j - i).sign() * COMMON_FLOW
-        sources = linearised_sources(thinned.flow, part, part.start, options)
+        sources = linearised_sources(flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(i), strict=True):
             depth, chain = source.edges.depth, source.edges.chain
             assert depth is not None
@@ -186,7 +188,7 @@ def _common_pulls(
 def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
     """One where a cell lies in a part of the image."""
     across, down = PLACES
-    camera, pixels = thinned.flow.camera, thinned.pixels
+    camera, pixels = thinned.camera, thinned.pixels
     x, y = (pixels / pixels.new_tensor([camera.width, camera.height])).mT
     at = (y * down).long() * across + (x * across).long()
     return torch.nn.functional.one_hot(at, across * down).to(pixels)
