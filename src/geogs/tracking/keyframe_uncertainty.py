@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import methodcaller
 
 import numpy as np
 import torch
@@ -122,7 +121,7 @@ class _Matches:
         ))  # fmt: skip
         T_ji = relative_motion(part.T_cw, part.source, part.target)
         depth = part.inverse_depth[part.source]
-        return rows.slope(methodcaller("of_matches", i, j, T_ji, rays, depth, at.pixels))
+        return rows.of_matches(i, j, T_ji, rays, depth, at.pixels).slope
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
