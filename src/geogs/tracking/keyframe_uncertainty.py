@@ -23,9 +23,9 @@ from geogs.world.keyframes import KeyframeSet
 
 CELLS = 512
 """Most cells of a keyframe whose matches stand for all."""
-OPTIONS = BundleOptions(huber=HUBER, depth_damping=1e-5)
-"""How matches are linearised. More damping of the depths would count as evidence against a drift of
-scale, which takes them all along."""
+OPTIONS = BundleOptions(huber=HUBER, depth_damping=1e-5, chunk=96)
+"""How matches are linearised, many edges at a time as few cells are looked at. More damping of the
+depths would count as evidence against a drift of scale, which takes them all along."""
 TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23

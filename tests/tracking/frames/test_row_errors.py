@@ -155,7 +155,7 @@ def test_the_slope_is_what_a_longer_readout_adds():
     numeric = (matches(1.02).shift - matches(0.98).shift) / 0.04
     slope = matches(1.0).slope
     assert slope.abs().max() > 0.5
-    torch.testing.assert_close(slope, numeric, rtol=0, atol=0.002)
+    torch.testing.assert_close(slope, numeric, rtol=0, atol=0.005)
 
 
 def test_nothing_is_said_where_too_little_is_known():
