@@ -16,7 +16,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
-from geogs.threads import thread_map
+from geogs.threads import ordered_map, thread_map, worker_count
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.pose_filling import seen_by_keyframes
 from geogs.tracking.frames.row_errors import seen_rows
@@ -56,8 +56,9 @@ class BentImages:
         """Have the keyframes' images as the table's pinhole sees them, always made of those that
         were tracked; normals and depths go along pixel by pixel."""
         arrays, view = self.keyframes.table.arrays, StraightView(self.keyframes.camera, lens)
-        for id in self.keyframes.ids:
-            image = view.image(self.pieces["image"][id].load())
+        bent, ids = self.pieces["image"], self.keyframes.ids
+        images = ordered_map(lambda id: view.image(bent[id].load()), ids, worker_count())
+        for id, image in zip(ids, images, strict=True):
             arrays.put("image", id, image, recent=True)
             arrays.recent("encoded").drop(id)
             for name in ("prior normal", "sensor depth"):
