@@ -150,48 +150,43 @@ class RowErrors:
         own point was elsewhere then. The difference is what the pixel shows instead, to first
         order.
         """
-        shift, slope = torch.zeros_like(pixels), torch.zeros_like(pixels)
-        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        found = RowShifts(*(pixels.new_zeros(pixels.shape) for _ in range(2)))
         # Of several edges of a frame, what it has of its own is brought here once.
-        order = {frame: n for n, frame in enumerate(dict.fromkeys(frames[n] for n in known))}
-        rectified = [self._rectified[frame] for frame in order]
-        which = [order[frames[n]] for n in known]
-        if known and pixels.is_cuda:
+        rectified = {f: self._rectified[f] for f in dict.fromkeys(frames) if f in self._rectified}
+        if rectified and pixels.is_cuda:
+            known = [n for n, frame in enumerate(frames) if frame in rectified]
+            order = {frame: n for n, frame in enumerate(rectified)}
             at = torch.tensor(known, device=pixels.device)
-            found = self._shifted(rectified, which, pixels[at], inverse_depth[at])
-            shift[at], slope[at] = found
-        elif known:
-            self._shift_each(
-                rectified, which, pixels.contiguous(), inverse_depth, known, shift, slope
-            )
-        return RowShifts(shift, slope)
+            found.shift[at], found.slope[at] = self._shifted(
+                list(rectified.values()), [order[frames[n]] for n in known],
+                pixels[at], inverse_depth[at],
+            )  # fmt: skip
+        elif rectified:
+            self._shift_each(frames, rectified, pixels, inverse_depth, found)
+        return found
 
     def _shift_each(
         self,
-        rectified: Sequence[_RectifiedFrame],
-        which: Sequence[int],
+        frames: Sequence[int],
+        rectified: Mapping[int, _RectifiedFrame],
         pixels: Float[Tensor, "e p 2"],
         inverse_depth: Float[Tensor, "e p"],
-        known: Sequence[int],
-        shift: Float[Tensor, "e p 2"],
-        slope: Float[Tensor, "e p 2"],
+        found: RowShifts,
     ) -> None:
-        """:meth:`_shifted` of some ``known`` edges of all, each in ``which`` of the frames, by
-        compiled loops on the CPU; into ``shift`` and ``slope``."""
+        """:meth:`_shifted` of all edges of rectified frames by compiled loops, into ``found``."""
         from geogs.tracking.frames.row_kernels import shift_pixels
 
         c = self._grid.camera
         camera = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
         limits, factor = np.array([CELL, MIN_Z], np.float32), np.float32(self._factor)
-        frames = [
-            (laid(f.rows).float().numpy(), f.times.numpy(), f.motions[:, :3].contiguous().numpy())
-            for f in rectified
-        ]
-        seen, depth, *out = (x.contiguous().numpy() for x in (pixels, inverse_depth, shift, slope))
-        for n, frame in zip(known, which, strict=True):
-            shift_pixels(
-                *frames[frame], camera, limits, factor, seen[n], depth[n], out[0][n], out[1][n]
-            )
+        known = {
+            frame: (laid(f.rows).float().numpy(), f.times.numpy(), f.motions.numpy())
+            for frame, f in rectified.items()
+        }
+        each = zip(*(x.contiguous().numpy() for x in (pixels, inverse_depth, *found)), strict=True)
+        for frame, edge in zip(frames, each, strict=True):
+            if frame in known:
+                shift_pixels(*known[frame], camera, limits, factor, *edge)
 
     def _shifted(
         self,

@@ -20,7 +20,7 @@ def shift_pixels(
     """Fill ``shift`` and ``slope`` (p, 2), as :meth:`RowErrors.of_pixels` says.
 
     Of the frame: ``field`` (r, c, 3) of offsets and seconds, times (5) of the nodes and motions
-    (5, 3, 4) to them. ``camera`` as fx, fy, cx, cy; ``limits`` are the pixels of a cell of the
+    (5, 4, 4) to them. ``camera`` as fx, fy, cx, cy; ``limits`` are the pixels of a cell of the
     field and the least z. Then the factor on the readout, pixels (p, 2) and their inverse depths
     (p); all float32.
     """
