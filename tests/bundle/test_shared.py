@@ -9,8 +9,9 @@ import torch
 
 from geogs.bundle.flow_term import PinholeFlow, linearised_sources
 from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.shared import OPTIONS, SharedFlow, SharedSchur, solve_shared
+from geogs.bundle.shared import OPTIONS, SharedSchur, solve_shared
 from geogs.bundle.terms import BundleState
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
 from oracles.calibration_reference import gauss_newton_step
@@ -21,7 +22,7 @@ def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
     problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.01, 0.03)
     options = BundleOptions(huber=1.0, depth_damping=1e-3)
     state = BundleState(problem.T_cw, problem.inverse_depth, LensBlock(lens, GRID.pixels))
-    flows = SharedFlow(), PinholeFlow(GRID.camera, GRID.rays)
+    flows = LensFlow(), PinholeFlow(GRID.camera, GRID.rays)
     both = (linearised_sources(flow, problem, state, options) for flow in flows)
     for source, tracked in zip(*both, strict=True):
         own, theirs = source.edges, tracked.edges

@@ -64,7 +64,7 @@ def test_rows_are_corrected_as_within_a_run(tmp_path):
     shift = errors.of_matches(
         [middle[n] for n in source], [middle[n] for n in target],
         T[target] @ se3_inverse(T[source]), GRID.rays, depth[source], torch.stack(plain),
-    )  # fmt: skip
+    ).shift  # fmt: skip
     step = position_step(CAMERA)
     assert float(shift.norm(dim=-1).median()) > 0.05  # pixels
     assert np.array_equal(found.shift, (shift / step).round().short().numpy())

@@ -103,7 +103,10 @@ def test_rows_are_those_that_straight_pixels_were_seen_in():
     )
     offset = torch.stack([1.0 + 0.01 * u, -2.0 + 0.02 * v], -1)
     rows = SeenRows(offset.half(), (1e-3 * v).half(), 0.1)
-    straight = straight_rows(rows, VIEW)
+    other = SeenRows(rows.offset + 1, rows.seconds, 0.2)
+    straight, second = straight_rows([rows, other], VIEW)
+    assert second.doubt == 0.2
+    assert torch.equal(second.offset, straight_rows([other], VIEW)[0].offset)
     assert straight.doubt == rows.doubt
     for row, column in [(3, 4), (8, 10), (12, 17)]:
         node = torch.stack([u[row, column], v[row, column]])[None].double()

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import CellProjection, motion_rows, relative_motion, seen_from_targets
+from geogs.bundle.projection import CellProjection, relative_motion, seen_from_targets
 from geogs.geometry.camera import Camera
 
 _NEWTON_STEPS = 8
@@ -43,16 +43,6 @@ class RadialLens:
         """Of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
         ``_LEAST_SLOPE``."""
         return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=_LEAST_SLOPE)
-
-
-@dataclass(frozen=True)
-class SharedProjection(CellProjection):
-    """A projection with its first derivatives."""
-
-    jacobian: Float[Tensor, "e c 2 p"]
-    """d pixel / d (xi of the motion to the target, left perturbation; the block's unknowns)."""
-    depth_jacobian: Float[Tensor, "e 2 p"]
-    """d pixel / d inverse depth of the source."""
 
 
 @dataclass(frozen=True)
@@ -93,41 +83,6 @@ class LensBlock:
         T_ji = relative_motion(T_cw, source, target)
         y, valid, z = seen_from_targets(self.rays.rays, T_ji, inverse_depth)
         return CellProjection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
-
-    def linearise(
-        self,
-        T_cw: Float[Tensor, "n 4 4"],
-        source: Int[Tensor, "e"],
-        target: Int[Tensor, "e"],
-        inverse_depth: Float[Tensor, "e p"],
-    ) -> SharedProjection:
-        """:meth:`project` with its derivatives."""
-        lens, rays, T_ji = self.lens, self.rays, relative_motion(T_cw, source, target)
-        y, valid, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
-        x, c, q = y[..., :2] / z[..., None], lens.camera, 1 / z
-        u, v = x.unbind(-1)
-        R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
-        tx, ty, tz = t[:, None].unbind(-1)
-        # A change of the lens moves the ray by a factor of (x, y, 0).
-        ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
-        along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
-        row_x = [*(along_x * slope for slope in rays.slope), (tx - tz * u) * q]
-        row_y = [*(along_y * slope for slope in rays.slope), (ty - tz * v) * q]
-        others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
-        J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
-        square = u * u + v * v
-        if lens.k1 or lens.k2:
-            point = x.mT[:, None]
-            inward = (J * point).sum(2, keepdim=True)
-            bent = (2 * lens.k1 + 4 * lens.k2 * square)[:, None, None]
-            J = J * lens.growth(square)[:, None, None] + bent * point * inward
-        J = J * J.new_tensor([c.fx, c.fy])[:, None]
-        pixels = _to_pixels(lens, x)
-        centred = (pixels - pixels.new_tensor([c.cx, c.cy])).mT
-        bulge = (x * pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
-        own = torch.stack([centred, bulge, bulge * square[:, None]], 1)
-        by = torch.cat([J[:, :6], J[:, 6:9] + own], 1)
-        return SharedProjection(pixels, valid, z, by, J[:, 9])
 
 
 @dataclass(frozen=True)

@@ -126,5 +126,5 @@ def carried_over(
     """
     focal = at.pixels.new_tensor([camera.fx, camera.fy])
     plane = (at.pixels - at.pixels.new_tensor([camera.cx, camera.cy])) / focal
-    moved = (step / focal) @ T_ji[:, :3, :2].to(step).mT
+    moved = (T_ji[:, :3, :2].to(step) @ (step / focal).mT).mT  # as :func:`seen_from_targets` does
     return focal * (moved[..., :2] - plane * moved[..., 2:]) / at.z[..., None]

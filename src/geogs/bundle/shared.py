@@ -5,14 +5,12 @@ beside poses and inverse depths: depths are eliminated frame by frame, then pose
 solved together in float64. The first pose is fixed; the scale, which nothing measures, is kept by a
 penalty along it, so that nothing else resists the block.
 
-What is summed over the cells of an edge is summed here in another order than by the tracker's term
-(:class:`~geogs.bundle.flow_term.PinholeFlow`), whose speed counts: the last bits of either's
-results depend on it.
+All of it is on the CPU, where matches are linearised by compiled loops
+(:mod:`geogs.bundle.lens_flow`).
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import torch
@@ -20,28 +18,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.dense import DenseSchur, LinearBundle
-from geogs.bundle.flow_term import (
-    SourceFlow,
-    damped_curvature,
-    matched_cost,
-    weighed_residuals,
-)
-from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
 from geogs.bundle.lens import LensBlock
-from geogs.bundle.problem import BundleProblem, sources_within
-from geogs.bundle.projection import relative_motion
+from geogs.bundle.lens_flow import LensFlow
+from geogs.bundle.problem import BundleProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, minimise
-from geogs.geometry.lie import se3_adjoint, se3_inverse
+from geogs.geometry.lie import se3_inverse
 
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
-GPU_OPTIONS = replace(OPTIONS, chunk=256)
-"""On a GPU, where Python's own time counts: one thread with all edges is faster than several with
-few each."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +91,7 @@ class SharedSchur(DenseSchur):
     floor = 1e-6
 
     def __init__(self, problem: BundleProblem, options: BundleOptions) -> None:
-        super().__init__(problem, SharedFlow(), options)
+        super().__init__(problem, LensFlow(), options)
 
     def linearise(self, state: BundleState) -> LinearBundle:
         """As without shared unknowns, and the scale is kept."""
@@ -114,7 +102,7 @@ class SharedSchur(DenseSchur):
             assert source.diagonal is not None
             diagonal[source.edges.rows(len(T))] += source.diagonal
         centre = se3_inverse(T[0])[:3, 3]
-        away = (T[:, :3, :3] @ centre + T[:, :3, 3]).double().cpu()
+        away = (T[:, :3, :3] @ centre + T[:, :3, 3]).double()
         scale = torch.zeros_like(diagonal)
         scale[: away.numel() * 2] = torch.cat([away, 0 * away], 1).reshape(-1)
         scale = scale / scale.norm().clamp(min=1e-12)
@@ -125,58 +113,6 @@ class SharedSchur(DenseSchur):
         """Mean over the matched cells; infinite where nothing is matched."""
         matched = int((self.problem.weight[..., 0] > 0).sum())
         return super().cost(state) / matched if matched else math.inf
-
-
-class SharedFlow:
-    """Dense flow whose projections depend on shared unknowns."""
-
-    def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """As in the protocol."""
-        source, block = problem.source, cast(LensBlock, state.block)
-        p = block.project(state.T_cw, source, problem.target, state.inverse_depth[source])
-        return matched_cost(p, problem.pixels, problem.weight, huber)
-
-    def sources(
-        self, problem: BundleProblem, state: BundleState, options: BundleOptions
-    ) -> Iterator[SourceFlow]:
-        """As in the protocol; each with the diagonal of its equations, its depths being fixed."""
-        i, j, block = problem.source, problem.target, cast(LensBlock, state.block)
-        p = block.linearise(state.T_cw, i, j, state.inverse_depth[i])
-        r, weight = weighed_residuals(p, problem.pixels, problem.weight, options.huber)
-        w, J, Jd = weight.mT[:, None], p.jacobian, p.depth_jacobian
-        wJ, wd = J * w, Jd * w[:, 0]
-        H = (wJ.flatten(2) @ J.flatten(2).mT).double().cpu()
-        v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
-        E, curvature, pull = (wJ * Jd[:, None]).sum(2), (wd * Jd).sum(1), (wd * r.mT).sum(1)
-        adjoint = se3_adjoint(relative_motion(state.T_cw, i, j))
-        for frame, e in sources_within(i):
-            information = curvature[e].sum(0)
-            depth = DepthEquations(
-                torch.cat([E[e, :6].flatten(0, 1), E[e, 6:].sum(0)]),
-                damped_curvature(information, options.depth_damping),
-                pull[e].sum(0),
-                information,
-            )
-            poses = torch.cat([j[e], i[e][:1]])
-            hessian, gradient = _with_shared(H[e], v[e])
-            edges = RelativeEdges(
-                poses, hessian, gradient, len(block.free), depth, adjoint=adjoint[e]
-            )
-            yield SourceFlow(frame, edges, edges.chained()[0].diagonal())
-
-
-def _with_shared(
-    H: Float[Tensor, "e b b"], v: Float[Tensor, "e b"]
-) -> tuple[Float[Tensor, "c c"], Float[Tensor, "c"]]:
-    """Equations of the relative motions of some edges, then of the unknowns that they share, from
-    those of each edge, of its motion and the shared unknowns."""
-    at, shared = 6 * len(H), H.shape[1] - 6
-    hessian = H.new_zeros(at + shared, at + shared)
-    hessian[:at, :at] = torch.block_diag(*H[:, :6, :6])
-    hessian[:at, at:] = H[:, :6, 6:].reshape(at, shared)
-    hessian[at:, :at] = hessian[:at, at:].mT
-    hessian[at:, at:] = H[:, 6:, 6:].sum(0)
-    return hessian, torch.cat([v[:, :6].reshape(-1), v[:, 6:].sum(0)])
 
 
 def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:

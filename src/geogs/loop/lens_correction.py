@@ -10,7 +10,6 @@ lens was taken for a pinhole is off by several percent (docs/tracking.md).
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import methodcaller
 
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, PRIOR, SHAPES, LensBend
@@ -136,8 +135,7 @@ def _shift(
         if rows is not None and longer != 0:
             i, j = ([keyframes[pair[k]].frame_index for pair in part] for k in (0, 1))
             pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
-            shifts = shifts + longer * rows.slope(
-                methodcaller("of_matches", i, j, T_ji, grid.rays, depth, pixels)
-            )
+            found = rows.of_matches(i, j, T_ji, grid.rays, depth, pixels)
+            shifts = shifts + longer * found.slope
         for pair, shift in zip(part, shifts, strict=True):
             graph.edges[pair] = measured[pair].moved(grid.camera, shift)

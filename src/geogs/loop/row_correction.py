@@ -10,14 +10,11 @@ where all matches together would become neither better nor worse with another.
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from jaxtyping import Float
-from torch import Tensor
-
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
-from geogs.tracking.frames.row_errors import SMALL, RowErrors, edge_shifts
+from geogs.tracking.frames.row_errors import RowErrors, RowShifts, edge_shifts
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.tracker import Tracker
@@ -67,7 +64,7 @@ def correct_rows(
             if abs(search.factor - before) < SETTLED:
                 last = n
         present = errors.with_readout(search.factor)
-        for part, shift in _shifts(graph, measured, present):
+        for part, (shift, _) in _shifts(graph, measured, present):
             graph.edges.update(
                 {e: measured[e].moved(grid.camera, s) for e, s in zip(part, shift, strict=True)}
             )
@@ -108,23 +105,19 @@ def _readout_gradient(
 ) -> float:
     """Half the derivative of the cost by the factor on the readout, and of what was known of it."""
     total = (factor - 1) / errors.doubt**2
-    low, high = (errors.with_readout(factor + by) for by in (-SMALL, SMALL))
     grid, keyframes = graph.keyframes.grid, graph.keyframes
-    both = zip(_shifts(graph, measured, low), _shifts(graph, measured, high), strict=True)
-    for (part, before), (_, after) in both:
+    for part, (shift, slope) in _shifts(graph, measured, errors.with_readout(factor)):
         T, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
         weight = static_weight(keyframes, part, pixels, weight)
         p = project(grid.camera, grid.rays, T, depth)
-        middle = pixels + (before + after) / 2
-        residual, weight = weighed_residuals(p, middle, weight, options.huber)
-        slope = (after - before) / (2 * SMALL)
+        residual, weight = weighed_residuals(p, pixels + shift, weight, options.huber)
         total += EVIDENCE * float((weight * residual * slope).double().sum())
     return total
 
 
 def _shifts(
     graph: FrameGraph, measured: dict[Pair, PackedEdge], errors: RowErrors
-) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
+) -> Iterator[tuple[list[Pair], RowShifts]]:
     keyframes = graph.keyframes
     return edge_shifts(errors, keyframes, measured, lambda id: keyframes[id].frame_index)

@@ -4,9 +4,10 @@ Images, depths, and what was found of the frames between keyframes go together, 
 can be matched and adjusted once more. Matches between keyframes do not: they are measured anew.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 import torch
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
-from geogs.threads import thread_map
+from geogs.threads import ordered_map, thread_map, worker_count
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.pose_filling import seen_by_keyframes
 from geogs.tracking.frames.row_errors import seen_rows
@@ -29,6 +30,9 @@ from geogs.world.straight_view import StraightView
 
 FARTHEST = 0.1
 """Fraction of the long edge; what seems to lie farther off straight has no match."""
+
+TOGETHER = 16
+"""Frames whose rows are straightened at a time; bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,9 @@ class BentImages:
         """Have the keyframes' images as the table's pinhole sees them, always made of those that
         were tracked; normals and depths go along pixel by pixel."""
         arrays, view = self.keyframes.table.arrays, StraightView(self.keyframes.camera, lens)
-        for id in self.keyframes.ids:
-            image = view.image(self.pieces["image"][id].load())
+        bent, ids = self.pieces["image"], self.keyframes.ids
+        images = ordered_map(lambda id: view.image(bent[id].load()), ids, worker_count())
+        for id, image in zip(ids, images, strict=True):
             arrays.put("image", id, image, recent=True)
             arrays.recent("encoded").drop(id)
             for name in ("prior normal", "sensor depth"):
@@ -133,24 +138,28 @@ def straighten_frames(log: FrameLog, keyframes: KeyframeSet, view: StraightView)
         for n, (_, observation) in enumerate(part):
             observation.position, observation.half_weight = position[n], half_weight[n]
             observation.shift = None
-    rows = thread_map(partial(straight_rows, view=view), list(log.rows.values()))
-    log.rows.update(zip(log.rows, rows, strict=True))
+    rows = list(log.rows.values())
+    parts = [rows[at : at + TOGETHER] for at in range(0, len(rows), TOGETHER)]
+    straight = thread_map(partial(straight_rows, view=view), parts)
+    log.rows.update(zip(log.rows, chain.from_iterable(straight), strict=True))
 
 
-def straight_rows(rows: SeenRows, view: StraightView) -> SeenRows:
-    """Where and when the pixels of a straight image were seen, given that of the bent one."""
-    lines, columns = rows.seconds.shape
+def straight_rows(rows: Sequence[SeenRows], view: StraightView) -> list[SeenRows]:
+    """Where and when the pixels of straight images of one size were seen, given that of the bent
+    ones."""
+    lines, columns = rows[0].seconds.shape
     v, u = torch.meshgrid(_nodes(lines), _nodes(columns), indexing="ij")
     nodes = torch.stack([u, v], -1).reshape(-1, 2)
     bent = view.bent(nodes)
-    offset, seconds = (x[0] for x in seen_rows([rows], torch.tensor([0]), bent[None]))
-    straight = view.straight(bent + offset) - nodes
-    offset = torch.where(straight.isfinite(), straight, offset)
-    shape = lines, columns
-    return SeenRows(
-        offset.reshape(*shape, 2).to(rows.offset), seconds.reshape(shape).to(rows.seconds),
-        rows.doubt,
-    )  # fmt: skip
+    offsets, seconds = seen_rows(rows, torch.arange(len(rows)), bent.expand(len(rows), -1, 2))
+    straight = view.straight(bent + offsets) - nodes
+    offsets = torch.where(straight.isfinite(), straight, offsets)
+    shape = len(rows), lines, columns
+    both = zip(offsets.reshape(*shape, 2), seconds.reshape(shape), strict=True)
+    return [
+        SeenRows(offset.to(frame.offset), at.to(frame.seconds), frame.doubt)
+        for frame, (offset, at) in zip(rows, both, strict=True)
+    ]
 
 
 def _nodes(count: int) -> Float[Tensor, "n"]:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import methodcaller
 
 import numpy as np
 import torch
@@ -24,9 +23,9 @@ from geogs.world.keyframes import KeyframeSet
 
 CELLS = 512
 """Most cells of a keyframe whose matches stand for all."""
-OPTIONS = BundleOptions(huber=HUBER, depth_damping=1e-5)
-"""How matches are linearised. More damping of the depths would count as evidence against a drift of
-scale, which takes them all along."""
+OPTIONS = BundleOptions(huber=HUBER, depth_damping=1e-5, chunk=96)
+"""How matches are linearised, many edges at a time as few cells are looked at. More damping of the
+depths would count as evidence against a drift of scale, which takes them all along."""
 TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23
@@ -122,7 +121,7 @@ class _Matches:
         ))  # fmt: skip
         T_ji = relative_motion(part.T_cw, part.source, part.target)
         depth = part.inverse_depth[part.source]
-        return rows.slope(methodcaller("of_matches", i, j, T_ji, rays, depth, at.pixels))
+        return rows.of_matches(i, j, T_ji, rays, depth, at.pixels).slope
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:

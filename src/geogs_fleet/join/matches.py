@@ -194,7 +194,7 @@ def match(
     shift: dict[Directed, Tensor] = {}
     if errors is not None:
         measured = {(ids[a], ids[b]): edge for (a, b), edge in found.items()}
-        for part, off in edge_shifts(errors, segment, measured, lambda id: id):
+        for part, (off, _) in edge_shifts(errors, segment, measured, lambda id: id):
             steps = in_steps(grid.camera, off)
             shift |= {(node[i], node[j]): s for (i, j), s in zip(part, steps, strict=True)}
     ends = []

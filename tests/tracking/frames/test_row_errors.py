@@ -79,8 +79,10 @@ def test_points_lie_beside_where_a_wrong_motion_put_them(distortion):
         shown = shown_at(rolling, offsets, read_at(rolling, z * ray))
         expected = np.array([u, v]) - shown
         assert np.abs(expected).max() > 0.2
-        found = errors(seen).of_pixels(
-            [FRAME], torch.tensor(shown[None, None]).float(), torch.full((1, 1), 1 / z)
+        found = (
+            errors(seen)
+            .of_pixels([FRAME], torch.tensor(shown[None, None]).float(), torch.full((1, 1), 1 / z))
+            .shift
         )
         np.testing.assert_allclose(found[0, 0], expected, atol=0.02 + 0.04 * np.abs(expected).max())
 
@@ -91,9 +93,9 @@ def test_a_match_is_corrected_at_both_its_ends():
     d = torch.full((1, GRID.size), 0.7)
     p = project(CAMERA, GRID.rays, T_ji[None], d)
     known = errors(seen)
-    both = known.of_matches([FRAME], [FRAME + 1], T_ji[None], GRID.rays, d, p.pixels)
-    there = known.of_pixels([FRAME + 1], p.pixels, d / p.z)
-    here = known.of_pixels([FRAME], GRID.pixels[None], d)
+    both = known.of_matches([FRAME], [FRAME + 1], T_ji[None], GRID.rays, d, p.pixels).shift
+    there = known.of_pixels([FRAME + 1], p.pixels, d / p.z).shift
+    here = known.of_pixels([FRAME], GRID.pixels[None], d).shift
     rays = GRID.rays.clone()
     rays[:, :2] += here[0] / torch.tensor([CAMERA.fx, CAMERA.fy])
     beside = project(CAMERA, rays, T_ji[None], d).pixels
@@ -121,18 +123,49 @@ def test_shares_follow_a_polynomial():
     times = torch.tensor([[-0.06, -0.03, 0.0, 0.04, 0.07]], dtype=torch.float64)
     at = torch.tensor([[-0.015, 0.0, 0.011]], dtype=torch.float64)
     for power in range(5):
-        value = (lagrange(times, at) * (times**power)[:, None]).sum(-1)
+        weights, changes = (torch.stack(x, -1) for x in lagrange(times, at))
+        value, change = ((x * (times**power)[:, None]).sum(-1) for x in (weights, changes))
         torch.testing.assert_close(value, at**power)
+        torch.testing.assert_close(change, power * at ** max(power - 1, 0))
+
+
+def test_compiled_loops_say_what_plain_pytorch_does():
+    known, g = errors(rows()[2]).with_readout(1.1), torch.Generator().manual_seed(4)
+    frames = [2, 5, 2, 4]
+    size = torch.tensor([CAMERA.width, CAMERA.height])
+    pixels = size * (1.2 * torch.rand(4, 300, 2, generator=g) - 0.1)  # some beyond the border
+    d = 0.3 + torch.rand(4, 300, generator=g)
+    fast = known.of_pixels(frames, pixels, d)
+    order = [2, 5, 4]
+    which = [order.index(frame) for frame in frames]
+    plain = known._shifted([known._rectified[frame] for frame in order], which, pixels, d)
+    torch.testing.assert_close(fast.shift, plain.shift, rtol=0, atol=5e-4)
+    torch.testing.assert_close(fast.slope, plain.slope, rtol=1e-3, atol=2e-3)
+
+
+def test_the_slope_is_what_a_longer_readout_adds():
+    known = errors(rows()[2])
+    T_ji, d = pose(1 / RATE) @ se3_inverse(pose(0.0)), torch.full((1, GRID.size), 0.7)
+    p = project(CAMERA, GRID.rays, T_ji[None], d)
+
+    def matches(factor: float):
+        at = known.with_readout(factor)
+        return at.of_matches([FRAME], [FRAME + 1], T_ji[None], GRID.rays, d, p.pixels)
+
+    numeric = (matches(1.02).shift - matches(0.98).shift) / 0.04
+    slope = matches(1.0).slope
+    assert slope.abs().max() > 0.5
+    torch.testing.assert_close(slope, numeric, rtol=0, atol=0.005)
 
 
 def test_nothing_is_said_where_too_little_is_known():
     seen = rows()[2]
     pixels, d = GRID.pixels[None], torch.full((1, GRID.size), 0.5)
-    assert errors(seen).of_pixels([FRAME], pixels, d).abs().max() > 0.3
+    assert errors(seen).of_pixels([FRAME], pixels, d).shift.abs().max() > 0.3
     slow = trajectory(1.1 * LONGEST_INTERVAL)
-    assert not errors(seen, slow).of_pixels([FRAME], pixels, d).any()
+    assert not errors(seen, slow).of_pixels([FRAME], pixels, d).shift.any()
     whole = trajectory()
     holes = Trajectory(whole.timestamps, whole.T_wc, np.arange(COUNT) % 4 != 3)
-    assert not errors(seen, holes).of_pixels([FRAME], pixels, d).any()
+    assert not errors(seen, holes).of_pixels([FRAME], pixels, d).shift.any()
     without = RowErrors(GRID, {}, range(COUNT), trajectory())
-    assert not without.of_pixels([FRAME], pixels, d).any()
+    assert not without.of_pixels([FRAME], pixels, d).shift.any()

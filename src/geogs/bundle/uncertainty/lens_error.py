@@ -17,16 +17,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.flow_term import linearised_sources, weighed_residuals
-from geogs.bundle.problem import BundleProblem, sources_within
+from geogs.bundle.flow_term import linearised_sources
+from geogs.bundle.lens_flow import LensFlow
+from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import (
     CellProjection,
     carried_over,
-    linearise,
     project,
     relative_motion,
 )
 from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import BundleState
 from geogs.bundle.uncertainty.marginals import Considered, pose_covariance
 from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
@@ -267,53 +268,29 @@ class _Reduced(NamedTuple):
 def _reduced(
     thinned: ThinnedProblem, options: BundleOptions, rows: Rows | None
 ) -> Iterator[_Reduced]:
-    """Each source in order."""
+    """Each source in order. What is to be added to a match is what the lens takes off where its
+    cell falls: so are the signs of what joins sizes and poses or depths."""
+
+    def fallen(part: BundleProblem) -> Float[Tensor, "e p 2"]:
+        assert rows is not None
+        T_ji = relative_motion(part.T_cw, part.source, part.target)
+        at = project(thinned.camera, thinned.rays, T_ji, part.inverse_depth[part.source])
+        return -rows(part, thinned.rays, at)
+
+    flow = LensFlow(further=None if rows is None else fallen)
     for part in thinned.parts(options):
-        matches = _weighed(thinned, part, options, rows)
-        sources = linearised_sources(thinned.flow, part, part.start, options)
-        for source, (frame, e) in zip(sources, sources_within(part.source), strict=True):
-            depth, chain = source.edges.depth, source.edges.chain
-            assert depth is not None
-            free = float(part.free_depth[frame]) / depth.curvature
-            S, r, w = matches.shift[:, e], matches.residual[e], matches.weight[e]
-            along = torch.einsum("eiap,keap->eik", matches.on_pose[e], S).flatten(0, 1)
-            on_depth = (matches.on_depth[e] * S).sum((1, 2))
-            follow = depth.coupling * free
-            information = torch.einsum("keap,leap,eap->kl", S, S, w)
-            gradient = -torch.einsum("keap,eap,eap->k", S, r, w)
-            poses, descent = source.edges.chained()
+        state = BundleState(part.T_cw, part.inverse_depth, thinned.lens)
+        for source in linearised_sources(flow, part, state, options):
+            edges = source.edges
+            assert edges.depth is not None
+            hessian, gradient = edges.chained()
+            c = len(gradient) - edges.shared
             yield _Reduced(
-                source.edges.rows(len(part.T_cw)),
-                poses,
-                chain.mT @ (along - follow @ on_depth.mT).double(),
-                descent,
-                on_depth,
-                (information - (on_depth * free) @ on_depth.mT).double(),
-                (gradient + (on_depth * free) @ depth.gradient).double(),
+                edges.rows(len(part.T_cw))[:c],
+                hessian[:c, :c],
+                -hessian[:c, c:],
+                gradient[:c],
+                -edges.depth.coupling[-edges.shared :],
+                hessian[c:, c:],
+                gradient[c:],
             )
-
-
-class _Weighed(NamedTuple):
-    """Matches of some edges."""
-
-    shift: Float[Tensor, "k e 2 p"]
-    residual: Float[Tensor, "e 2 p"]
-    weight: Float[Tensor, "e 2 p"]
-    on_pose: Float[Tensor, "e 6 2 p"]
-    """The weight times the derivative by the poses."""
-    on_depth: Float[Tensor, "e 2 p"]
-    """The weight times the derivative by the inverse depth."""
-
-
-def _weighed(
-    thinned: ThinnedProblem, part: BundleProblem, options: BundleOptions, rows: Rows | None
-) -> _Weighed:
-    camera, rays = thinned.flow.camera, thinned.flow.rays
-    T_ji = relative_motion(part.T_cw, part.source, part.target)
-    p = linearise(camera, rays, T_ji, part.inverse_depth[part.source])
-    r, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
-    shift = shape_shifts(camera, rays, T_ji, p)
-    if rows is not None:
-        shift = torch.cat([shift, rows(part, rays, p)[None]])
-    on_pose, on_depth = p.pose_jacobian * w.mT[:, None], (w * p.depth_jacobian).mT
-    return _Weighed(shift.mT, r.mT, w.mT, on_pose, on_depth)

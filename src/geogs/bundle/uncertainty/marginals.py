@@ -15,6 +15,7 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, weighed_residuals
 from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import sources_within
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -147,46 +148,51 @@ def common_errors(
     part = ThinnedProblem(grid, problem, cells)
     n = len(problem.T_cw)
     pull = torch.zeros(6 * n, 4 * PLACES[0] * PLACES[1], dtype=torch.float64)
-    for source, on_poses, _ in _common_pulls(part, options):
+    place, owns = _places(part), []
+    for source, on_poses, own in _common_pulls(part, options, place):
         pull[source.edges.rows(n)] += on_poses / part.fraction
+        owns.append(own)
     moves = found.covariance / ALIKE @ pull
-    for source, _, on_depths in _common_pulls(part, options):
+    for source, own in zip(part.sources(options), owns, strict=True):
+        on_depths = (own[:, :, None] * place).permute(1, 0, 2).flatten(1)
         relative[source.frame] = part.depth_moves(source, on_depths, moves).square().sum(1)
     return Considered(moves @ moves.mT, relative)
 
 
 def _common_pulls(
-    thinned: ThinnedProblem, options: BundleOptions
-) -> Iterator[tuple[SourceFlow, Float[Tensor, "c k"], Float[Tensor, "p k"]]]:
+    thinned: ThinnedProblem, options: BundleOptions, place: Float[Tensor, "p q"]
+) -> Iterator[tuple[SourceFlow, Float[Tensor, "c k"], Float[Tensor, "4 p"]]]:
     """Each source in order, and by how much each error that matches have in common, at its
-    deviation, pulls at the poses that it joins once depths have followed, and at its depths."""
-    camera, rays, place = thinned.flow.camera, thinned.flow.rays, _places(thinned)
+    deviation, pulls at the poses that it joins once depths have followed, and at its depths.
+
+    Of each axis there are two, along the flow and of the place, wherever in the image: an error in
+    a part of it pulls at the depths that are there (``place``).
+    """
+    flow = LensFlow(thinned.lens)
     for part in thinned.parts(options):
         i, j = part.source, part.target
-        p = linearise(camera, rays, relative_motion(part.T_cw, i, j), part.inverse_depth[i])
+        T_ji = relative_motion(part.T_cw, i, j)
+        p = linearise(thinned.camera, thinned.rays, T_ji, part.inverse_depth[i])
         _, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
         unit = w * part.weight.clamp(min=1e-12).rsqrt()  # weight times one deviation
         onward = (j - i).sign() * COMMON_FLOW
-        sources = linearised_sources(thinned.flow, part, part.start, options)
+        size = torch.stack([onward, torch.full_like(onward, COMMON_PLACE)])
+        pose, own = p.pose_jacobian * unit.mT[:, None], (p.depth_jacobian * unit).mT
+        sources = linearised_sources(flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(i), strict=True):
             depth, chain = source.edges.depth, source.edges.chain
             assert depth is not None
             follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
-            pulls, owns = [], []
-            for axis in (0, 1):
-                pose = p.pose_jacobian[e, :, axis] * unit[e, None, :, axis]
-                own = p.depth_jacobian[e, :, axis] * unit[e, :, axis]
-                for size in (onward[e], torch.full_like(onward[e], COMMON_PLACE)):
-                    along = (pose * size[:, None, None]).flatten(0, 1)
-                    owns.append((size[:, None] * own).sum(0)[:, None] * place)
-                    pulls.append(along @ place - follow @ owns[-1])
-            yield source, chain.mT @ torch.cat(pulls, 1).double(), torch.cat(owns, 1)
+            along = torch.einsum("se,ekap->asekp", size[:, e], pose[e]).flatten(0, 1).flatten(1, 2)
+            owns = torch.einsum("se,eap->asp", size[:, e], own[e]).flatten(0, 1)
+            pulls = (along - follow * owns[:, None]) @ place
+            yield source, chain.mT @ pulls.permute(1, 0, 2).flatten(1).double(), owns
 
 
 def _places(thinned: ThinnedProblem) -> Float[Tensor, "c q"]:
     """One where a cell lies in a part of the image."""
     across, down = PLACES
-    camera, pixels = thinned.flow.camera, thinned.pixels
+    camera, pixels = thinned.camera, thinned.pixels
     x, y = (pixels / pixels.new_tensor([camera.width, camera.height])).mT
     at = (y * down).long() * across + (x * across).long()
     return torch.nn.functional.one_hot(at, across * down).to(pixels)

@@ -10,13 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import (
-    PinholeFlow,
-    SourceFlow,
-    linearised_sources,
-    residual_norms,
-)
+from geogs.bundle.flow_term import SourceFlow, linearised_sources, residual_norms
 from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
 from geogs.bundle.projection import project, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -32,16 +29,18 @@ class ThinnedProblem:
     def __init__(self, grid: SampleGrid, problem: AnyProblem, cells: int) -> None:
         step = -(-grid.size // cells)
         self._problem, self._cells = problem, slice(None, None, step)
-        self.flow = PinholeFlow(grid.camera, grid.rays[self._cells].cpu())
+        self.camera, self.rays = grid.camera, grid.rays[self._cells].cpu()
         self.pixels = grid.pixels[self._cells].cpu()
-        self.count = len(self.flow.rays)
+        self.lens = LensBlock(RadialLens(grid.camera), self.pixels)
+        self.count = len(self.rays)
         self.fraction = self.count / grid.size
         self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
 
     def sources(self, options: BundleOptions) -> Iterator[SourceFlow]:
         """All sources, in order."""
+        flow = LensFlow(self.lens)
         for part in self.parts(options):
-            yield from linearised_sources(self.flow, part, part.start, options)
+            yield from linearised_sources(flow, part, part.start, options)
 
     def depth_moves(
         self, source: SourceFlow, pull: Float[Tensor, "c k"], moves: Float[Tensor, "m k"]
@@ -63,7 +62,7 @@ class ThinnedProblem:
         for part in self.parts(options):
             i, j = part.source, part.target
             T_ji = relative_motion(part.T_cw, i, j)
-            at = project(self.flow.camera, self.flow.rays, T_ji, self.inverse_depth[i])
+            at = project(self.camera, self.rays, T_ji, self.inverse_depth[i])
             norm = residual_norms(at, part.pixels, part.weight)
             used = at.valid & (part.weight[..., 0] > 0)
             for frame, edges in sources_within(i):

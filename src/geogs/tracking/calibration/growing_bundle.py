@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.shared import GPU_OPTIONS, OPTIONS, SharedResult, solve_shared
+from geogs.bundle.shared import SharedResult, solve_shared
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View
@@ -116,33 +116,34 @@ class GrowingBundle:
         return block.project(torch.stack(self._T), source, target, depth).pixels
 
     def problem(self) -> BundleProblem:
-        """All edges; every pose but the first is free."""
+        """All edges, on the CPU; every pose but the first is free."""
         directed = sorted(self._edges)
         edges = [self._edges[e] for e in directed]
         free = torch.ones(len(self), dtype=torch.bool)
         free[0] = False
         return BundleProblem(
             torch.stack(self._T),
-            torch.stack(self._depth),
+            torch.stack(self._depth).cpu(),
             torch.tensor([i for i, _ in directed]),
             torch.tensor([j for _, j in directed]),
             free,
             torch.ones_like(free),
-            pixels=torch.stack([e.pixels for e in edges]),
-            weight=torch.stack([e.weight for e in edges]),
+            pixels=torch.stack([e.pixels for e in edges]).cpu(),
+            weight=torch.stack([e.weight for e in edges]).cpu(),
         )
 
     def adjust(self, radial: bool) -> bool:
         """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
-        block = LensBlock(self.lens, self.grid.pixels, radial=radial)
-        options = GPU_OPTIONS if self.grid.on_gpu else OPTIONS
-        result = solve_shared(self.problem(), block, options)
+        block = LensBlock(self.lens, self.grid.pixels.cpu(), radial=radial)
+        result = solve_shared(self.problem(), block)
         if not result.finite:
             return False
         self.result, self.lens = result, result.block.lens
         self._T = list(result.T_cw)
-        self._information = list(result.information)
-        self._depth = list(grid_fields(self.grid).fill(result.inverse_depth, result.information))
+        information = result.information.to(self.grid.device)
+        self._information = list(information)
+        depth = result.inverse_depth.to(self.grid.device)
+        self._depth = list(grid_fields(self.grid).fill(depth, information))
         self._normalise()
         return True
 

@@ -79,7 +79,7 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
             grid.rays[cells], keyframes.inverse_depths(ids)[:, cells],
             unpacked_positions(grid, torch.stack([o.position for _, o in part])),
         )  # fmt: skip
-        steps = in_steps(grid.camera, shifts)
+        steps = in_steps(grid.camera, shifts.shift)
         for (_, observation), shift in zip(part, steps, strict=True):
             observation.shift = shift
 

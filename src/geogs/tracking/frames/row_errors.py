@@ -9,13 +9,14 @@ that by fractions of a pixel, so the matches are corrected to first order and th
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import carried_over, project, seen_from_targets
+from geogs.bundle.projection import MIN_Z, carried_over, project, seen_from_targets
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
 from geogs.types import SeenRows, Trajectory
@@ -33,8 +34,12 @@ LARGEST = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
 
 
-SMALL = 0.02
-"""Part of the readout over which a derivative is taken."""
+class RowShifts(NamedTuple):
+    """Pixels by which something is to be moved, and what a longer readout adds to that."""
+
+    shift: Float[Tensor, "e p 2"]
+    slope: Float[Tensor, "e p 2"]
+    """Derivative by the factor on the readout."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +99,6 @@ class RowErrors:
         other._factor = factor
         return other
 
-    def slope(self, shift: "Callable[[RowErrors], Float[Tensor, '*b']]") -> Float[Tensor, "*b"]:
-        """Derivative of what is made of these by the factor on the readout."""
-        low, high = (self.with_readout(self._factor + by) for by in (-SMALL, SMALL))
-        return (shift(high) - shift(low)) / (2 * SMALL)
-
     def poses(self, frames: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera of frames in the trajectory, float64."""
         return torch.stack([self._T_cw[frame] for frame in frames])
@@ -111,7 +111,7 @@ class RowErrors:
         rays: Float[Tensor, "p 3"],
         inverse_depth: Float[Tensor, "e p"],
         pixels: Float[Tensor, "e p 2"],
-    ) -> Float[Tensor, "e p 2"]:
+    ) -> RowShifts:
         """What is to be added to where cells were found, as if the rows of both frames were right.
 
         What a cell of the source shows lies next to it, and what was found in the target, too; the
@@ -131,51 +131,90 @@ class RowErrors:
         own = (own + pixels.new_tensor([camera.cx, camera.cy])).expand_as(pixels)
         p = project(camera, rays, T_ji, inverse_depth)
         there = self.of_pixels(target, pixels, inverse_depth / p.z)
-        moved = carried_over(camera, T_ji, p, self.of_pixels(source, own, inverse_depth))
-        error = there - moved
-        believed = p.valid & (error.norm(dim=-1) < LARGEST * camera.long_edge)
-        return torch.where(believed[..., None], error, 0.0)
+        here = self.of_pixels(source, own, inverse_depth)
+        shift, slope = (
+            t - carried_over(camera, T_ji, p, h) for t, h in zip(there, here, strict=True)
+        )
+        believed = p.valid & (shift.norm(dim=-1) < LARGEST * camera.long_edge)
+        return RowShifts(*(torch.where(believed[..., None], x, 0.0) for x in (shift, slope)))
 
     def of_pixels(
         self,
         frames: Sequence[int],
         pixels: Float[Tensor, "e p 2"],
         inverse_depth: Float[Tensor, "e p"],
-    ) -> Float[Tensor, "e p 2"]:
+    ) -> RowShifts:
         """By how much what pixels of frames show lies next to them at the middle row's time.
 
         The camera saw it in another position and at another time; by the poses around, the pixel's
         own point was elsewhere then. The difference is what the pixel shows instead, to first
         order.
         """
-        error = torch.zeros_like(pixels)
-        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
-        if not known:
-            return error
+        found = RowShifts(*(pixels.new_zeros(pixels.shape) for _ in range(2)))
         # Of several edges of a frame, what it has of its own is brought here once.
-        order = {frame: n for n, frame in enumerate(dict.fromkeys(frames[n] for n in known))}
-        rectified = [self._rectified[frame] for frame in order]
-        at, which = (
-            torch.tensor(numbers, device=pixels.device)
-            for numbers in (known, [order[frames[n]] for n in known])
-        )
-        shown, d = pixels[at], inverse_depth[at]
-        offset, seconds = seen_rows([f.rows for f in rectified], which, shown)
-        seconds = self._factor * seconds
-        T = torch.stack([f.motions for f in rectified]).to(shown)[which]
-        times = torch.stack([f.times for f in rectified]).to(shown)[which]
-        weights, camera = lagrange(times, seconds), self._grid.camera
+        rectified = {f: self._rectified[f] for f in dict.fromkeys(frames) if f in self._rectified}
+        if rectified and pixels.is_cuda:
+            known = [n for n, frame in enumerate(frames) if frame in rectified]
+            order = {frame: n for n, frame in enumerate(rectified)}
+            at = torch.tensor(known, device=pixels.device)
+            found.shift[at], found.slope[at] = self._shifted(
+                list(rectified.values()), [order[frames[n]] for n in known],
+                pixels[at], inverse_depth[at],
+            )  # fmt: skip
+        elif rectified:
+            self._shift_each(frames, rectified, pixels, inverse_depth, found)
+        return found
+
+    def _shift_each(
+        self,
+        frames: Sequence[int],
+        rectified: Mapping[int, _RectifiedFrame],
+        pixels: Float[Tensor, "e p 2"],
+        inverse_depth: Float[Tensor, "e p"],
+        found: RowShifts,
+    ) -> None:
+        """:meth:`_shifted` of all edges of rectified frames by compiled loops, into ``found``."""
+        from geogs.tracking.frames.row_kernels import shift_pixels
+
+        c = self._grid.camera
+        camera = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
+        limits, factor = np.array([CELL, MIN_Z], np.float32), np.float32(self._factor)
+        known = {
+            frame: (laid(f.rows).float().numpy(), f.times.numpy(), f.motions.numpy())
+            for frame, f in rectified.items()
+        }
+        each = zip(*(x.contiguous().numpy() for x in (pixels, inverse_depth, *found)), strict=True)
+        for frame, edge in zip(frames, each, strict=True):
+            if frame in known:
+                shift_pixels(*known[frame], camera, limits, factor, *edge)
+
+    def _shifted(
+        self,
+        rectified: Sequence[_RectifiedFrame],
+        which: Sequence[int],
+        pixels: Float[Tensor, "e p 2"],
+        inverse_depth: Float[Tensor, "e p"],
+    ) -> RowShifts:
+        """:meth:`of_pixels` of edges, each in ``which`` of the frames, in plain PyTorch."""
+        camera, at = self._grid.camera, torch.tensor(which, device=pixels.device)
+        offset, seconds = seen_rows([f.rows for f in rectified], at, pixels)
+        T = torch.stack([f.motions for f in rectified]).to(pixels)[at]
+        times = torch.stack([f.times for f in rectified]).to(pixels)[at]
+        weights, changes = lagrange(times, self._factor * seconds)
         focal, centre = (
-            shown.new_tensor([camera.fx, camera.fy]), shown.new_tensor([camera.cx, camera.cy])
+            pixels.new_tensor([camera.fx, camera.fy]), pixels.new_tensor([camera.cx, camera.cy])
         )  # fmt: skip
-        plane = (shown - centre) / focal
+        plane = (pixels - centre) / focal
         rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
-        moved = torch.zeros_like(plane)
+        moved, change = torch.zeros_like(plane), torch.zeros_like(plane)
         for j in range(NODES):
-            y, _, z = seen_from_targets(rays, T[:, j], d)
-            moved += weights[..., j, None] * (y[..., :2] / z[..., None])
-        error[at] = shown + offset - (moved * focal + centre)
-        return error
+            y, _, z = seen_from_targets(rays, T[:, j], inverse_depth)
+            there = y[..., :2] / z[..., None]
+            moved += weights[j][..., None] * there
+            change += changes[j][..., None] * there
+        return RowShifts(
+            pixels + offset - (moved * focal + centre), -seconds[..., None] * change * focal
+        )
 
 
 def edge_shifts(
@@ -183,7 +222,7 @@ def edge_shifts(
     keyframes: KeyframeSet,
     measured: Mapping[Pair, Edge],
     frame_of: Callable[[int], int],
-) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
+) -> Iterator[tuple[list[Pair], RowShifts]]:
     """Pixels by which the matches of edges are to be corrected, some edges at a time.
 
     ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame.
@@ -201,16 +240,21 @@ def edge_shifts(
         )  # fmt: skip
 
 
-def lagrange(times: Float[Tensor, "e j"], at: Float[Tensor, "e p"]) -> Float[Tensor, "e p j"]:
-    """Weights of the values at ``times`` in that of the polynomial through them."""
-    count = times.shape[1]
-    weights = at.new_ones(*at.shape, count)
-    for j in range(count):
-        for other in range(count):
-            if other != j:
-                span = (times[:, j] - times[:, other])[:, None]
-                weights[..., j] *= (at - times[:, other, None]) / span
-    return weights
+def lagrange(
+    times: Float[Tensor, "e 5"], at: Float[Tensor, "e p"]
+) -> tuple[list[Float[Tensor, "e p"]], list[Float[Tensor, "e p"]]]:
+    """Weights of the values at ``times`` in that of the polynomial through them, one after the
+    other, and how each changes with ``at``."""
+    off = [at - time[:, None] for time in times.unbind(1)]
+    apart = times[:, :, None] - times[:, None]
+    scale = (1 / (apart + torch.eye(NODES).to(apart)).prod(-1)).unbind(1)
+    weights, changes = [], []
+    for j in range(NODES):
+        a, b, c, d = (off[other] for other in range(NODES) if other != j)
+        ab, cd, by = a * b, c * d, scale[j][:, None]
+        weights.append(ab * cd * by)
+        changes.append((ab * (c + d) + cd * (a + b)) * by)
+    return weights, changes
 
 
 def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
@@ -236,11 +280,15 @@ def seen_rows(
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
     """Offsets and seconds at pixels, each in ``which`` of the rows, bilinear between the nodes as
     the image was made."""
-    laid = [torch.cat([r.offset, r.seconds[..., None]], -1) for r in rows]
-    field = torch.stack(laid).to(pixels).permute(0, 3, 1, 2)[which]
+    field = torch.stack([laid(r) for r in rows]).to(pixels).permute(0, 3, 1, 2)[which]
     size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
     position = 2 * (pixels + CELL + 0.5) / size - 1
     values = torch.nn.functional.grid_sample(
         field, position[:, :, None], padding_mode="border", align_corners=False
     )[..., 0]
     return values[:, :2].mT, values[:, 2]
+
+
+def laid(rows: SeenRows) -> Float[Tensor, "r c 3"]:
+    """Offsets and seconds of the nodes beside each other."""
+    return torch.cat([rows.offset, rows.seconds[..., None]], -1)

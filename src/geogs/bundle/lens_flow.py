@@ -1,0 +1,111 @@
+"""The term of dense flow seen through a lens, whose sizes may be unknowns that all edges share.
+
+What is summed over the cells of an edge is summed here in another order than by the tracker's term
+(:class:`~geogs.bundle.flow_term.PinholeFlow`), by loops that are compiled; on the CPU.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.flow_term import BEHIND, SourceFlow, damped_curvature
+from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
+from geogs.bundle.lens import LensBlock
+from geogs.bundle.problem import BundleProblem, sources_within
+from geogs.bundle.projection import MIN_Z, relative_motion
+from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import BundleState
+from geogs.geometry.lie import se3_adjoint
+
+Further = Callable[[BundleProblem], Float[Tensor, "e p 2"]]
+"""By how much one more unknown that all edges share, at size one, moves where cells fall."""
+
+
+class LensFlow:
+    """Dense flow of cells that are seen through the lens of a state, or one that is known."""
+
+    def __init__(self, known: LensBlock | None = None, further: Further | None = None) -> None:
+        """The lens is no unknown where it is that which is ``known``: the state has none then."""
+        self._known, self._further = known, further
+
+    def sources(
+        self, problem: BundleProblem, state: BundleState, options: BundleOptions
+    ) -> Iterator[SourceFlow]:
+        """As in the protocol; each with the diagonal of its equations, its depths being fixed."""
+        from geogs.bundle.lens_kernels import linearise_source
+
+        T_ji = relative_motion(state.T_cw, problem.source, problem.target)
+        adjoint, edges = se3_adjoint(T_ji), _Edges(self._block(state), problem, T_ji)
+        limits = _limits(options.huber)
+        slopes = np.zeros((0, edges.rays.shape[1]), np.float32)
+        if state.block is not None:
+            slopes = edges.slopes
+        further = np.zeros((0, 0, 2), np.float32)
+        if self._further is not None:
+            further = _float(self._further(problem))
+        shared = len(slopes) + (self._further is not None)
+        for frame, e in sources_within(problem.source):
+            size = 6 * (e.stop - e.start) + shared
+            H, g = torch.zeros(size, size).double(), torch.zeros(size).double()
+            depth = state.inverse_depth[frame].contiguous()
+            E, C, b = (
+                depth.new_zeros(size, len(depth)),
+                torch.zeros_like(depth),
+                torch.zeros_like(depth),
+            )
+            linearise_source(
+                edges.motions[e], edges.rays, slopes, edges.lens, depth.numpy(), edges.pixels[e],
+                edges.weight[e], further[e], limits,
+                H.numpy(), g.numpy(), E.numpy(), C.numpy(), b.numpy(),
+            )  # fmt: skip
+            equations = DepthEquations(E, damped_curvature(C, options.depth_damping), b, C)
+            poses = torch.cat([problem.target[e], problem.source[e][:1]])
+            found = RelativeEdges(poses, H, g, shared, equations, adjoint=adjoint[e])
+            yield SourceFlow(frame, found, found.chained()[0].diagonal())
+
+    def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
+        """As in the protocol."""
+        from geogs.bundle.lens_kernels import cost_of_source
+
+        T_ji = relative_motion(state.T_cw, problem.source, problem.target)
+        edges = _Edges(self._block(state), problem, T_ji)
+        behind, limits = np.float32((BEHIND * huber) ** 2), _limits(huber)
+        return sum(
+            cost_of_source(
+                edges.motions[e], edges.rays, edges.lens, _float(state.inverse_depth[frame]),
+                edges.pixels[e], edges.weight[e], limits, behind,
+            )
+            for frame, e in sources_within(problem.source)
+        )  # fmt: skip
+
+    def _block(self, state: BundleState) -> LensBlock:
+        block = cast(LensBlock | None, state.block) or self._known
+        assert block is not None
+        return block
+
+
+class _Edges:
+    """Edges and the lens as the kernels take them."""
+
+    def __init__(
+        self, block: LensBlock, problem: BundleProblem, T_ji: Float[Tensor, "e 4 4"]
+    ) -> None:
+        lens, camera = block.lens, block.lens.camera
+        self.motions = _float(T_ji[:, :3])
+        self.rays, self.slopes = _float(block.rays.rays[:, :2].mT), _float(block.rays.slope)
+        self.lens = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy, lens.k1, lens.k2], np.float32
+        )
+        self.pixels, self.weight = _float(problem.pixels), _float(problem.weight)
+
+
+def _float(values: Tensor) -> np.ndarray:
+    return values.to(torch.float32).contiguous().numpy()
+
+
+def _limits(huber: float) -> np.ndarray:
+    return np.array([huber, MIN_Z], np.float32)

@@ -1,0 +1,177 @@
+"""Compiled loops over the cells of a source that are seen through a lens in its targets.
+
+Arrays are C-contiguous, float32 but for what is summed over cells, which is float64: motions to the
+targets (e, 3, 4), rays of the cells (2, p) with z = 1, the lens (6) as fx, fy, cx, cy, k1 and k2,
+inverse depths (p), found positions and their weights (e, p, 2). The kernels release the interpreter
+lock. Chains of small operations of PyTorch take ten times as long, and threads that call them wait
+for each other.
+"""
+
+import numpy as np
+from numba import njit
+
+from geogs.kernel_parts import inlined
+
+_FAST = {
+    "cache": True, "nogil": True, "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},  # what is not finite has to show
+}  # fmt: skip
+_PART = inlined(_FAST)
+_BLOCK = 64
+"""Cells whose derivatives are formed at a time: they stay in the first cache."""
+_ZERO, _ONE, _TWO, _FOUR = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(4.0)
+
+
+@njit(**_PART)
+def _seen(motion, x, y, d, nearest):
+    """A cell in a target: x / z and y / z, 1 / z, and whether it lies before it."""
+    X = motion[0, 0] * x + motion[0, 1] * y + motion[0, 2] + motion[0, 3] * d
+    Y = motion[1, 0] * x + motion[1, 1] * y + motion[1, 2] + motion[1, 3] * d
+    Z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] + motion[2, 3] * d
+    q = _ONE / (nearest if nearest > Z else Z)
+    return X * q, Y * q, q, nearest < Z
+
+
+@njit(**_PART)
+def _dot(left, right):
+    """Of two blocks."""
+    total = _ZERO
+    for n in range(2 * _BLOCK):
+        total += left[n] * right[n]
+    return total
+
+
+@njit(**_PART)
+def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limits, J, r, w):
+    """Derivatives of some cells, as :func:`linearise_source` sums them up; the x of all, then the
+    y. The last row of ``J`` is by the inverse depth."""
+    huber, nearest = limits[0], limits[1]
+    fx, fy, cx, cy, k1, k2 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    first, second = J[:, :_BLOCK], J[:, _BLOCK:]
+    shapes, last = len(slopes), len(J) - 1
+    tx, ty, tz = motion[0, 3], motion[1, 3], motion[2, 3]
+    for n in range(rays.shape[1]):
+        x, y, d = rays[0, n], rays[1, n], inverse_depth[n]
+        u, v, q, is_front = _seen(motion, x, y, d, nearest)
+        square = u * u + v * v
+        growth = _ONE + square * (k1 + square * k2)
+        bent = _TWO * k1 + _FOUR * k2 * square
+        # d pixel / d (u, v)
+        xx, xy = fx * (growth + bent * u * u), fx * bent * u * v
+        yx, yy = fy * bent * u * v, fy * (growth + bent * v * v)
+        dq = d * q
+        first[0, n], second[0, n] = xx * dq, yx * dq
+        first[1, n], second[1, n] = xy * dq, yy * dq
+        a, b = -u * dq, -v * dq
+        first[2, n], second[2, n] = xx * a + xy * b, yx * a + yy * b
+        a, b = -u * v, -_ONE - v * v
+        first[3, n], second[3, n] = xx * a + xy * b, yx * a + yy * b
+        a, b = _ONE + u * u, u * v
+        first[4, n], second[4, n] = xx * a + xy * b, yx * a + yy * b
+        first[5, n], second[5, n] = xy * u - xx * v, yy * u - yx * v
+        a, b = (tx - tz * u) * q, (ty - tz * v) * q
+        first[last, n], second[last, n] = xx * a + xy * b, yx * a + yy * b
+        if shapes:
+            # A change of the lens moves the ray by a factor of (x, y, 0).
+            z = motion[2, 0] * x + motion[2, 1] * y
+            a = (motion[0, 0] * x + motion[0, 1] * y - z * u) * q
+            b = (motion[1, 0] * x + motion[1, 1] * y - z * v) * q
+            along, across = xx * a + xy * b, yx * a + yy * b
+            own_x, own_y = fx * u, fy * v
+            first[6, n] = along * slopes[0, n] + own_x * growth
+            second[6, n] = across * slopes[0, n] + own_y * growth
+            first[7, n] = along * slopes[1, n] + own_x * square
+            second[7, n] = across * slopes[1, n] + own_y * square
+            first[8, n] = along * slopes[2, n] + own_x * square * square
+            second[8, n] = across * slopes[2, n] + own_y * square * square
+        a = pixels[n, 0] - (fx * u * growth + cx)
+        b = pixels[n, 1] - (fy * v * growth + cy)
+        wx = weight[n, 0] if is_front else _ZERO
+        wy = weight[n, 1] if is_front else _ZERO
+        norm = np.sqrt(wx * a * a + wy * b * b)
+        robust = huber / (huber if norm < huber else norm)
+        r[n], r[_BLOCK + n] = a, b
+        w[n], w[_BLOCK + n] = wx * robust, wy * robust
+
+
+@njit(**_FAST)
+def linearise_source(
+    motions, rays, slopes, lens, inverse_depth, pixels, weight, further, limits,
+    hessian, gradient, coupling, curvature, pull,
+):  # fmt: skip
+    """Add the equations of all edges of a source to what is given.
+
+    Unknowns are the motions to all targets (6e, left perturbations), then what all edges share: the
+    logarithm of the focal length, k1 and k2 where there are ``slopes`` (3, p) of the rays by them,
+    and one that moves where cells fall by ``further`` (e or 0, p, 2). ``limits`` are Huber's, in
+    deviations, and the least z. Filled are ``hessian`` (m, m) and ``gradient`` (m), the direction
+    of descent; ``coupling`` (m, p) with the inverse depths, whose own ``curvature`` (p), and
+    ``pull`` (p).
+    """
+    edges, cells = weight.shape[0], weight.shape[1]
+    shapes, others = len(slopes), min(len(further), 1)
+    count = 6 + shapes + others
+    J = np.zeros((count + 1, 2 * _BLOCK), np.float32)
+    r, w = np.zeros(2 * _BLOCK, np.float32), np.zeros(2 * _BLOCK, np.float32)
+    wJ = np.zeros(2 * _BLOCK, np.float32)
+    rows = np.empty(count, np.int64)
+    for e in range(edges):
+        for k in range(count):
+            rows[k] = 6 * e + k if k < 6 else 6 * (edges - 1) + k
+        for begin in range(0, cells, _BLOCK):
+            end = min(begin + _BLOCK, cells)
+            size = end - begin
+            _derivatives(
+                motions[e], rays[:, begin:end], slopes[:, begin:end], lens,
+                inverse_depth[begin:end], pixels[e, begin:end], weight[e, begin:end], limits,
+                J, r, w,
+            )  # fmt: skip
+            w[size:_BLOCK] = _ZERO
+            w[_BLOCK + size :] = _ZERO
+            if others:
+                for n in range(size):
+                    J[count - 1, n] = further[e, begin + n, 0]
+                    J[count - 1, _BLOCK + n] = further[e, begin + n, 1]
+            depth = J[count]
+            for k in range(count + 1):
+                for n in range(2 * _BLOCK):
+                    wJ[n] = J[k, n] * w[n]
+                if k == count:
+                    out = curvature[begin:end]
+                else:
+                    out = coupling[rows[k], begin:end]
+                    gradient[rows[k]] += _dot(wJ, r)
+                    for other in range(k + 1):
+                        hessian[rows[k], rows[other]] += _dot(wJ, J[other])
+                for n in range(size):
+                    out[n] += wJ[n] * depth[n] + wJ[_BLOCK + n] * depth[_BLOCK + n]
+            for n in range(size):
+                pull[begin + n] += wJ[n] * r[n] + wJ[_BLOCK + n] * r[_BLOCK + n]
+    for k in range(len(hessian)):
+        for other in range(k):
+            hessian[other, k] = hessian[k, other]
+
+
+@njit(**_FAST)
+def cost_of_source(motions, rays, lens, inverse_depth, pixels, weight, limits, behind):
+    """Huber's cost of all matched cells of a source; one behind its target costs ``behind``."""
+    knee, nearest = limits[0], limits[1]
+    fx, fy, cx, cy, k1, k2 = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
+    total = 0.0
+    for e in range(len(weight)):
+        motion = motions[e]
+        for n in range(weight.shape[1]):
+            if not weight[e, n, 0] > _ZERO:
+                continue
+            u, v, _, is_front = _seen(motion, rays[0, n], rays[1, n], inverse_depth[n], nearest)
+            square = u * u + v * v
+            growth = _ONE + square * (k1 + square * k2)
+            a = pixels[e, n, 0] - (fx * u * growth + cx)
+            b = pixels[e, n, 1] - (fy * v * growth + cy)
+            error = weight[e, n, 0] * a * a + weight[e, n, 1] * b * b
+            if not is_front:
+                error = behind
+            total += (
+                error if not error > knee * knee else _TWO * knee * np.sqrt(error) - knee * knee
+            )
+    return total

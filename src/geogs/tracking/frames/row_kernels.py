@@ -1,0 +1,76 @@
+"""Compiled loop over pixels of a frame whose rows were rectified; it releases the interpreter lock.
+
+Some two hundred small operations of PyTorch otherwise, of which edges have some thousands of pixels
+each.
+"""
+
+import numpy as np
+from numba import njit
+
+_NODES = 5
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+
+
+@njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
+)  # fmt: skip
+def shift_pixels(
+    field, times, motions, camera, limits, factor, pixels, inverse_depth, shift, slope
+):
+    """Fill ``shift`` and ``slope`` (p, 2), as :meth:`RowErrors.of_pixels` says.
+
+    Of the frame: ``field`` (r, c, 3) of offsets and seconds, times (5) of the nodes and motions
+    (5, 4, 4) to them. ``camera`` as fx, fy, cx, cy; ``limits`` are the pixels of a cell of the
+    field and the least z. Then the factor on the readout, pixels (p, 2) and their inverse depths
+    (p); all float32.
+    """
+    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    cell, nearest = limits[0], limits[1]
+    bottom, right = field.shape[0] - 1, field.shape[1] - 1
+    seconds, inverse_span = (
+        np.empty(len(pixels), np.float32),
+        np.empty((_NODES, _NODES), np.float32),
+    )
+    for j in range(_NODES):
+        for other in range(_NODES):
+            inverse_span[j, other] = _ONE / (times[j] - times[other]) if j != other else _ONE
+    for n in range(len(pixels)):
+        x = (pixels[n, 0] + cell + _HALF) / cell - _HALF
+        y = (pixels[n, 1] + cell + _HALF) / cell - _HALF
+        x, y = x if x > _ZERO else _ZERO, y if y > _ZERO else _ZERO
+        x, y = min(x, np.float32(right)), min(y, np.float32(bottom))
+        left, top = min(int(x), right - 1), min(int(y), bottom - 1)
+        a, b = x - np.float32(left), y - np.float32(top)
+        first, second = field[top], field[top + 1]
+        for k in range(3):
+            above = first[left, k] + a * (first[left + 1, k] - first[left, k])
+            below = second[left, k] + a * (second[left + 1, k] - second[left, k])
+            value = above + b * (below - above)
+            if k < 2:
+                shift[n, k] = value
+            else:
+                seconds[n] = value
+    for n in range(len(pixels)):
+        at, d = factor * seconds[n], inverse_depth[n]
+        x, y = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
+        u = v = along = across = _ZERO
+        for j in range(_NODES):
+            weight, change = _ONE, _ZERO
+            for other in range(_NODES):
+                if other != j:
+                    part = (at - times[other]) * inverse_span[j, other]
+                    change = change * part + weight * inverse_span[j, other]
+                    weight *= part
+            M = motions[j]
+            z = M[2, 0] * x + M[2, 1] * y + M[2, 2] + M[2, 3] * d
+            q = _ONE / (nearest if z < nearest else z)
+            X = (M[0, 0] * x + M[0, 1] * y + M[0, 2] + M[0, 3] * d) * q
+            Y = (M[1, 0] * x + M[1, 1] * y + M[1, 2] + M[1, 3] * d) * q
+            u += weight * X
+            v += weight * Y
+            along += change * X
+            across += change * Y
+        shift[n, 0] += pixels[n, 0] - (u * fx + cx)
+        shift[n, 1] += pixels[n, 1] - (v * fy + cy)
+        slope[n, 0] = -seconds[n] * along * fx
+        slope[n, 1] = -seconds[n] * across * fy

@@ -1,0 +1,74 @@
+"""The compiled loops over edges seen through a lens against plain PyTorch."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens_flow import LensFlow
+from geogs.bundle.problem import BundleProblem, sources_within
+from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.terms import BundleState
+from lens_scene import CAMERA, GRID, disturbed, lens_problem
+from oracles import lens_reference
+
+HUBER = 2.0
+OPTIONS = BundleOptions(huber=HUBER, depth_damping=0.0)
+
+
+def problem_of(lens: RadialLens) -> BundleProblem:
+    """One of whose cells some are behind their targets and some have no match."""
+    problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.05, 0.1)
+    T, d, weight = (x.clone() for x in (problem.T_cw, problem.inverse_depth, problem.weight))
+    T[2, 2, 3] -= 2.5
+    d[:, ::2] += 1.0  # none is hardly before it
+    d[:, 1::2] = 0.1
+    weight[1, ::3] = 0
+    return replace(problem, T_cw=T, inverse_depth=d, weight=weight)
+
+
+def close(found: torch.Tensor, wanted: torch.Tensor) -> bool:
+    """To rounding, by the size of what is summed."""
+    return float((found - wanted).norm() / wanted.norm()) < 2e-5
+
+
+@pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
+@pytest.mark.parametrize("shared", ["lens", "lens and more", "more", "nothing"])
+def test_equations_are_those_of_plain_pytorch(distortion, shared):
+    lens = RadialLens(CAMERA, *distortion)
+    problem, block = problem_of(lens), LensBlock(lens, GRID.pixels)
+    g = torch.Generator().manual_seed(2)
+    more = torch.randn(problem.pixels.shape, generator=g) if "more" in shared else None
+    wanted = lens_reference.equations(problem, block, HUBER, more)
+    chosen = [n for n in range(wanted.gradient.shape[1]) if n < 6 or n >= 9 or "lens" in shared]
+    flow = LensFlow(block, None if more is None else lambda part: more)
+    state = BundleState(problem.T_cw, problem.inverse_depth, block if "lens" in shared else None)
+    sources = list(flow.sources(problem, state, OPTIONS))
+    for source, (frame, e) in zip(sources, sources_within(problem.source), strict=True):
+        edges, at = source.edges, 6 * (e.stop - e.start)
+        assert source.frame == frame
+        assert edges.shared == len(chosen) - 6
+        H = wanted.hessian[e][:, chosen][:, :, chosen]
+        v, E = wanted.gradient[e][:, chosen], wanted.coupling[e][:, chosen]
+        assert close(edges.hessian[:at, :at], torch.block_diag(*H[:, :6, :6]))
+        assert close(edges.gradient[:at], v[:, :6].flatten())
+        assert close(edges.depth.coupling[:at], E[:, :6].flatten(0, 1))
+        if edges.shared:
+            assert close(edges.hessian[:at, at:], H[:, :6, 6:].flatten(0, 1))
+            assert close(edges.hessian[at:, at:], H[:, 6:, 6:].sum(0))
+            assert close(edges.gradient[at:], v[:, 6:].sum(0))
+            assert close(edges.depth.coupling[at:], E[:, 6:].sum(0))
+        assert torch.equal(edges.hessian, edges.hessian.mT)
+        assert close(source.information, wanted.curvature[e].sum(0))
+        assert close(edges.depth.gradient, wanted.pull[e].sum(0))
+
+
+@pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
+@pytest.mark.parametrize("huber", [0.3, 30.0])
+def test_the_cost_is_that_of_plain_pytorch(distortion, huber):
+    lens = RadialLens(CAMERA, *distortion)
+    problem, block = problem_of(lens), LensBlock(lens, GRID.pixels)
+    state = BundleState(problem.T_cw, problem.inverse_depth, block)
+    found = LensFlow().cost(problem, state, huber)
+    assert found == pytest.approx(lens_reference.cost(problem, block, huber), rel=1e-5)
