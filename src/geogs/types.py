@@ -48,6 +48,9 @@ class SeenRows(ShortRepr):
     """That time, from the middle row's."""
     doubt: float = 0.0
     """Standard error of the readout, as a part of it; 0 where it was told."""
+    is_rectified: bool = True
+    """Else rows are as they came, and ``seconds`` those of a readout of one standard error: the
+    shutter is taken for global, and may not be."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from geogs.application.run_settings import RunSettings
 from geogs.cli import main as cli
 from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
 from geogs.config import InputConfig
-from geogs.geometry.distortion import lens_maps
+from geogs.geometry.distortion import RESAMPLING, lens_maps
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.pose_estimate import PoseEstimate
 from geogs.types import FoundLens
@@ -221,7 +221,7 @@ def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, 
     shown = next(f for f in plain if f.timestamp == pytest.approx(time))
     camera = plain.camera
     maps = lens_maps(camera, camera, (0.1, -0.05, 0.0, 0.0), "polynomial")
-    straight = cv2.remap(shown.image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    straight = cv2.remap(shown.image, *maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
     off = np.abs(saved.image(3).astype(float) - straight).mean()
     assert off < 0.3 * np.abs(shown.image.astype(float) - straight).mean()
     going_on = RunSettings((small_room,), map=folder)

@@ -49,7 +49,7 @@ def test_a_readout_that_is_found_is_said_and_written(folder, tmp_path, monkeypat
     finding(monkeypatch, FOUND)
     listener = Listener()
     source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)), listener)
-    assert source.shutter.readout == 0.0276
+    assert (source.shutter.readout, source.shutter.error) == (0.0276, 0.0011)
     assert listener.said == [
         "Rolling shutter: 27.6 ms from the first to the last row (12 clips say 27.6 ms, "
         "standard error 1.1 ms); rows are rectified."
@@ -85,6 +85,7 @@ def test_what_is_not_believed_leaves_the_shutter_global(folder, monkeypatch):
     source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)), listener)
     assert listener.said == []
     assert source.shutter.readout == 0.0
+    assert source.shutter.error == FoundReadout(0.0, 0.012, 0.009, 8).left_open
     assert not source.is_shutter_open
     finding(monkeypatch, FoundReadout())
     source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)))

@@ -11,11 +11,13 @@ from torch import Tensor
 from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.row_correction import FIRST_STEP, _readout_gradient, _Search, correct_rows
 from geogs.tracking.frames.pose_filling import row_errors
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid
@@ -199,3 +201,23 @@ def test_only_the_last_adjustment_is_a_long_one(monkeypatch, doubt, best, steps)
     tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
     correct_rows(tracker, [1, 2], [0, 1, 2], GLOBAL_OPTIONS)
     assert taken == steps
+
+
+def test_a_readout_that_nobody_found_is_in_the_deviations(monkeypatch):
+    """By what rows that count as seen at once really do to the poses; not where it was told."""
+    monkeypatch.setattr("geogs.bundle.uncertainty.lens_error.PRIOR", (1e-9, 1e-9, 1e-9))
+    tracker = tracker_of_rows(as_read())
+    log, ids = tracker.segment.frames, tracker.keyframes.ids
+    log.rows.clear()
+    global_bundle(tracker)
+    found, true = (
+        se3_inverse(T)[:, :3, 3] for T in (tracker.keyframes.poses(ids), pose(np.arange(COUNT)))
+    )
+    scale, R, t = umeyama(found, true)
+    off = float((scale * found @ R.T + t - true).norm() / scale)
+    monkeypatch.setattr("geogs.tracking.keyframe_uncertainty.USUAL_RESIDUAL", np.inf)
+    told = np.linalg.norm(keyframe_uncertainty(tracker).position)
+    log.open_rows = replace(as_read(doubt=1.0), is_rectified=False)
+    left_open = np.linalg.norm(keyframe_uncertainty(tracker).position)
+    assert told < 0.1 * off
+    assert 0.5 * off < left_open < 1.5 * off

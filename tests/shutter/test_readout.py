@@ -3,10 +3,19 @@
 import functools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from geogs.shutter.first_reconstruction import first_reconstruction
-from geogs.shutter.readout import CLIP, FoundReadout, _Adjusted, _verdict, find_readout
+from geogs.shutter.readout import (
+    CLIP,
+    LONGEST,
+    SHORTEST,
+    FoundReadout,
+    _Adjusted,
+    _verdict,
+    find_readout,
+)
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.types import Frame
 from rolling_scenes import RATE, hand_held, rolling_image
@@ -91,6 +100,27 @@ def test_a_steady_motion_tells_nothing():
 def test_few_clips_tell_nothing():
     assert _verdict(clips_of_points(TRUE)[:2], FOCAL) == FoundReadout(clips=2)
     assert _verdict([], FOCAL) == FoundReadout()
+
+
+@pytest.mark.parametrize(
+    ("best", "error"), [(0.0, float("inf")), (0.001, 0.002), (0.009, 0.004), (0.04, 0.006)]
+)
+def test_what_is_left_open_is_the_mean_square_over_shutters_that_say_the_same(best, error):
+    """Against shutters drawn, half of them global, and what noisy clips say of each."""
+    rng = np.random.default_rng(0)
+    true = rng.uniform(SHORTEST, LONGEST, 2_000_000) * rng.integers(0, 2, 2_000_000)
+    said = true + rng.normal(0, error, len(true)) if np.isfinite(error) else 0 * true
+    alike = true[np.abs(said - best) < 0.0003]
+    assert len(alike) > 1000
+    found = FoundReadout(0.0, best, error).left_open
+    assert found == pytest.approx(np.sqrt((alike**2).mean()), rel=0.05)
+
+
+def test_little_is_left_open_where_it_is_found_or_seen_to_be_none():
+    assert FoundReadout().left_open == pytest.approx(0.0151, abs=1e-4)
+    assert FoundReadout(0.02, 0.02, 0.001).left_open == 0.001
+    assert FoundReadout(0.0, -0.0005, 0.002).left_open < 0.0005
+    assert FoundReadout(0.0, -0.005, 0.0001).left_open < 1e-6  # impossible, hence none
 
 
 def test_clips_that_disagree_are_not_believed():

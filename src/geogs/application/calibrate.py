@@ -147,13 +147,13 @@ def with_shutter_found(
         )
         return source
     if not found.is_believed:
-        return source.with_shutter(Shutter(origin=_evidence(found)))
+        return source.with_shutter(Shutter(0.0, _evidence(found), found.left_open))
     progress.write(
         f"Rolling shutter: {1000 * found.readout:.1f} ms from the first to the last row "
         f"({_evidence(found)}); rows are rectified."
     )
     origin = f"found in the video: {_evidence(found)}"
-    return source.with_shutter(Shutter(found.readout, origin, found.error))
+    return source.with_shutter(Shutter(found.readout, origin, found.left_open))
 
 
 def _with_rows_rectified(source: Source, progress: RunProgress, stop: Stop) -> Source | None:

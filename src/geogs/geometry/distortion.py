@@ -17,6 +17,10 @@ from jaxtyping import Float
 from geogs.geometry.camera import Camera
 
 LensModel = Literal["polynomial", "fisheye"]
+RESAMPLING = cv2.INTER_LANCZOS4
+"""How images are straightened. OpenCV's cubic (a = -3/4, which does not keep a slope) would show
+things up to 0.04 pixels beside their place, most where that lies a quarter from a pixel, and rows
+that are read in turn run through all such places."""
 FISHEYE_LIMIT = np.radians(88.0)
 """Angle from the axis beyond which the plane z = 1 is no use; rays that are farther end there."""
 _POLISHING = 8

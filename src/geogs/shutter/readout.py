@@ -88,6 +88,22 @@ class FoundReadout:
         """Whether the video says that its shutter rolls."""
         return self.readout != 0
 
+    @property
+    def left_open(self) -> float:
+        """Root mean square of what the readout may differ by from the one that counts, seconds.
+
+        Where it counts as 0, by Bayes' rule: before the video was asked, every second shutter
+        rolls, as likely in any time from ``SHORTEST`` to ``LONGEST`` as in another. Where the video
+        says nothing, that is 15 ms.
+        """
+        if self.is_believed:
+            return self.error
+        rolling = np.linspace(SHORTEST, LONGEST, 500)
+        readouts = np.append(np.zeros_like(rolling), rolling)
+        fit = -0.5 * np.square((readouts - self.best) / self.error)
+        likely = np.exp(fit - fit.max())
+        return float(np.sqrt(likely @ readouts**2 / likely.sum()))
+
 
 @dataclass(frozen=True)
 class _Adjusted:

@@ -18,7 +18,7 @@ class Shutter:
     origin: str = "taken for a global shutter"
     """Where that comes from, for the log and ``intrinsics.json``."""
     error: float = 0.0
-    """Standard error where the video gave it, seconds."""
+    """Standard error where the video gave it, or left it open, seconds; 0 where it was told."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.readout) and abs(self.readout) <= LONGEST):

@@ -14,6 +14,7 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.gauge import deviations_after_alignment
 from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence
 from geogs.bundle.uncertainty.marginals import Marginals, common_errors, marginals
+from geogs.tracking.frames.pose_filling import rows_in_doubt
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
@@ -48,10 +49,10 @@ def keyframe_uncertainty(tracker: Tracker) -> Uncertainty:
     ids = tracker.segment.free
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
-    propagated = np.zeros(2)
+    propagated, rows = np.zeros(2), rows_in_doubt(tracker.map.recorder.log, tracker.keyframes)
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
-        found = _marginals(tracker, ids[part])
+        found = _marginals(tracker, ids[part], rows)
         if found is None:
             continue
         depth[part] = found.depth_deviation.numpy()
@@ -124,11 +125,12 @@ class _Matches:
         return rows.of_matches(i, j, T_ji, rays, depth, at.pixels).slope
 
 
-def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
+def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marginals | None:
     """Marginals of some keyframes, with what all their matches have wrong in common.
 
     They hold where the scene is not as modelled, too: matches are as many times as unsure as they
-    say as their residuals are longer than usual. What is known of the lens does not hang on that.
+    say as their residuals are longer than usual. What is known of the lens does not hang on that,
+    nor of the readout that ``rows`` were seen over.
     """
     matches = _Matches.among(tracker, ids)
     if matches is None:
@@ -137,7 +139,7 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     found = marginals(matches.grid, matches.problem, OPTIONS, CELLS)
     longer = (found.normalised_residual / USUAL_RESIDUAL).clamp(min=1)
     longer = torch.where(longer.isfinite(), longer, 1.0)
-    said = matches.lens(of_depths=True) if found.is_bounded else None
+    said = matches.lens(rows, of_depths=True) if found.is_bounded else None
     if said is not None:
         found = found.beside(common_errors(matches.grid, matches.problem, OPTIONS, found, CELLS))
     found = replace(
@@ -147,7 +149,8 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     )
     if said is not None:
         lens = tracker.keyframes.table.lens
-        found = found.beside(said.considered(1.0 if lens is None else lens.focal))
-    rows = (6 * own[:, None] + torch.arange(6)).reshape(-1)
-    covariance = found.covariance[rows[:, None], rows]
+        doubt = 0.0 if rows is None else rows.doubt
+        found = found.beside(said.considered(1.0 if lens is None else lens.focal, doubt))
+    free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
+    covariance = found.covariance[free[:, None], free]
     return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import distorted_pixels, lens_maps
+from geogs.geometry.distortion import RESAMPLING, distorted_pixels, lens_maps
 from geogs.types import FoundLens
 
 FARTHEST, ENTRIES = 4.0, 1 << 14
@@ -97,7 +97,7 @@ class StraightView:
     def image(self, bent: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """As the pinhole sees it. What is beyond the border gets its colour; what was masked out
         stays black."""
-        straight = cv2.remap(bent, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        straight = cv2.remap(bent, *self._maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
         black = bent[..., 0] | bent[..., 1] | bent[..., 2]  # one after the other: quicker
         straight[self.nearest(black) == 0] = 0
         return straight

@@ -168,21 +168,24 @@ def test_matches_that_are_corrected_are_those_of_a_pinhole():
     assert off < 0.03 * before
 
 
-def test_what_is_said_of_poses_is_the_mean_square_over_lenses():
-    """Against lenses drawn by ``PRIOR``, each seen with noise, and what they do."""
+@pytest.mark.parametrize("readout", [(), (0.4, 0.2)])
+def test_what_is_said_of_poses_is_the_mean_square_over_lenses(readout):
+    """Against lenses drawn by ``PRIOR``, each seen with noise, and what they do; and readouts drawn
+    by what is doubted of them."""
     g = torch.Generator().manual_seed(0)
-    moves = torch.randn(12, 3, generator=g, dtype=torch.float64)
-    prior = torch.tensor(PRIOR).double()
-    noise = torch.tensor([0.02, 0.02, 0.2]).double()
+    k = 4 if readout else 3
+    moves = torch.randn(12, k, generator=g, dtype=torch.float64)
+    prior = torch.tensor([*PRIOR, *readout[:1]]).double()
+    noise = torch.tensor([0.02, 0.02, 0.2, *readout[1:]]).double()
     count = 40
-    each = torch.diag(1 / noise.square())[None].expand(count, 3, 3) / count
+    each = torch.diag(1 / noise.square())[None].expand(count, k, k) / count
     said = torch.zeros(12, dtype=torch.float64)
     true = torch.zeros_like(said)
     for _ in range(1000):
-        lens = prior * torch.randn(3, generator=g, dtype=torch.float64)
-        seen = torch.randn(count, 3, generator=g, dtype=torch.float64) / noise / count**0.5
+        lens = prior * torch.randn(k, generator=g, dtype=torch.float64)
+        seen = torch.randn(count, k, generator=g, dtype=torch.float64) / noise / count**0.5
         found = LensEvidence(each, each @ lens + seen, moves, moves[None])
-        considered = found.considered()
+        considered = found.considered(1.0, *readout[:1])
         torch.testing.assert_close(
             considered.covariance.diagonal(), considered.relative_depth[0].double()
         )

@@ -56,6 +56,19 @@ def test_without_a_readout_images_are_as_they_were(folder):
             np.testing.assert_array_equal(frame.image, stored)
 
 
+def test_images_of_an_open_shutter_stay_and_tell_when_their_rows_may_have_been_seen(folder):
+    source = opened(folder, 0.0)
+    assert all(frame.rows is None for frame in source)
+    for raw, frame in zip(source, source.with_shutter(Shutter(0.0, "open", 0.01)), strict=True):
+        np.testing.assert_array_equal(frame.image, raw.image)
+        assert not frame.rows.is_rectified
+        assert float(frame.rows.offset.abs().max()) < 1e-3
+        middle = frame.rows.seconds[:, 1]
+        step = 0.01 * 8 / (frame.image.shape[0] - 1)  # eight pixels
+        np.testing.assert_allclose(middle.diff(), step, rtol=0.02)
+        assert float(middle.max()) == pytest.approx(0.005, abs=2 * step)
+
+
 def test_a_camera_that_stands_still_loses_nothing(tmp_path):
     still = global_image(hand_held, 0.3)
     for k in range(3):

@@ -89,3 +89,6 @@ def test_rows_go_where_the_frames_go():
     assert set(copied(logs[0]).rows) == {0, 1, 2}
     assert row_errors(logs[1], tracker.keyframes) is not None
     assert row_errors(FrameLog(), tracker.keyframes) is None
+    recorders[2].note_rows(replace(frame(20), rows=replace(rows, is_rectified=False)))
+    assert set(logs[2].rows) == {2}
+    assert not copied(logs[2]).open_rows.is_rectified

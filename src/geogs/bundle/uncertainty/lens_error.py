@@ -135,17 +135,18 @@ class LensEvidence:
         least = (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
         return _estimate(self.information, self.gradient).floored(least)
 
-    def considered(self, corrected: float = 1.0) -> Considered:
+    def considered(self, corrected: float = 1.0, doubt: float = 0.0) -> Considered:
         """The error that the lens has, and what it does to poses and depths.
 
         By what matches say of it and ``PRIOR`` together: their estimate moves them as far as it
         would if it were taken off, and what it leaves open does too; and by what is left of a focal
-        length that was ``corrected`` by a factor, which they do not tell of. Without ``LEAST``:
+        length that was ``corrected`` by a factor, which they do not tell of. Of a readout that was
+        asked for, too, ``doubt`` is the deviation as a part of it. Without ``LEAST``:
         what matches have wrong in common is taken for an error of the lens that hardly moves a
         pose, and three sizes that were each so unsure would move them two to five times as far.
         """
         said = _estimate(self.information, self.gradient)
-        prior = self.moves.new_tensor(PRIOR).square()
+        prior = self.moves.new_tensor((*PRIOR, doubt)[: len(said.size)]).square()
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)

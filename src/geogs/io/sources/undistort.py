@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel, distorted_pixels, lens_maps
+from geogs.geometry.distortion import RESAMPLING, LensModel, distorted_pixels, lens_maps
 from geogs.io.sources.calibration import Calibration
 from geogs.shutter.rolling_camera import RollingCamera
 
@@ -100,7 +100,7 @@ class Rectifier:
         if offsets is not None:
             maps = self.places(offsets)
         if maps is not None:
-            image = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            image = cv2.remap(image, *maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
         return np.ascontiguousarray(image)
 
     def places(

@@ -37,7 +37,7 @@ from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
 from geogs.threads import Each
-from geogs.types import MeasuredDepth
+from geogs.types import MeasuredDepth, SeenRows
 
 LEAST_EDGE = 12
 """Pixels of the shorter side of a working image."""
@@ -197,12 +197,26 @@ class WorkingImages:
         if self.shutter.readout:
             yield from self._with_rows_rectified(start)
             return
+        rows = self._open_rows()
         for raw in reader.read(start, config.stop, config.stride):
             raw = of_one_size(raw, reader.info)
             if raw.image is not None:
                 image = self._rectifier(raw.image)
-                raw = replace(raw, image=image, depth=self._rectified(raw.depth))
+                raw = replace(raw, image=image, depth=self._rectified(raw.depth), rows=rows)
             yield raw
+
+    def _open_rows(self) -> SeenRows | None:
+        """When rows of any image may have been seen; none where the shutter is known to be global.
+
+        It is the same for all images and kept once.
+        """
+        error = self.shutter.error
+        if error == 0:
+            return None
+        offsets = RowOffsets(self.rolling_camera, self.camera)
+        still = offsets.nodes(AngularMotion(), 0.0)
+        seen = offsets.seen(still, Shutter(error, error=error))
+        return replace(seen, is_rectified=False)
 
     def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
         """Working images with what masks of their own leave out black."""

@@ -49,8 +49,10 @@ class FrameRecorder:
 
     def note_rows(self, frame: Frame) -> None:
         """Note how the rows of a frame were rectified, whatever becomes of it."""
-        if frame.rows is not None:
+        if frame.rows is not None and frame.rows.is_rectified:
             self._log.rows[frame.index] = frame.rows
+        else:
+            self._log.open_rows = frame.rows
 
     # --- frames as they come ---------------------------------------------------------------
 

@@ -1,6 +1,7 @@
 """Pose of every frame on the present keyframes, from the sparse flow kept along the way."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -66,6 +67,18 @@ def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
         return None
     indices = sorted(record.index for record in frames.records)
     return RowErrors(keyframes.grid, frames.rows, indices, solve_trajectory(frames, keyframes))
+
+
+def rows_in_doubt(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
+    """The same where their readout is not known for sure, and where they were not rectified as
+    it is not known at all; none where it was told."""
+    if frames.open_rows is None:
+        errors = row_errors(frames, keyframes)
+    else:
+        every = dict.fromkeys((record.index for record in frames.records), frames.open_rows)
+        errors = row_errors(replace(frames, rows=every), keyframes)
+        errors = None if errors is None else errors.with_readout(0.0)
+    return errors if errors is not None and errors.doubt > 0 else None
 
 
 def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> None:

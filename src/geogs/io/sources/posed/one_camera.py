@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import lens_maps
+from geogs.geometry.distortion import RESAMPLING, lens_maps
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.posed.posed_set import PosedFile
@@ -138,7 +138,7 @@ class Resampler:
         """The image of the target."""
         if (image.shape[1], image.shape[0]) != self.size:
             image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
-        return cv2.remap(image, *self._maps(), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(image, *self._maps(), RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
 
     def covered(self) -> Bool[np.ndarray, "h w"] | None:
         """Pixels of the target that the source sees; none where it sees all."""
