@@ -21,6 +21,10 @@ RECOGNISED = 0.25
 what is asked where the camera was expected."""
 TRIED = 5
 """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
+DOUBTFUL = 0.7
+"""A frame near where it was expected is also looked for without a guess where less than this
+fraction of the keyframe's known depths agrees: a guess that is off by half a period of a pattern
+leads to the wrong one of its repetitions, which agree over a part of the image."""
 RELOCALISE_EVERY = 5
 """While a camera only rotates, its orientation says what it sees; only every so many frames it is
 searched for as if it could be anywhere."""
@@ -48,7 +52,7 @@ class SegmentLocaliser:
                 motion = locate(keyframe, encoded, given @ keyframe.T_cw)
         if motion is None and last.velocity is not None:
             motion = locate(keyframe, encoded, last.T_cw(keyframe))
-        return self._with_depth(motion)
+        return self._best(keyframe, encoded, self._with_depth(motion))
 
     def relocalise(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
         """The frame anywhere: first where the camera would be if it had only rotated."""
@@ -80,6 +84,17 @@ class SegmentLocaliser:
             if motion is not None and motion.matched >= RECOGNISED:
                 return motion
         return None
+
+    def _best(
+        self, keyframe: Keyframe, encoded: Any, expected: FrameMotion | None
+    ) -> FrameMotion | None:
+        """The frame where most of the keyframe agrees: as expected, or where nothing but the
+        images led, if that was doubtful."""
+        if expected is None or expected.overlap >= DOUBTFUL:
+            return expected
+        others = (self.locator.relocate, self.locator.relocate_by_features)
+        found = [self._with_depth(search(keyframe, encoded)) for search in others]
+        return max([expected, *(m for m in found if m is not None)], key=lambda m: m.matched)
 
     def _with_depth(self, motion: FrameMotion | None) -> FrameMotion | None:
         """A motion that enough cells of known depth say."""
