@@ -20,12 +20,12 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-OF_SEARCH, OF_MAP, KERNELS = 14, 35, 52
+OF_SEARCH, OF_MAP, KERNELS = 17, 38, 55
 """How many a rehearsal compiles, those counted that are called from Python: first what depths are
 searched by, up to what a map needs, up to a mesh."""
 PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
-ON_GPU = {"planes": 6}
+ON_GPU = {"planes": 9}
 """Likewise with a GPU, which calls nothing else of it."""
 _POLITELY = 5
 """By which each part is nicer than what goes before it, images first of all."""

@@ -6,6 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.shared import OPTIONS, solve_shared
 from geogs.config import MeshConfig, ReconstructConfig
 from geogs.depth.depth_view import KeyframeDepth
 from geogs.depth.revision.segment_planes import on_planes
@@ -13,10 +16,15 @@ from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.reconstruction import Reconstruction
-from geogs.shutter.angular_motion import rotated
+from geogs.shutter.angular_motion import AngularMotion, rotated
 from geogs.shutter.rates import FlowMeter, angular_velocity
 from geogs.shutter.rolling_camera import RollingCamera
+from geogs.shutter.rows import RowOffsets
+from geogs.shutter.shutter import Shutter
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.frames.row_errors import RowErrors
+from geogs.types import Trajectory
+from geogs.world.grid import SampleGrid
 
 CAMERA = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 VIEWS, SHIFT = 6, 8
@@ -32,9 +40,11 @@ def rehearse(part: str) -> None:
     extracts its mesh; leaves nothing."""
     if part == "map":
         _turn()
+        _lens()
         _map()
     elif part == "planes":
         _turn()
+        _lens()
         _bare()
     else:
         extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
@@ -46,6 +56,25 @@ def _turn() -> None:
     first, second, *_ = map(meter.small, _pictures())
     angular_velocity(meter.measure(first, second), 1.0, 0.1)
     rotated(np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def _lens() -> None:
+    """Two pictures through a lens that nobody knows, and rows that were read in turn."""
+    grid, times = SampleGrid(CAMERA), np.arange(VIEWS) / 30
+    T_cw = torch.stack([torch.from_numpy(_pose(number)) for number in range(VIEWS)])
+    depth, free = torch.full((2, grid.size), 1 / DEPTH), torch.tensor([False, True])
+    pixels = (grid.pixels - torch.tensor([SHIFT, 0.0]))[None]
+    problem = BundleProblem(
+        T_cw[:2], depth, torch.tensor([0]), torch.tensor([1]), free, free.new_ones(2),
+        pixels=pixels, weight=torch.ones_like(pixels),
+    )  # fmt: skip
+    solve_shared(
+        problem, LensBlock(RadialLens(CAMERA), grid.pixels), replace(OPTIONS, iterations=1)
+    )
+    rows = RowOffsets(RollingCamera(CAMERA), CAMERA)
+    seen = rows.seen(rows.nodes(AngularMotion(), 0.0), Shutter(0.02))
+    way = Trajectory(times, torch.linalg.inv(T_cw).numpy(), np.ones(VIEWS, bool))
+    RowErrors(grid, {0: seen}, range(VIEWS), way).of_pixels([0], pixels, depth[:1])
 
 
 def _map() -> None:
