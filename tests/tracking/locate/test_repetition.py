@@ -1,5 +1,6 @@
 """A pattern that repeats, in which a wrong guess leads to the wrong one of its repetitions."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +9,8 @@ import torch
 
 import tracking_scenes
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.locate.frame_locator import FrameMotion
-from geogs.tracking.locate.localiser import DOUBTFUL, SegmentLocaliser
+from geogs.tracking.locate.frame_locator import SAME, FrameMotion
+from geogs.tracking.locate.localiser import BORNE_OUT, DOUBTFUL, SegmentLocaliser
 from geogs.tracking.matching.photometric_check import PhotometricCheck
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch, Frame
@@ -17,10 +18,12 @@ from geogs.world.segments import LastFrame, TrackState
 from tracking_scenes import CAMERA, pose, render
 
 
-def motion(overlap: float, matched: float, known: float = 0.5) -> FrameMotion:
-    nothing = FlowMatch(torch.zeros(1, 1, 2), torch.zeros(1, 1, 2))
-    eye, check = torch.eye(4, dtype=torch.float64), PhotometricCheck(0.9, 100)
-    return FrameMotion(0, eye, nothing, 9.0, 9.0, matched, overlap, known, 0.3, check)
+def motion(
+    overlap: float, matched: float, known: float = 0.5, at: float = 0.0, correlation: float = 0.9
+) -> FrameMotion:
+    match = FlowMatch(torch.full((1, 8, 2), at), torch.ones(1, 8, 2))
+    eye, check = torch.eye(4, dtype=torch.float64), PhotometricCheck(correlation, 100)
+    return FrameMotion(0, eye, match, 9.0, 9.0, matched, overlap, known, 0.3, check)
 
 
 def searched(
@@ -54,6 +57,16 @@ def test_what_most_of_the_keyframe_agrees_with_is_believed():
     assert searched(doubtful, None, None) == (doubtful, 2)
     assert searched(doubtful, motion(0.9, 0.9, known=0.01), None) == (doubtful, 2)
     assert searched(None, better, better) == (None, 0)  # others look for a camera that is lost
+
+
+def test_features_are_not_asked_where_flow_leads_there_again_and_images_bear_it_out():
+    doubtful, features = motion(DOUBTFUL - 0.01, 0.3), motion(0.9, 0.5)
+    near, far = SAME / 2, 2 * SAME
+    for at, correlation, asked in ((near, BORNE_OUT, 1), (near, 0.9, 2), (far, BORNE_OUT, 2)):
+        cold = motion(0.8, 0.4, at=at, correlation=correlation)
+        assert searched(doubtful, cold, features) == (cold if asked == 1 else features, asked)
+    blank = replace(doubtful.match, weight=torch.zeros(1, 8, 2))
+    assert not replace(doubtful, match=blank).is_where(doubtful)
 
 
 def on_the_move(guess: np.ndarray) -> Tracker:

@@ -24,7 +24,9 @@ FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
 FIT_HUBER = 5.0
 """Standard deviations of the flow beyond which a match counts linearly in it."""
-
+SAME = 1.0
+"""Pixels by which matches of two ways to the same place differ in the median at most; those of two
+repetitions of a pattern differ by its period."""
 FEATURE_CANDIDATES = 2
 """Keyframes with which the features of a frame are compared when the camera is lost."""
 
@@ -53,6 +55,12 @@ class FrameMotion:
     """Median distance in pixels between matches and reprojection."""
     check: PhotometricCheck
     """What the images say of it."""
+
+    def is_where(self, other: "FrameMotion") -> bool:
+        """Whether matches of the same keyframe say the same as another's, in the median."""
+        both = self.match.sure()[0] & other.match.sure()[0]
+        off = (self.match.pixels - other.match.pixels)[0, both].norm(dim=-1)
+        return len(off) > 0 and float(off.median()) < SAME
 
 
 @dataclass(frozen=True)
