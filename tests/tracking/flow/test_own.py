@@ -197,7 +197,7 @@ def test_a_cold_start_counts_where_the_classical_flow_bears_it_out(operator):
         return float((match.weight[0, :, 0] > 0).float().mean())
 
     assert matched(one, other, here, here) > 0.7  # begun where one is, it is believed as it is
-    assert matched(one, other) < 0.3
+    assert matched(one, other) < 0.5
     assert matched(one, one) > 0.7
 
 

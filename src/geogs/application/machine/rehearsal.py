@@ -22,6 +22,7 @@ from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.types import Trajectory
 from geogs.world.grid import SampleGrid
@@ -40,6 +41,7 @@ def rehearse(part: str) -> None:
     extracts its mesh; leaves nothing."""
     if part == "map":
         _turn()
+        _follow()
         _lens()
         _map()
     elif part == "planes":
@@ -56,6 +58,14 @@ def _turn() -> None:
     first, second, *_ = map(meter.small, _pictures())
     angular_velocity(meter.measure(first, second), 1.0, 0.1)
     rotated(np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def _follow() -> None:
+    """A picture found again where it is expected."""
+    operator = ClassicalFlow(SampleGrid(CAMERA))
+    image = operator.encode(_pictures()[0])
+    here = operator.grid.pixels[None]
+    operator.measure([image], [image], here, here)
 
 
 def _lens() -> None:

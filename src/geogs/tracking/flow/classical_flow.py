@@ -178,8 +178,7 @@ class ClassicalFlow:
             shape = (self.grid.height, self.grid.width, 2)
             warp = StartFlow(np.clip(start - self._pixels, -1e4, 1e4).reshape(shape))
             dense = warp.on(level.lattice) / level.step
-            u, v = level.u + dense[..., 0], level.v + dense[..., 1]
-            target = cv2.remap(target, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            target = _warped(target, level.u + dense[..., 0], level.v + dense[..., 1])
         target = _match_brightness(target, source)
         # OpenCV makes the output where None is given, which its stubs do not say.
         flow = self._dis(start is None).calc(source, target, None)  # type: ignore[call-overload]
@@ -232,6 +231,16 @@ def match_deviation(
     adjustment takes them for independent.
     """
     return 0.06 + 0.8 * disagreement + 3.4 * roughness
+
+
+def _warped(
+    image: UInt8[np.ndarray, "h w"], x: Float[np.ndarray, "a b"], y: Float[np.ndarray, "a b"]
+) -> UInt8[np.ndarray, "a b"]:
+    from geogs.tracking.flow.warp_kernels import warp
+
+    warped = np.empty(x.shape, np.uint8)
+    warp(image, x, y, warped)
+    return warped
 
 
 def _match_brightness(
