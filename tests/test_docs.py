@@ -23,6 +23,20 @@ def test_files_that_a_text_names_exist(text: Path) -> None:
     assert missing == set()
 
 
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.stem)
+def test_headings_that_a_text_leads_to_exist(text: Path) -> None:
+    links = re.findall(r"\]\(([\w./-]+\.md|)#([^)\s]+)\)", text.read_text())
+    pages = {name: text.parent / name if name else text for name, _ in links}
+    missing = {f"{name}#{at}" for name, at in links if at not in _headings(pages[name])}
+    assert missing == set()
+
+
+def _headings(page: Path) -> set[str]:
+    """As the links to them are written."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 def _is_there(name: str) -> bool:
     return any(ROOT.glob(name)) or any(
         any((ROOT / folder).glob(f"**/{name}")) for folder in ("src", "benchmarks", "tests")

@@ -36,7 +36,7 @@ GLOBAL_OPTIONS = BundleOptions(
 """How each round is solved; it ends with a step that moves no pose by more, in units and radians.
 A drift of scale along many keyframes has a curvature far below 1e-4 of the diagonal, the less the
 more they are, and carries all depths along: with the usual damping of either the steps end long
-before it is gone (docs/tracking.md, section 4)."""
+before it is gone (docs/adjustment.md)."""
 
 
 def global_bundle(

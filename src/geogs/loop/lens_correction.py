@@ -4,7 +4,7 @@ Images were undistorted by what was said of the lens, which may be nothing. What
 k1 and k2 that all matches of the video tell together. They are taken off the matches, and
 everything is adjusted again; flow stays as it is. Until then a walk straight on drifts in scale.
 The focal length is corrected with them where they ask for that, too: one that was found while the
-lens was taken for a pinhole is off by several percent (docs/tracking.md).
+lens was taken for a pinhole is off by several percent (docs/lens.md).
 """
 
 import math
@@ -30,13 +30,13 @@ CONVERGED = 0.2
 EVIDENCE = 81.0
 """Square of the sizes in their deviations from which on they are believed. Matches of different
 keyframes err alike, too: where the lens was known it is 1 to 10, where it was not, hundreds
-(docs/tracking.md)."""
+(docs/lens.md)."""
 FOCAL_EVIDENCE = 4.0
 """Deviations from which on the focal length is believed to be off, too, where k1 and k2 are. Where
-it was given it is 0 to 2.2 (docs/tracking.md)."""
+it was given it is 0 to 2.2 (docs/lens.md)."""
 READOUT_DOUBT = 0.05
 """Part of the readout that its deviation has to be for matches to be asked for it, too: what they
-say of it comes out 2 to 6 % short itself (docs/tracking.md)."""
+say of it comes out 2 to 6 % short itself (docs/lens.md)."""
 
 
 def correct_lens(

@@ -31,7 +31,7 @@ TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23
 """Median residual, in deviations of a match, where the scene is as modelled: read off rendered
-videos (docs/tracking.md has the table)."""
+videos (docs/uncertainty.md has the table)."""
 
 
 def keyframe_uncertainty(tracker: Tracker) -> Uncertainty:

@@ -41,7 +41,7 @@ Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Ten
 by a part of it: one shape more."""
 LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001), 0.005
 """No size is known better, however many matches agree: half of what they say of lenses that have no
-error (docs/tracking.md)."""
+error (docs/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Deviations of the sizes before any match is asked."""
 FOCAL_LEFT = 0.2
