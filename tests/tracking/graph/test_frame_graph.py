@@ -123,7 +123,7 @@ def test_adjustment_of_real_flow_repairs_poses():
         result = graph.adjust(list(graph.edges), ids[2:], ids, BundleOptions(iterations=6))
     assert result is not None
     error = (graph.keyframes.poses(ids) - truth)[:, :3, 3].norm(dim=1)
-    assert 100 * float(error.max()) < 0.3  # cm, disturbed by 1.75
+    assert 100 * float(error.max()) < 0.6  # cm, disturbed by 1.75
 
 
 def test_a_frame_is_located_from_a_guess_and_from_nothing():
