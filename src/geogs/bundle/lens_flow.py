@@ -41,9 +41,7 @@ class LensFlow:
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         adjoint, edges = se3_adjoint(T_ji), _Edges(self._block(state), problem, T_ji)
         limits = _limits(options.huber)
-        slopes = np.zeros((0, edges.rays.shape[1]), np.float32)
-        if state.block is not None:
-            slopes = edges.slopes
+        slopes = edges.slopes if state.block is not None else edges.slopes[:0]
         further = np.zeros((0, 0, 2), np.float32)
         if self._further is not None:
             further = _float(self._further(problem))
@@ -52,11 +50,7 @@ class LensFlow:
             size = 6 * (e.stop - e.start) + shared
             H, g = torch.zeros(size, size).double(), torch.zeros(size).double()
             depth = state.inverse_depth[frame].contiguous()
-            E, C, b = (
-                depth.new_zeros(size, len(depth)),
-                torch.zeros_like(depth),
-                torch.zeros_like(depth),
-            )
+            E, C, b = depth.new_zeros(size, len(depth)), *depth.new_zeros(2, len(depth))
             linearise_source(
                 edges.motions[e], edges.rays, slopes, edges.lens, depth.numpy(), edges.pixels[e],
                 edges.weight[e], further[e], limits,

@@ -5,7 +5,7 @@ can be matched and adjusted once more. Matches between keyframes do not: they ar
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 
@@ -157,7 +157,7 @@ def straight_rows(rows: Sequence[SeenRows], view: StraightView) -> list[SeenRows
     shape = len(rows), lines, columns
     both = zip(offsets.reshape(*shape, 2), seconds.reshape(shape), strict=True)
     return [
-        SeenRows(offset.to(frame.offset), at.to(frame.seconds), frame.doubt)
+        replace(frame, offset=offset.to(frame.offset), seconds=at.to(frame.seconds))
         for frame, (offset, at) in zip(rows, both, strict=True)
     ]
 
