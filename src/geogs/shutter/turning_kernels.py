@@ -2,6 +2,7 @@
 
 Rows of frames are rectified beside tracking. Hundreds of steps of NumPy a frame, each of which may
 give the lock away and has to wait for it again, hold that up longer than their arithmetic takes.
+Arrays are written by element: products, rows and sums of NumPy take numba seconds to compile.
 """
 
 import numpy as np
@@ -41,7 +42,10 @@ def nearest_turn(matrix):
 
     Source: the polar decomposition by Newton's iteration (Higham 1986).
     """
-    other, largest = np.empty((3, 3)), np.abs(matrix).max()
+    other, largest = np.empty((3, 3)), 0.0
+    for i in range(3):
+        for j in range(3):
+            largest = max(largest, abs(matrix[i, j]))
     for _ in range(_POLAR):
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
@@ -83,9 +87,14 @@ def turning_between(first, second, first_time, second_time, inside, interval, to
     """
     rate, moment, weight = np.zeros(3), np.empty((3, 3)), inside.copy()
     a, b, error = np.empty_like(first), np.empty_like(second), np.empty_like(weight)
+    first_turn, second_turn = np.empty_like(first), np.empty_like(second)
     for _ in range(rounds):
-        turn(first, np.outer(-first_time, rate), a)
-        turn(second, np.outer(-second_time, rate), b)
+        for n in range(len(weight)):
+            for i in range(3):
+                first_turn[n, i] = -first_time[n] * rate[i]
+                second_turn[n, i] = -second_time[n] * rate[i]
+        turn(first, first_turn, a)
+        turn(second, second_turn, b)
         for i in range(3):
             for j in range(3):
                 moment[i, j] = 0.0
@@ -96,9 +105,11 @@ def turning_between(first, second, first_time, second_time, inside, interval, to
             break
         x, y = moment[2, 1] - moment[1, 2], moment[0, 2] - moment[2, 0]
         z = moment[1, 0] - moment[0, 1]
-        sine, cosine = np.sqrt(x * x + y * y + z * z), np.trace(moment) - 1.0
+        sine = np.sqrt(x * x + y * y + z * z)
+        cosine = moment[0, 0] + moment[1, 1] + moment[2, 2] - 1.0
         factor = np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.5
-        rate[:] = np.array([x, y, z]) * (factor / interval)
+        factor /= interval
+        rate[0], rate[1], rate[2] = factor * x, factor * y, factor * z
         for n in range(len(error)):
             square = 0.0
             for i in range(3):

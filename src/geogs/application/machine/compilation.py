@@ -25,8 +25,8 @@ OF_SEARCH, OF_MAP, KERNELS = 18, 39, 56
 searched by, up to what a map needs, up to a mesh."""
 PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
-ON_GPU = {"planes": 9}
-"""Likewise with a GPU, which calls nothing else of it."""
+ON_GPU = {"planes": 4, "turn": 2, "lens": 3}
+"""Likewise with a GPU, which calls nothing else of it; what takes longest goes first."""
 _POLITELY = 5
 """By which each part is nicer than what goes before it, images first of all."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")

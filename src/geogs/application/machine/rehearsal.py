@@ -37,19 +37,10 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """``map`` follows and maps the wall on a CPU, ``planes`` does what of it no GPU does, ``mesh``
-    extracts its mesh; leaves nothing."""
-    if part == "map":
-        _turn()
-        _follow()
-        _lens()
-        _map()
-    elif part == "planes":
-        _turn()
-        _lens()
-        _bare()
-    else:
-        extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
+    """``map`` follows and maps the wall on a CPU, ``mesh`` extracts its mesh; ``turn``, ``lens``
+    and ``planes`` do what of ``map`` no GPU does. Leaves nothing."""
+    for step in _STEPS[part]:
+        step()
 
 
 def _turn() -> None:
@@ -107,6 +98,19 @@ def _bare() -> None:
     confidence[20:50, 20:70] = 0
     labels[20:50, 20:70] = 1
     on_planes(KeyframeDepth(depth, confidence), labels, None, 0)
+
+
+def _mesh() -> None:
+    extract_mesh([_seen(number) for number in range(VIEWS)], MeshConfig(triangle_budget=500))
+
+
+_STEPS = {
+    "map": (_turn, _follow, _lens, _map),
+    "mesh": (_mesh,),
+    "turn": (_turn,),
+    "lens": (_lens,),
+    "planes": (_bare,),
+}
 
 
 def _seen(number: int) -> DepthMapView:

@@ -75,14 +75,13 @@ def near_part(parts, number, box, reach):
         for u in range(width - 1, -1, -1):
             since = 0 if parts[top + v, left + u] == number else since + 1
             across[v, u] |= since <= reach
-    count = np.zeros(width, np.int32)
-    for v in range(-reach, height):
-        if v + reach < height:
-            count += across[v + reach]
-        if v > reach:
-            count -= across[v - reach - 1]
-        if v >= 0:
-            near[v] = count > 0
+    for u in range(width):  # numba takes seconds to compile what assigns whole rows
+        count = 0
+        for v in range(-reach, height):
+            count += across[v + reach, u] if v + reach < height else 0
+            count -= across[v - reach - 1, u] if v > reach else 0
+            if v >= 0:
+                near[v, u] = count > 0
     return near
 
 
