@@ -81,9 +81,9 @@ def test_what_was_found_of_frames_is_as_if_the_pinhole_had_seen_both():
     bent = VIEW.bent(carried(VIEW.straight(GRID.pixels[cells]), T.float()))
     inside = GRID.inside(bent, 4.0)
     weight = inside.float()[:, None].expand(-1, 2)
-    log = FrameLog([FrameRecord(1, 0.1, 0, T)])
+    log = FrameLog([FrameRecord(1, 0.1, 0, torch.eye(4).double())])  # as tracking left it
     log.records[0].observations = [Observation(0, *pack_matches(GRID, bent, weight))]
-    straighten_frames(log, keyframes, VIEW)
+    straighten_frames(log, keyframes, VIEW, {1: T})
     (found,) = log.records[0].observations
     kept = found.half_weight[:, 0] > 0
     assert int(kept.sum()) > 0.95 * int(inside.sum()) > 20

@@ -17,8 +17,8 @@ from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
 from geogs.threads import ordered_map, thread_map, worker_count
-from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
-from geogs.tracking.frames.pose_filling import seen_by_keyframes
+from geogs.tracking.frames.frame_recorder import sparse_cells
+from geogs.tracking.frames.pose_filling import seen_by_keyframes, solved_poses
 from geogs.tracking.frames.row_errors import seen_rows
 from geogs.tracking.tracker import Tracker
 from geogs.types import FoundLens, SeenRows
@@ -73,12 +73,13 @@ def straighten(tracker: Tracker, lens: FoundLens, images: BentImages) -> None:
     Its graph has no edges then, as their matches are those of images that bend.
     """
     keyframes, graph = tracker.keyframes, tracker.map.graph
-    view = StraightView(keyframes.camera, lens)
+    view, log = StraightView(keyframes.camera, lens), tracker.map.recorder.log
+    poses = solved_poses(log, keyframes)
     images.straighten(lens)
     graph.edges.clear()
     graph.refocus(1.0)
     straighten_cells(keyframes, view)
-    straighten_frames(tracker.map.recorder.log, keyframes, view)
+    straighten_frames(log, keyframes, view, poses)
 
 
 def straighten_cells(keyframes: KeyframeSet, view: StraightView) -> None:
@@ -104,12 +105,18 @@ def straighten_cells(keyframes: KeyframeSet, view: StraightView) -> None:
             measured.information = torch.where(is_cell, measured.information[nearest], 0.0)
 
 
-def straighten_frames(log: FrameLog, keyframes: KeyframeSet, view: StraightView) -> None:
+def straighten_frames(
+    log: FrameLog,
+    keyframes: KeyframeSet,
+    view: StraightView,
+    T_cw: Mapping[int, Float[Tensor, "4 4"]],
+) -> None:
     """Have what was found of the frames between straight keyframes where straight frames show it.
 
     Frames' images are no longer there. What a cell of a bent keyframe shows lies off it in the
     straight one; where it was found is straightened, and what lies on the cell is that far from it
-    as the depths of both say at the frame's pose. Rows are those that straight pixels were seen in.
+    as the depths of both say at the frame's pose ``T_cw``. That is what is known now, not where
+    tracking left the frame. Rows are those that straight pixels were seen in.
     """
     grid = keyframes.grid
     cells = sparse_cells(grid)
@@ -122,9 +129,7 @@ def straighten_frames(log: FrameLog, keyframes: KeyframeSet, view: StraightView)
     )
     rays = torch.cat([plane, torch.ones_like(plane[:, :1])], 1)
     for part, ids in seen_by_keyframes(log, keyframes):
-        T = torch.stack([pose_of(r, keyframes) for r, _ in part]) @ se3_inverse(
-            keyframes.poses(ids)
-        )
+        T = torch.stack([T_cw[r.index] for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
         depth = keyframes.inverse_depths(ids)
         found = view.straight(unpacked_positions(grid, torch.stack([o.position for _, o in part])))
         of_shown = project(camera, rays, T, grid.sample_field(depth.mT, shown).mT)

@@ -5,10 +5,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from geogs.bundle.uncertainty.lens_error import LensBend
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frames.frame_recorder import FrameRecorder, pose_of
 from geogs.tracking.frames.interpolation import interpolate
-from geogs.tracking.frames.pose_filling import depth_aware_weight, row_errors, solve_trajectory
+from geogs.tracking.frames.pose_filling import (
+    depth_aware_weight,
+    row_errors,
+    shift_lens,
+    solve_trajectory,
+)
 from geogs.types import FlowMatch, Frame, SeenRows
 from geogs.world.frames import FrameLog
 from planted_walk import planted_tracker
@@ -74,6 +80,21 @@ def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
     found = torch.from_numpy(solve_trajectory(log, tracker.keyframes).T_wc[0])
     # Positions are known to 1/800 pixel here, of 75 pixels focal length at 3 metres.
     torch.testing.assert_close(se3_inverse(found), T[2], rtol=0, atol=2e-4)
+
+
+def test_a_lens_bends_what_is_found_of_a_frame_where_that_is_not_where_tracking_left_it():
+    tracker, T = planted_tracker(4, sigma=0.0)
+    match, _ = tracker.map.operator.measure([0], [2])
+    wrong = se3_exp(torch.tensor([0.2, -0.1, 0.1, 0, 0.05, 0.1], dtype=torch.float64))
+    shifts = []
+    for left in (T[2], wrong @ T[2]):
+        log = FrameLog()
+        recorder = FrameRecorder(log, tracker.keyframes, tracker.map.operator)
+        recorder.add(frame(50), 2, 0, left, FlowMatch(match.pixels, match.weight))
+        shift_lens(log, tracker.keyframes, LensBend(0.1, -0.05))
+        shifts.append(log.records[0].observations[0].shift.int())
+    assert int(shifts[0].abs().max()) > 40
+    assert int((shifts[1] - shifts[0]).abs().max()) <= 1
 
 
 def test_rows_go_where_the_frames_go():

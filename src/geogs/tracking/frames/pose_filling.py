@@ -44,12 +44,7 @@ def solve_trajectory(
     interpolated, too. Without a map (``has_map``) nothing but rotations is known of any.
     """
     records = sorted([*frames.records, *elsewhere], key=lambda r: r.index)
-    tracked = tracked_on(frames, keyframes) if has_map else []
-    solved: dict[int, Tensor] = {r.index: pose_of(r, keyframes) for r in tracked}
-    solver = motion_solver(keyframes.grid, sparse_cells(keyframes.grid))
-    for part, problem in observed(tracked, keyframes):
-        poses, _ = solver.solve(problem, iterations=ITERATIONS, huber=HUBER)
-        solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
+    solved = solved_poses(frames, keyframes) if has_map else {}
     oriented = orientations(
         {r.index: r.rotations for r in records}, {n: T[:3, :3] for n, T in solved.items()}
     )
@@ -59,6 +54,17 @@ def solve_trajectory(
         [solved.get(r.index) for r in records],
         [oriented.get(r.index) for r in records],
     )
+
+
+def solved_poses(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, Float[Tensor, "4 4"]]:
+    """World to camera of the frames that have a place, by their indices."""
+    tracked = tracked_on(frames, keyframes)
+    solved = {r.index: pose_of(r, keyframes) for r in tracked}
+    solver = motion_solver(keyframes.grid, sparse_cells(keyframes.grid))
+    for part, problem in observed(tracked, keyframes):
+        poses, _ = solver.solve(problem, iterations=ITERATIONS, huber=HUBER)
+        solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
+    return solved
 
 
 def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
@@ -100,9 +106,9 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
 def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None:
     """Correct what was found of frames by what the lens bends, beside the errors of their rows."""
     grid = keyframes.grid
-    cells = sparse_cells(grid)
+    cells, poses = sparse_cells(grid), solved_poses(frames, keyframes)
     for part, ids in seen_by_keyframes(frames, keyframes):
-        seen = torch.stack([pose_of(r, keyframes) for r, _ in part])
+        seen = torch.stack([poses[r.index] for r, _ in part])
         T, depth = seen @ se3_inverse(keyframes.poses(ids)), keyframes.inverse_depths(ids)
         shifts = bend.of_matches(grid.camera, grid.rays[cells], T, depth[:, cells])
         steps = in_steps(grid.camera, shifts)
