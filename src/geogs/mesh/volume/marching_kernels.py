@@ -65,7 +65,9 @@ def find_vertices(distance, seen, number):
                     if found == room:
                         room *= 2
                         larger = np.empty((room, 4), np.float64)
-                        larger[:found] = vertices
+                        for n in range(found):  # numba takes seconds to compile it as one copy
+                            for k in range(4):
+                                larger[n, k] = vertices[n, k]
                         vertices = larger
                     vertices[found, 0], vertices[found, 1], vertices[found, 2] = x, y, z
                     vertices[found, axis] += here / (here - there)
