@@ -26,9 +26,9 @@ def rendered(
     That gives the gradients of the disks and, float64, of the pose; it takes those of depth,
     normal, alpha and distortion, None for zero. It may be asked again, but not without trace.
     """
-    arrays = tuple(p.detach().contiguous().numpy() for p in disks)
+    x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
     pose, threads = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy(), worker_count()
-    maps, trace = rasterize_forward(arrays, camera, pose, near, threads, with_trace)
+    maps, trace = rasterize_forward((x, q, scale, logit), camera, pose, near, threads, with_trace)
     shown = tuple(torch.from_numpy(getattr(maps, name)) for name in maps.__slots__)
     shapes = [m.shape for m in shown[:4]]  # not the maps, which belong to the graph
 
