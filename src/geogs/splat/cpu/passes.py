@@ -36,7 +36,7 @@ def rendered(
         gradients: Sequence[Tensor | None], with_pose: bool
     ) -> tuple[DiskParameters, Float[Tensor, "4 4"]]:
         depth, normal, alpha, distortion = (
-            (torch.zeros(shape) if g is None else g.to(torch.float32).contiguous()).numpy()
+            (torch.zeros(shape) if g is None else g).to(torch.float32).contiguous().numpy()
             for g, shape in zip(gradients, shapes, strict=True)
         )
         found = rasterize_backward(trace, depth, normal, alpha, distortion, threads)
