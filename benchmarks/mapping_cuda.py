@@ -35,9 +35,8 @@ from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
 from geogs.splat.cuda import passes
-from geogs.splat.cuda.autograd import RasterizeOnGpu
 from geogs.splat.init import initialise_disks
-from geogs.splat.render import NEAR, RenderOutput
+from geogs.splat.render import NEAR, Rasterized, RenderOutput
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
@@ -193,7 +192,7 @@ class Plain:
     def _loss(self) -> Tensor:
         window, config = self.window, self.config
         camera = window.cameras.render
-        out = RenderOutput(*RasterizeOnGpu.apply(*self.disks, self.poses, camera, NEAR))
+        out = RenderOutput(*Rasterized.apply("cuda", camera, NEAR, self.poses, *self.disks))
         shown = torch.where(out.alpha.detach() > MIN_ALPHA, out.depth, 0.0)
         losses = []
         for k, (view, partners) in enumerate(window.batch):

@@ -15,11 +15,13 @@ from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.mixed_scenes import find_mixed
 from geogs_bench.data.posed_scenes import find_any_posed, find_objects, find_posed_rooms
 from geogs_bench.data.replica_scenes import find_relighted, find_replica, find_rooms
-from geogs_bench.data.scannet_scenes import find_scannet
-from geogs_bench.data.scannetpp_scenes import find_scannetpp
-from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
+from geogs_bench.data.sequence_scenes import (
+    find_scannet,
+    find_scannetpp,
+    find_seven_scenes,
+    find_tum,
+)
 from geogs_bench.data.true_poses import read_true_poses
-from geogs_bench.data.tum_scenes import find_tum
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
 from io_samples import write_images
 from posed_layouts import write_colmap_text, write_dtu, write_scannet

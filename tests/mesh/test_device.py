@@ -7,15 +7,13 @@ import torch
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.mesh import clean, face_kernels
+from geogs.mesh.clean import border_edges, cleaned, components_on_host, vertex_components
 from geogs.mesh.decimation.deviation import deviations
 from geogs.mesh.decimation.deviation_kernels import triangle_distance
 from geogs.mesh.decimation.device_deviation import surface_distances, triangle_distances
 from geogs.mesh.device import surface
-from geogs.mesh.device.clean import border_edges, device_cleaned, vertex_components
 from geogs.mesh.device.surface import device_surface
-from geogs.mesh.device.tensor_mesh import TensorMesh
-from geogs.mesh.triangle_mesh import Mesh
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.volume.free_space import SeenFree
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import SparseTsdf
@@ -61,12 +59,12 @@ def triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return turned[np.lexsort(turned.reshape(len(turned), 9).round(5).T)]
 
 
-def assert_same_surface(made: TensorMesh, expected: Mesh) -> None:
+def assert_same_surface(made: TensorMesh, expected: TensorMesh) -> None:
     assert len(made.vertices) == len(expected.vertices)
     assert len(made.faces) == len(expected.faces) > 1000
     np.testing.assert_allclose(
         triangles(made.vertices.cpu().numpy(), made.faces.cpu().numpy()),
-        triangles(expected.vertices, expected.faces),
+        triangles(expected.vertices.numpy(), expected.faces.numpy()),
         atol=1e-6,
     )
 
@@ -85,14 +83,13 @@ def test_the_surface_is_that_of_the_host(device, batch, monkeypatch):
 def test_it_is_cleaned_as_on_the_host(device, most):
     config, tsdf = MeshConfig(min_component_faces=8, max_components=most), volume(device)
     expected = extract_surface(host(tsdf), 1.5)
-    before, expected = expected, clean.cleaned(expected, config, SeenFree(host(tsdf), 1.5))
+    before = expected
+    expected, up = cleaned(expected, config, SeenFree(host(tsdf), 1.5))
     assert len(expected.faces) != len(before.faces)
-    made, normals = device_cleaned(device_surface(tsdf, 1.5), config, SeenFree(tsdf, 1.5))
+    made, normals = cleaned(device_surface(tsdf, 1.5), config, SeenFree(tsdf, 1.5))
     assert_same_surface(made, expected)
-    order, other = (
-        np.lexsort(v.round(5).T) for v in (made.vertices.cpu().numpy(), expected.vertices)
-    )
-    np.testing.assert_allclose(normals.cpu().numpy()[order], expected.normals[other], atol=1e-4)
+    order, other = (np.lexsort(v.vertices.cpu().numpy().round(5).T) for v in (made, expected))
+    np.testing.assert_allclose(normals.cpu().numpy()[order], up.numpy()[other], atol=1e-4)
 
 
 def test_without_a_surface_the_error_is_that_of_the_host():
@@ -101,7 +98,7 @@ def test_without_a_surface_the_error_is_that_of_the_host():
         with pytest.raises(
             InputError, match=f"No surface was seen with a total weight of {weight:g}"
         ):
-            device_cleaned(found, config, SeenFree(tsdf, weight))
+            cleaned(found, config, SeenFree(tsdf, weight))
 
 
 @pytest.mark.parametrize("count", [1, 30, 300, 2000])
@@ -109,13 +106,17 @@ def test_borders_and_components_of_any_faces(count):
     random = np.random.default_rng(count)
     faces = random.integers(0, 400, (count, 3)).astype(np.int32)
     mesh = TensorMesh(torch.zeros(400, 3), torch.from_numpy(faces).long())
-    expected = {tuple(edge) for edge in face_kernels.border_edges(faces, 400).tolist()}
-    assert {tuple(edge) for edge in border_edges(mesh).tolist()} == expected
+    edges = {(f[k], f[(k + 1) % 3]) for f in faces.tolist() for k in range(3)}
+    expected = {(a, b) for a, b in edges if (b, a) not in edges}
+    found = [tuple(edge) for edge in border_edges(mesh).tolist()]
+    assert sorted(found) == sorted(expected)
     label = np.arange(400)
     for _ in range(400):
         for face in faces:
             label[face] = label[face].min()
     assert vertex_components(mesh).tolist() == label.tolist()
+    part = np.unique(label, return_inverse=True)[1]
+    assert components_on_host(mesh).tolist() == part.tolist()
 
 
 @DEVICES

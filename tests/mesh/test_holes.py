@@ -7,10 +7,10 @@ import torch
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mesh import clean
-from geogs.mesh.clean import keep_faces
+from geogs.mesh.clean import border_edges, keep_faces, with_closed_holes
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.face_kernels import border_edges
-from geogs.mesh.holes import border_loops, close_holes
+from geogs.mesh.holes import IsFree, border_loops
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.free_space import FreeSpace, SeenFree
 from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
@@ -35,6 +35,12 @@ def sheet(*holes: tuple[int, int, int]) -> Mesh:
     return keep_faces(mesh, np.repeat(keep.ravel(), 2))
 
 
+def close_holes(mesh: Mesh, most_edges: int, is_free: IsFree) -> Mesh:
+    there = TensorMesh.of(mesh.vertices, mesh.faces)
+    made, normals = with_closed_holes(there, most_edges, is_free)
+    return Mesh(made.vertices.numpy(), made.faces.int().numpy(), normals.numpy())
+
+
 def open_edges(mesh: Mesh) -> int:
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     count = np.unique(edges, axis=0, return_counts=True)[1]
@@ -44,7 +50,7 @@ def open_edges(mesh: Mesh) -> int:
 
 def test_loops_go_round_every_border_once():
     mesh = sheet((3, 3, 1), (8, 8, 3), (15, 8, 1))
-    border = border_edges(mesh.faces, len(mesh.vertices))
+    border = border_edges(TensorMesh.of(mesh.vertices, mesh.faces)).numpy()
     loops = list(border_loops(border, 100))
     assert [loop.shape for loop in loops] == [(2, 4), (1, 12), (1, 80)]
     assert len({vertex for loop in loops for vertex in loop.ravel().tolist()}) == 100

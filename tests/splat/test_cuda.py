@@ -9,8 +9,7 @@ from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.splat.cuda import rasterize
-from geogs.splat.cuda.autograd import RasterizeOnGpu
-from geogs.splat.render import NEAR, RenderOutput, render
+from geogs.splat.render import NEAR, Rasterized, RenderOutput, render
 from geogs.world.disks import DiskParameters, GaussianMap
 from splat_scenes import (
     CAMERA,
@@ -136,7 +135,7 @@ def test_views_together_are_views_alone(device: torch.device) -> None:
         rest = out.normal[..., 0] + out.alpha + out.distortion
         return ((out.depth + rest) * w).sum()
 
-    both = RenderOutput(*RasterizeOnGpu.apply(*disks, poses, CAMERA, NEAR))
+    both = RenderOutput(*Rasterized.apply("cuda", CAMERA, NEAR, poses, *disks))
     together = torch.autograd.grad(loss(both, weights), [*leaves, poses])
     views = [render(disks, CAMERA, T, backend="cuda") for T in poses]
     total = sum(loss(v, w) for v, w in zip(views, weights, strict=True))

@@ -106,7 +106,8 @@ def stitched_blocks(blocks: Sequence[MeshBlock], plan: VolumePlan, config: MeshC
         InputError: there is no surface.
     """
     mesh = stitched((part for block in blocks for part in block.parts), plan.voxel)
-    return cleaned(mesh, config, FreeSpace.joined([block.free for block in blocks]))
+    found, normals = cleaned(mesh, config, FreeSpace.joined([block.free for block in blocks]))
+    return Mesh(found.vertices.numpy(), found.faces.to(torch.int32).numpy(), normals.numpy())
 
 
 def near(mesh: Mesh, box: BlockBox, plan: VolumePlan) -> Bool[np.ndarray, "n"]:

@@ -1,11 +1,14 @@
-"""What is removed from an extracted mesh."""
+"""What is removed from an extracted mesh, and which of its holes are closed, on its device."""
 
 import numpy as np
-from jaxtyping import Int
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.holes import IsFree, close_holes
+from geogs.mesh.holes import IsFree, closing_fans
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import Mesh
 
 LEAST_OF_LARGEST = 2e-4
@@ -15,57 +18,31 @@ CLOSED_HOLES = 8
 """Holes with so many edges or fewer are closed, unless somebody looked through them."""
 
 
-def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
-    """Without what is no surface, and with small holes closed where nobody looked through them.
+def cleaned(
+    mesh: TensorMesh, config: MeshConfig, is_free: IsFree
+) -> tuple[TensorMesh, Float[Tensor, "n 3"]]:
+    """Without what is no surface, and with small holes closed where nobody looked through them;
+    the mesh and its normals.
 
     Raises InputError if no surface is left.
     """
-    mesh = remove_degenerate_faces(mesh)
-    mesh = keep_components(
-        mesh, config.min_component_faces, LEAST_OF_LARGEST, config.max_components
-    )
+    mesh = large_components(
+        without_degenerate_faces(mesh), config.min_component_faces, LEAST_OF_LARGEST,
+        config.max_components,
+    )  # fmt: skip
     if not len(mesh.faces):
-        raise no_surface(config)
-    return close_holes(mesh, CLOSED_HOLES, is_free)
-
-
-def no_surface(config: MeshConfig) -> InputError:
-    """The error that no surface is left."""
-    return InputError(
-        f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
-        "or use more views."
-    )
+        raise InputError(
+            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
+            "or use more views."
+        )
+    return with_closed_holes(mesh, CLOSED_HOLES, is_free)
 
 
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:
-    """Without faces that repeat a vertex or whose squared area is below 1e-12 of the
-    squared mean edge length squared, and without the vertices this leaves unused."""
-    from geogs.mesh.face_kernels import face_sizes
-
-    a, b, c = mesh.faces.T
-    area = np.empty(len(mesh.faces))
-    scale = face_sizes(mesh.vertices, np.ascontiguousarray(mesh.faces), area)
-    distinct = (a != b) & (b != c) & (c != a)
-    return keep_faces(mesh, distinct & (area > 1e-12 * scale**2))
-
-
-def keep_components(
-    mesh: Mesh, min_faces: int, min_fraction: float = 0.0, max_components: int | None = None
-) -> Mesh:
-    """Connected parts that are large enough.
-
-    A part stays if it has at least ``min_faces`` faces and at least ``min_fraction`` of the faces
-    of the largest; of those the ``max_components`` largest, all if none is given.
-    """
+    """As :func:`without_degenerate_faces`, with normals and colours."""
     if not len(mesh.faces):
         return mesh
-    label, count = _components(mesh)
-    keep = count >= max(min_faces, min_fraction * count.max())
-    if max_components is not None:
-        rank = np.empty(len(count), int)
-        rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
-        keep &= rank < max_components
-    return keep_faces(mesh, keep[label])
+    return keep_faces(mesh, _have_areas(TensorMesh.of(mesh.vertices, mesh.faces)).numpy())
 
 
 def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
@@ -84,17 +61,100 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
     )
 
 
-def _components(mesh: Mesh) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "c"]]:
-    """Label of each face and number of faces of each label; faces connect by a shared vertex.
+def without_degenerate_faces(mesh: TensorMesh) -> TensorMesh:
+    """Without faces that repeat a vertex or whose squared area is below 1e-12 of the
+    squared mean edge length squared, and without the vertices this leaves unused."""
+    return mesh.kept(_have_areas(mesh)) if len(mesh.faces) else mesh
 
-    A vertex without a face has a label of its own, which no face has.
+
+def _have_areas(mesh: TensorMesh) -> Bool[Tensor, "m"]:
+    a, b, c = mesh.corners()
+    u, v, w = b - a, c - a, c - b
+    area = torch.linalg.cross(u, v).square().sum(-1)
+    scale = sum(edge.square().sum(-1).mean() for edge in (u, v, w)) / 3
+    i, j, k = mesh.faces.unbind(1)
+    return (i != j) & (j != k) & (k != i) & (area > 1e-12 * scale**2)
+
+
+def large_components(
+    mesh: TensorMesh, min_faces: int, min_fraction: float, max_components: int | None
+) -> TensorMesh:
+    """Connected parts that are large enough; faces connect by a shared vertex.
+
+    A part stays if it has at least ``min_faces`` faces and at least ``min_fraction`` of the faces
+    of the largest; of those the ``max_components`` largest, all if none is given.
     """
+    if not len(mesh.faces):
+        return mesh
+    found = components_on_host if mesh.faces.device.type == "cpu" else vertex_components
+    label = found(mesh)[mesh.faces[:, 0]]
+    _, label, count = torch.unique(label, return_inverse=True, return_counts=True)
+    keep = count >= torch.clamp(min_fraction * count.amax().double(), min=min_faces)
+    if max_components is not None:
+        keep[torch.argsort(-count, stable=True)[max_components:]] = False
+    return mesh.kept(keep[label])
+
+
+def vertex_components(mesh: TensorMesh) -> Int[Tensor, "n"]:
+    """The lowest vertex that each is connected with, found on any device.
+
+    All vertices name a lower one, at first themselves. Those named by a face's corners learn the
+    lowest of these, then every vertex names what the one that it names does, until nothing changes.
+    """
+    label = torch.arange(len(mesh.vertices), device=mesh.faces.device)
+    while True:
+        named = label[mesh.faces]
+        lowest = named.amin(1, keepdim=True).expand(-1, 3)
+        new = label.scatter_reduce(0, named.flatten(), lowest.flatten(), "amin")
+        new = new[new[new]]
+        if torch.equal(new, label):
+            return label
+        label = new
+
+
+def components_on_host(mesh: TensorMesh) -> Int[Tensor, "n"]:
+    """The number of the connected part of each vertex, on a CPU."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    n = len(mesh.vertices)
+    faces, n = mesh.faces.numpy(), len(mesh.vertices)
+    a, b = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
-    _, of_vertex = connected_components(links, directed=False)
-    label = of_vertex[mesh.faces[:, 0]]
-    return label, np.bincount(label, minlength=of_vertex.max() + 1)
+    return torch.from_numpy(connected_components(links, directed=False)[1])
+
+
+def border_edges(mesh: TensorMesh) -> Int[Tensor, "e 2"]:
+    """Edges (start, end) of faces that no face has in the other direction, in no order."""
+    start, end = mesh.faces.flatten(), mesh.faces.roll(-1, 1).flatten()
+    low, high = torch.minimum(start, end), torch.maximum(start, end)
+    pair = low * len(mesh.vertices) + high
+    keys = torch.unique(2 * pair + (start > end))[:, None]
+    other = torch.cat([keys[1:], keys[:1]], 0), torch.cat([keys[-1:], keys[:-1]], 0)
+    alone = (torch.cat(other, 1) != (keys ^ 1)).all(1)
+    keys = keys[alone, 0]
+    low, high = (keys // 2) // len(mesh.vertices), (keys // 2) % len(mesh.vertices)
+    edges = torch.stack([low, high], -1)
+    edges = torch.where((keys % 2 == 1)[:, None], edges.flip(1), edges)
+    return edges[low != high]
+
+
+def with_closed_holes(
+    mesh: TensorMesh, most_edges: int, is_free: IsFree
+) -> tuple[TensorMesh, Float[Tensor, "n 3"]]:
+    """The mesh and its normals, holes with ``most_edges`` or fewer edges closed by a fan around
+    their middle.
+
+    A hole stays open where its middle is free, or where the fan would fold over: such an edge is
+    one of the surface, no gap in it.
+    """
+    vertices, normals, device = mesh.vertices, mesh.normals(), mesh.faces.device
+
+    def look(loops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        index = torch.from_numpy(loops).to(device)
+        return vertices[index].cpu().numpy(), normals[index].cpu().numpy()
+
+    border = border_edges(mesh).cpu().numpy()
+    fans = closing_fans(border, len(vertices), look, most_edges, is_free)
+    new = [torch.from_numpy(part).to(device) for part in (fans.vertices, fans.normals, fans.faces)]
+    mesh = TensorMesh(torch.cat([vertices, new[0]]), torch.cat([mesh.faces, new[2]]))
+    return mesh, torch.cat([normals, new[1]])

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from geogs.mesh.device.tensor_mesh import vertex_sums
+from geogs.mesh.tensor_mesh import vertex_sums
 
 ALIKE = 0.2
 """Standard deviation of the length between unit normals (11 degrees) that are of one surface."""

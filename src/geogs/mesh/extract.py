@@ -15,9 +15,8 @@ from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
 from geogs.mesh.decimation.decimate import merged
 from geogs.mesh.denoise import denoised
-from geogs.mesh.device.clean import device_cleaned
 from geogs.mesh.device.surface import device_surface
-from geogs.mesh.device.tensor_mesh import TensorMesh
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.block_count import fitting, fitting_voxel
 from geogs.mesh.volume.free_space import SeenFree
@@ -171,11 +170,12 @@ class _Surface:
 def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
     """The surface in a volume, cleaned. Raises InputError if there is none."""
     is_free = SeenFree(tsdf, config.min_weight)
-    if tsdf.device.type != "cpu":
-        found, normals = device_cleaned(device_surface(tsdf, config.min_weight), config, is_free)
-        return _Surface(found.vertices, found.faces.to(torch.int32), normals)
-    mesh = cleaned(extract_surface(tsdf, config.min_weight), config, is_free)
-    return _Surface(*map(torch.from_numpy, (mesh.vertices, mesh.faces, mesh.normals)))
+    if tsdf.device.type == "cpu":
+        mesh = extract_surface(tsdf, config.min_weight)
+    else:
+        mesh = device_surface(tsdf, config.min_weight)
+    found, normals = cleaned(mesh, config, is_free)
+    return _Surface(found.vertices, found.faces.to(torch.int32), normals)
 
 
 def _merged_mesh(

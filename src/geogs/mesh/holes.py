@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from geogs.mesh.triangle_mesh import Mesh
-
 IsFree = Callable[[Float[np.ndarray, "k 3"]], Bool[np.ndarray, "k"]]
 """Which points lie in space that was seen to be free."""
 Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -24,35 +22,13 @@ class Fans:
     faces: Int[np.ndarray, "m 3"]
 
 
-def close_holes(mesh: Mesh, most_edges: int, is_free: IsFree) -> Mesh:
-    """Close holes with ``most_edges`` or fewer edges by a fan around their middle.
-
-    A hole stays open where its middle is free, or where the fan would fold over: such an edge is
-    one of the surface, no gap in it. Colours are made later.
-    """
-    from geogs.mesh.face_kernels import border_edges
-
-    border = border_edges(np.ascontiguousarray(mesh.faces), len(mesh.vertices))
-
-    def look(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return mesh.vertices[vertices], mesh.normals[vertices]
-
-    fans = closing_fans(border, len(mesh.vertices), look, most_edges, is_free)
-    if not len(fans.faces):
-        return mesh
-    return Mesh(
-        np.concatenate([mesh.vertices, fans.vertices]),
-        np.concatenate([mesh.faces, fans.faces.astype(np.int32)]),
-        np.concatenate([mesh.normals, fans.normals]),
-    )
-
-
 def closing_fans(
     border: Int[np.ndarray, "e 2"], count: int, look: Look, most_edges: int, is_free: IsFree
 ) -> Fans:
-    """The fans of :func:`close_holes`, their vertices numbered from ``count`` on.
+    """Fans around the middles of holes with ``most_edges`` or fewer edges.
 
-    ``border`` are the edges (start, end) that one face has.
+    Their vertices are numbered from ``count`` on; ``border`` are the edges (start, end) that one
+    face has.
     """
     vertices, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
     faces = [np.zeros((0, 3), np.int64)]

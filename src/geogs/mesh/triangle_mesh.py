@@ -13,6 +13,7 @@ from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.creases import creased
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.short_repr import ShortRepr
 
 if TYPE_CHECKING:
@@ -110,11 +111,7 @@ def vertex_normals(
     vertices: Float[np.ndarray, "n 3"], faces: Int32[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Unit normals, the mean of a vertex's faces weighted by area; zero where it has none."""
-    from geogs.mesh.face_kernels import normal_sums
-
-    total = normal_sums(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return (total / np.where(length > 0, length, 1)).astype(np.float32)
+    return TensorMesh.of(vertices, faces).normals().numpy()
 
 
 def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

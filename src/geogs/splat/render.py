@@ -1,7 +1,8 @@
 """Rendering the map: one contract, several backends."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +11,6 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.splat.reference import render_reference
-from geogs.threads import worker_count
 from geogs.types import MapSnapshot
 from geogs.world.disks import DiskParameters, GaussianMap
 
@@ -73,11 +73,7 @@ def render(
     T_cw, backend = torch.as_tensor(T_cw), chosen_backend(parameters, backend)
     if backend == "reference":
         return RenderOutput(*render_reference(parameters, camera, T_cw, near))
-    if backend == "cuda":
-        from geogs.splat.cuda.autograd import RasterizeOnGpu
-
-        return RenderOutput(*RasterizeOnGpu.apply(*parameters, T_cw, camera, near))
-    return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, worker_count()))
+    return RenderOutput(*Rasterized.apply(backend, camera, near, T_cw, *parameters))
 
 
 def parameters_of(disks: GaussianMap | DiskParameters | MapSnapshot) -> DiskParameters:
@@ -100,40 +96,42 @@ def chosen_backend(disks: DiskParameters, backend: Backend) -> Literal["referenc
     return backend
 
 
-class _Rasterize(torch.autograd.Function):
-    """The cpu backend."""
+def passes_of(backend: Literal["cpu", "cuda"]) -> Callable[..., Any]:
+    """The compiled ``rendered`` of a backend."""
+    if backend == "cuda":
+        from geogs.splat.cuda import passes as on_gpu
+
+        return on_gpu.rendered
+    from geogs.splat.cpu import passes as on_cpu
+
+    return on_cpu.rendered
+
+
+class Rasterized(torch.autograd.Function):
+    """A compiled backend; on a GPU of one pose (4, 4), or of several (b, 4, 4)."""
 
     @staticmethod
     def forward(
         ctx: Any,
-        position: Tensor,
-        quaternion: Tensor,
-        log_scale: Tensor,
-        opacity_logit: Tensor,
-        T_cw: Tensor,
+        backend: Literal["cpu", "cuda"],
         camera: Camera,
         near: float,
-        threads: int,
+        T_cw: Tensor,
+        *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
-        from geogs.splat.cpu.passes import forward_pass
-
-        disks = DiskParameters(position, quaternion, log_scale, opacity_logit)
-        with_trace = any(ctx.needs_input_grad)
-        maps, trace = forward_pass(disks, camera, T_cw, near, threads, with_trace)
-        tensors = tuple(torch.from_numpy(getattr(maps, f)) for f in maps.__slots__)
+        disks, with_trace = DiskParameters(*parameters), any(ctx.needs_input_grad)
+        maps, back = passes_of(backend)(disks, camera, T_cw, near, with_trace)
         if with_trace:
             # Saved, so that PyTorch notices if they are changed before the backward pass.
-            ctx.save_for_backward(*disks, T_cw)
-            ctx.trace, ctx.threads = trace, threads
-            ctx.set_materialize_grads(True)
-        ctx.mark_non_differentiable(*tensors[4:])
-        return tensors
+            ctx.save_for_backward(*parameters, T_cw)
+            ctx.back = back
+            ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(*maps[4:])
+        return cast(tuple[Tensor, ...], maps)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        from geogs.splat.cpu.passes import backward_pass
-
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *_, T_cw = ctx.saved_tensors
-        disks, d_T = backward_pass(ctx.trace, gradients[:4], ctx.threads)
-        return *disks, d_T.to(T_cw), None, None, None
+        d_disks, d_T = ctx.back(gradients[:4], ctx.needs_input_grad[3])
+        return None, None, None, None if d_T is None else d_T.view(T_cw.shape).to(T_cw), *d_disks

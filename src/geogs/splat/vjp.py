@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
@@ -10,8 +12,14 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
 from geogs.splat.reference import render_reference
-from geogs.splat.render import NEAR, Backend, RenderOutput, chosen_backend, parameters_of
-from geogs.threads import worker_count
+from geogs.splat.render import (
+    NEAR,
+    Backend,
+    RenderOutput,
+    chosen_backend,
+    parameters_of,
+    passes_of,
+)
 from geogs.types import MapSnapshot
 from geogs.world.disks import DiskParameters, GaussianMap
 
@@ -87,7 +95,7 @@ def render_vjp(
     """
     parameters = DiskParameters(*(p.detach() for p in parameters_of(disks)))
     pose, backend = torch.as_tensor(T_cw).detach(), chosen_backend(parameters, backend)
-    run = {"reference": _by_autograd, "cpu": _on_cpu, "cuda": _on_gpu}[backend]
+    run = _by_autograd if backend == "reference" else partial(_compiled, passes_of(backend))
     output, backward = run(parameters, camera, pose, near)
     return output, PullBack(backward, (camera.height, camera.width))
 
@@ -95,39 +103,18 @@ def render_vjp(
 _Rendered = tuple[RenderOutput, Callable[[_Gradients], RenderGradients]]
 
 
-def _on_gpu(disks: DiskParameters, camera: Camera, T_cw: Tensor, near: float) -> _Rendered:
-    from geogs.splat.cuda.passes import backward_pass, forward_pass
-
-    maps, trace = forward_pass(disks, camera, T_cw, near)
-    device, normal = disks.position.device, maps.normal.movedim(-3, -1)
-    output = RenderOutput(
-        maps.depth, normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible
-    )
+def _compiled(
+    rendered: Callable[..., Any], disks: DiskParameters, camera: Camera, T_cw: Tensor, near: float
+) -> _Rendered:
+    maps, back = rendered(disks, camera, T_cw, near)
+    device = disks.position.device
 
     def backward(gradients: _Gradients) -> RenderGradients:
-        there = tuple(None if g is None else g.detach().to(device) for g in gradients)
-        d_disks, d_poses = backward_pass(trace, there, with_poses=True)
-        assert d_poses is not None
-        return RenderGradients(d_disks, d_poses[0])
+        there = [None if g is None else g.detach().to(device) for g in gradients]
+        d_disks, d_T = back(there, True)
+        return RenderGradients(d_disks, d_T.view(4, 4))
 
-    return output, backward
-
-
-def _on_cpu(disks: DiskParameters, camera: Camera, T_cw: Tensor, near: float) -> _Rendered:
-    from geogs.splat.cpu.passes import backward_pass, forward_pass
-
-    threads = worker_count()
-    maps, trace = forward_pass(disks, camera, T_cw, near, threads)
-    output = RenderOutput(*(torch.from_numpy(getattr(maps, f)) for f in maps.__slots__))
-
-    def backward(gradients: _Gradients) -> RenderGradients:
-        whole = tuple(
-            torch.zeros_like(m) if g is None else g.detach().to("cpu")
-            for g, m in zip(gradients, _differentiable(output), strict=True)
-        )
-        return RenderGradients(*backward_pass(trace, whole, threads))
-
-    return output, backward
+    return RenderOutput(*maps), backward
 
 
 def _by_autograd(disks: DiskParameters, camera: Camera, T_cw: Tensor, near: float) -> _Rendered:

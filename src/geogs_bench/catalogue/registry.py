@@ -10,10 +10,12 @@ from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.motion_cells import FULL, SMALL, find_motions
 from geogs_bench.data.posed_scenes import find_objects, find_posed_rooms
 from geogs_bench.data.replica_scenes import find_replica, find_rooms
-from geogs_bench.data.scannet_scenes import find_scannet
-from geogs_bench.data.scannetpp_scenes import find_scannetpp
-from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
-from geogs_bench.data.tum_scenes import find_tum
+from geogs_bench.data.sequence_scenes import (
+    find_scannet,
+    find_scannetpp,
+    find_seven_scenes,
+    find_tum,
+)
 from geogs_bench.tables.columns import (
     COST,
     area_layout,

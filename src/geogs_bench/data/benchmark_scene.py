@@ -23,6 +23,15 @@ class Option:
         return [f"--{self.name}", self.value] if self.value else [f"--{self.name}"]
 
 
+def same_surface(long_edge: str, voxel: str) -> tuple[Option, ...]:
+    """What every method gets: images of one size, and the same surface from its depths."""
+    return (
+        Option("input.long-edge", long_edge),
+        Option("mesh.voxel", voxel),
+        Option("mesh.truncation", "5"),
+    )
+
+
 @dataclass(frozen=True)
 class DtuTruth:
     """The official files that DTU's protocol needs for a scan."""

@@ -8,7 +8,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.motion_cells import Cell
 from geogs_bench.data.replica_scenes import find_replica
 from geogs_bench.data.scene_folders import folders_like
-from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
+from geogs_bench.data.sequence_scenes import find_seven_scenes
 from geogs_synth.camera.flaws import Flaws
 
 CELLS: tuple[Cell, ...] = (

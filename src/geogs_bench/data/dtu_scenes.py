@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from geogs.io.sources.formats.dtu import is_dtu
-from geogs_bench.data.benchmark_scene import BenchmarkScene, DtuTruth, Option, Truth
+from geogs_bench.data.benchmark_scene import BenchmarkScene, DtuTruth, Option, Truth, same_surface
 from geogs_bench.data.scene_folders import folders_like
 
 _OFFICIAL = (
@@ -16,13 +16,9 @@ _OFFICIAL = (
 )  # fmt: skip
 
 _HELD_OUT = 8
-# What every method gets: half the size of the images, and the same surface from its depths (mm).
-_SAME = (
-    Option("input.long-edge", "800"),
-    Option("mesh.voxel", "1"),
-    Option("mesh.truncation", "5"),
-)
 """Every so many-th image."""
+_SAME = same_surface("800", "1")
+"""Half the size of the images; millimetres."""
 
 
 def find_dtu(root: Path) -> list[BenchmarkScene]:

@@ -7,7 +7,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene
 from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.posed_scenes import find_objects
 from geogs_bench.data.replica_scenes import find_rooms
-from geogs_bench.data.seven_scenes_rooms import find_seven_scenes
+from geogs_bench.data.sequence_scenes import find_seven_scenes
 
 
 def find_mixed(root: Path) -> list[BenchmarkScene]:

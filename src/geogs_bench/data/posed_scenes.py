@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from geogs.io.sources.formats.replica import open_replica
-from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
+from geogs_bench.data.benchmark_scene import BenchmarkScene, Option, same_surface
 from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.replica_scenes import find_rooms
 
@@ -20,7 +20,7 @@ def find_objects(root: Path) -> list[BenchmarkScene]:
     folders = (folder for folder in (root, root / "objects") if folder.is_dir())
     found = ([s for s in find_rooms(folder) if _has_masks(s)] for folder in folders)
     objects = next((scenes for scenes in found if scenes), [])
-    same = _same("800", "0.001")
+    same = same_surface("800", "0.001")
     return [replace(s, kind="object", options=(*s.options, *same)) for s in objects]
 
 
@@ -42,12 +42,4 @@ def _has_masks(scene: BenchmarkScene) -> bool:
 def _thinned(scene: BenchmarkScene) -> BenchmarkScene:
     count = len(open_replica(scene.source).files)
     stride = Option("input.stride", str(max(1, round(count / _IMAGES))))
-    return replace(scene, options=(*scene.options, *_same("600", "0.01"), stride))
-
-
-def _same(long_edge: str, voxel: str) -> tuple[Option, ...]:
-    return (
-        Option("input.long-edge", long_edge),
-        Option("mesh.voxel", voxel),
-        Option("mesh.truncation", "5"),
-    )
+    return replace(scene, options=(*scene.options, *same_surface("600", "0.01"), stride))

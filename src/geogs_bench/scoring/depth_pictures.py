@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from geogs.evaluation.pages.run_pictures import depth_colours
 from geogs.io.writers.atomic import atomic_file
 from geogs_bench.results.record import Place
 from geogs_bench.scoring.depth_scores import JudgedView
@@ -60,10 +61,7 @@ def _depth_colours(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Inverse depth from far (blue) to near (red); black where there is none."""
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
-    level = np.clip((inverse - ends[0]) / max(ends[1] - ends[0], 1e-9), 0, 1)
-    mapped = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO)
-    there = (depth > 0) & np.isfinite(depth)
-    return np.where(there[..., None], cv2.cvtColor(mapped, cv2.COLOR_BGR2RGB), np.uint8(0))
+    return depth_colours(inverse, float(ends[0]), float(ends[1]), background=0)
 
 
 def error_colours(

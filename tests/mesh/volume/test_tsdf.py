@@ -11,8 +11,9 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.mesh import clean
-from geogs.mesh.clean import keep_components, remove_degenerate_faces
+from geogs.mesh.clean import large_components, remove_degenerate_faces
 from geogs.mesh.extract import extract_mesh, plan_volume
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume import level_set
 from geogs.mesh.volume.level_set import extract_surface
@@ -147,6 +148,11 @@ def test_sphere_is_accurate_closed_and_faces_outwards():
     assert area == pytest.approx(4 * math.pi * RADIUS**2, rel=0.01)
 
 
+def extracted(tsdf: SparseTsdf, min_weight: float) -> Mesh:
+    found = extract_surface(tsdf, min_weight)
+    return Mesh.from_triangles(found.vertices.numpy(), found.faces.numpy())
+
+
 def test_box_from_inside_spans_chunks_without_seams(monkeypatch):
     half, voxel = torch.tensor([1.3, 1.1, 0.9]).double(), 0.015  # two chunks and more per axis
     views = box_views(half)
@@ -154,7 +160,7 @@ def test_box_from_inside_spans_chunks_without_seams(monkeypatch):
     for v in views:
         tsdf.integrate(v.depth, v.weight, v.camera, v.T_cw)
     assert (tsdf.coordinates.amax(0) - tsdf.coordinates.amin(0)).min() > 14
-    mesh = extract_surface(tsdf, min_weight=1.0)
+    mesh = extracted(tsdf, min_weight=1.0)
     distance = np.abs(np.abs(mesh.vertices) - half.numpy()).min(1)
     assert distance.mean() < voxel / 20
     assert np.quantile(distance, 0.99) < voxel / 3
@@ -162,7 +168,7 @@ def test_box_from_inside_spans_chunks_without_seams(monkeypatch):
     assert (inwards > 0).mean() > 0.9999  # no back faces
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
     monkeypatch.setattr(level_set, "CHUNK", 64)  # all in one piece, of course without seams
-    whole = extract_surface(tsdf, min_weight=1.0)
+    whole = extracted(tsdf, min_weight=1.0)
     assert np.array_equal(by_position(mesh), by_position(whole))
 
 
@@ -174,7 +180,7 @@ def test_pixel_planes_are_exact_on_a_slanted_wall():
     depth = torch.where((depth > 0) & (depth < 4), depth, 0.0).float()
     tsdf = SparseTsdf(0.02)
     tsdf.integrate(depth, torch.ones_like(depth), CAMERA, torch.eye(4, dtype=torch.float64))
-    mesh = extract_surface(tsdf, 1.0)
+    mesh = extracted(tsdf, 1.0)
     distance = np.abs(mesh.vertices @ normal.numpy() + 1.0)
     assert np.quantile(distance, 0.95) < 0.0002
     assert len(mesh.faces) > 5000
@@ -186,7 +192,7 @@ def test_depth_step_does_not_bleed():
     depth[:, 80:] = 1.0
     tsdf = SparseTsdf(0.02)
     tsdf.integrate(depth, torch.ones_like(depth), CAMERA, torch.eye(4, dtype=torch.float64))
-    z = extract_surface(tsdf, 1.0).vertices[:, 2]
+    z = extracted(tsdf, 1.0).vertices[:, 2]
     assert ((np.abs(z - 1) < 0.09) | (np.abs(z - 2) < 0.001)).all()
     assert (np.abs(z - 1) < 1e-3).sum() > 1000
 
@@ -212,13 +218,13 @@ def test_weights_average_and_bad_pixels_are_left_out():
     tsdf = SparseTsdf(0.02)
     tsdf.integrate(near, torch.full_like(near, 3.0), CAMERA, eye)
     tsdf.integrate(far, torch.full_like(far, 1.0), CAMERA, eye)
-    mesh = extract_surface(tsdf, 4.0)
+    mesh = extracted(tsdf, 4.0)
     middle = mesh.vertices[np.abs(mesh.vertices[:, :2]).max(1) < 0.2]
     assert np.abs(middle[:, 2] - 1.0075).max() < 1e-3
     assert mesh.vertices[:, 1].min() > (10 - 1 - CAMERA.cy) / CAMERA.fy
     assert torch.isfinite(tsdf.distance).all()
     assert torch.isfinite(tsdf.weight).all()
-    assert len(extract_surface(tsdf, 4.1).faces) == 0
+    assert len(extracted(tsdf, 4.1).faces) == 0
 
 
 def test_stray_points_far_away_do_no_harm():
@@ -226,7 +232,7 @@ def test_stray_points_far_away_do_no_harm():
     depth[:2] = 1e9
     tsdf = SparseTsdf(0.02)
     tsdf.integrate(depth, torch.ones_like(depth), CAMERA, torch.eye(4, dtype=torch.float64))
-    mesh = extract_surface(tsdf, 1.0)
+    mesh = extracted(tsdf, 1.0)
     assert np.abs(mesh.vertices[:, 2] - 1).max() < 0.1
     assert len(mesh.faces) > 1000
 
@@ -312,10 +318,11 @@ def test_clean_removes_degenerate_faces_and_small_parts():
     mesh = remove_degenerate_faces(two_parts())
     assert len(mesh.faces) == 7
     assert len(mesh.vertices) == 10  # vertex 10 is unused now
-    assert len(keep_components(mesh, 1).faces) == 7
-    largest = keep_components(mesh, 2)
+    parts = TensorMesh.of(mesh.vertices, mesh.faces)
+    assert len(large_components(parts, 1, 0.0, None).faces) == 7
+    largest = large_components(parts, 2, 0.0, None)
     assert len(largest.faces) == 6
-    assert np.abs(largest.vertices).max() <= 1
-    assert len(keep_components(mesh, 1, min_fraction=0.5).faces) == 6
-    assert len(keep_components(mesh, 1, max_components=1).faces) == 6
-    assert np.allclose(largest.normals, [0, 0, 1])
+    assert largest.vertices.abs().max() <= 1
+    assert len(large_components(parts, 1, 0.5, None).faces) == 6
+    assert len(large_components(parts, 1, 0.0, 1).faces) == 6
+    assert np.allclose(largest.normals(), [0, 0, 1])

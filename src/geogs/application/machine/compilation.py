@@ -20,7 +20,7 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-OF_SEARCH, OF_MAP, KERNELS = 18, 39, 56
+OF_SEARCH, OF_MAP, KERNELS = 18, 39, 53
 """How many a rehearsal compiles, those counted that are called from Python: first what depths are
 searched by, up to what a map needs, up to a mesh."""
 PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}

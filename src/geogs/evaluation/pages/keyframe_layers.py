@@ -3,9 +3,9 @@
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
-from geogs.evaluation.pages.run_pictures import normal_colours
+from geogs.evaluation.pages.run_pictures import depth_colours, normal_colours
 from geogs.types import RenderedKeyframe
 
 Layer = Literal["image", "depth", "normal", "confidence"]
@@ -24,25 +24,13 @@ def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray,
                 return np.zeros((*keyframe.depth.shape, 3), np.uint8)
             return keyframe.image
         case "depth":
-            return depth_picture(keyframe.depth.cpu().numpy())
+            depth = keyframe.depth.cpu().numpy()
+            known = depth[np.isfinite(depth) & (depth > 0)]
+            low, high = np.quantile(known, [0.01, 0.99]) if len(known) else (0.0, 1.0)
+            return depth_colours(depth, float(low), float(high), background=0)
         case "normal":
             return normal_colours(keyframe.normal.cpu().numpy(), background=0)
         case "confidence":
             weight = keyframe.weight.cpu().numpy()
-            return _bytes(np.repeat(weight[..., None], 3, -1))
-
-
-def depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Depth in colours; black where it is 0 or not finite."""
-    from matplotlib import colormaps
-
-    known = np.isfinite(depth) & (depth > 0)
-    if not known.any():
-        return np.zeros((*depth.shape, 3), np.uint8)
-    low, high = np.quantile(depth[known], [0.01, 0.99])
-    fraction = (np.where(known, depth, low) - low) / max(high - low, 1e-12)
-    return _bytes(np.where(known[..., None], colormaps["turbo"](fraction.clip(0, 1))[..., :3], 0))
-
-
-def _bytes(values: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    return (255 * values.clip(0, 1)).round().astype(np.uint8)
+            grey = (255 * weight.clip(0, 1)).round().astype(np.uint8)
+            return np.repeat(grey[..., None], 3, -1)

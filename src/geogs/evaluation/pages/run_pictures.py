@@ -109,14 +109,14 @@ def draw_keyframes(
 
 
 def depth_colours(
-    depth: Float[np.ndarray, "h w"], low: float, high: float
+    depth: Float[np.ndarray, "h w"], low: float, high: float, background: int = 255
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Depth from blue, near, to red, far; white where there is none."""
+    """Depth from blue, near, to red, far; white or black where there is none."""
     is_known = np.isfinite(depth) & (depth > 0)
     fraction = (np.where(is_known, depth, low) - low) / max(high - low, 1e-12)
     levels = (255 * fraction.clip(0, 1)).round().astype(np.uint8)
     colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]
-    return np.where(is_known[..., None], colours, np.uint8(255))
+    return np.where(is_known[..., None], colours, np.uint8(background))
 
 
 def normal_colours(

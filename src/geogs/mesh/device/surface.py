@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from geogs.mesh.device.tensor_mesh import TensorMesh
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.volume.level_set import least_weight, off_zero
 from geogs.mesh.volume.marching import CORNERS, EDGES, triangle_counts, triangle_table
 from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.mesh.triangle_mesh import Mesh
+from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.volume.marching import march
 from geogs.mesh.volume.tsdf import BLOCK, LIMIT, SparseTsdf
 from geogs.threads import ordered_map, worker_count
@@ -31,7 +31,7 @@ class SurfacePart:
     faces: Int[np.ndarray, "m 3"]
 
 
-def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
+def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> TensorMesh:
     """Triangles of the zero level, in the world frame of ``tsdf``.
 
     Only cells whose eight voxels have at least ``min_weight`` give triangles: the far side of the
@@ -61,17 +61,17 @@ def _part(chunk: "_VoxelChunk") -> SurfacePart:
     return SurfacePart(chunk.chunk, keys, vertices + chunk.origin, triangles)
 
 
-def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
+def stitched(parts: Iterable[SurfacePart], voxel: float) -> TensorMesh:
     """One mesh of the parts, which may come in any order and from several volumes."""
     ordered = sorted(parts, key=lambda part: part.chunk)
     if not ordered:
-        return Mesh.from_triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+        return TensorMesh.of(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
     keys = np.concatenate([part.keys for part in ordered])
     offsets = np.cumsum([0, *(len(part.keys) for part in ordered)])
     faces = np.concatenate([p.faces + n for p, n in zip(ordered, offsets[:-1], strict=True)])
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     vertices = np.concatenate([part.position for part in ordered])[first] * voxel
-    return Mesh.from_triangles(vertices.astype(np.float32), inverse[faces].astype(np.int32))
+    return TensorMesh.of(vertices.astype(np.float32), inverse[faces])
 
 
 @dataclass(frozen=True)

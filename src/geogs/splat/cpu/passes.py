@@ -1,38 +1,48 @@
 """The two passes of the renderer on a CPU, on tensors, without autograd."""
 
+from collections.abc import Callable, Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.splat.cpu.rasterize import Maps, Trace, rasterize_backward, rasterize_forward
+from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
+from geogs.threads import worker_count
 from geogs.world.disks import DiskParameters
 
+WayBack = Callable[[Sequence[Tensor | None], bool], tuple[DiskParameters, Tensor | None]]
 
-def forward_pass(
+
+def rendered(
     disks: DiskParameters,
     camera: Camera,
     T_cw: Float[Tensor, "4 4"],
     near: float,
-    threads: int,
     with_trace: bool = True,
-) -> tuple[Maps, Trace]:
-    """Maps of one pose. Without trace a backward pass is not possible."""
-    x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
-    pose = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy()
-    return rasterize_forward((x, q, scale, logit), camera, pose, near, threads, with_trace)
+) -> tuple[tuple[Tensor, ...], WayBack]:
+    """Maps of one pose, as a ``RenderOutput`` has them, and what takes their gradients back.
 
-
-def backward_pass(
-    trace: Trace, gradients: tuple[Tensor, ...], threads: int
-) -> tuple[DiskParameters, Float[Tensor, "4 4"]]:
-    """Gradients of the disks and, float64, of the pose. May be asked for again.
-
-    ``gradients`` are those of depth, normal, alpha and distortion.
+    That gives the gradients of the disks and, float64, of the pose; it takes those of depth,
+    normal, alpha and distortion, None for zero. It may be asked again, but not without trace.
     """
-    depth, normal, alpha, distortion = (g.to(torch.float32).contiguous().numpy() for g in gradients)
-    found = rasterize_backward(trace, depth, normal, alpha, distortion, threads)
-    d_T = torch.zeros(4, 4, dtype=torch.float64)
-    d_T[:3] = torch.from_numpy(found.T_cw)
-    disks = (found.position, found.quaternion, found.log_scale, found.opacity_logit)
-    return DiskParameters(*map(torch.from_numpy, disks)), d_T
+    x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
+    pose, threads = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy(), worker_count()
+    maps, trace = rasterize_forward((x, q, scale, logit), camera, pose, near, threads, with_trace)
+    shown = tuple(torch.from_numpy(getattr(maps, name)) for name in maps.__slots__)
+    shapes = [m.shape for m in shown[:4]]  # not the maps, which belong to the graph
+
+    def back(
+        gradients: Sequence[Tensor | None], with_pose: bool
+    ) -> tuple[DiskParameters, Float[Tensor, "4 4"]]:
+        depth, normal, alpha, distortion = (
+            (torch.zeros(shape) if g is None else g).to(torch.float32).contiguous().numpy()
+            for g, shape in zip(gradients, shapes, strict=True)
+        )
+        found = rasterize_backward(trace, depth, normal, alpha, distortion, threads)
+        d_T = torch.zeros(4, 4, dtype=torch.float64)
+        d_T[:3] = torch.from_numpy(found.T_cw)
+        d_disks = (found.position, found.quaternion, found.log_scale, found.opacity_logit)
+        return DiskParameters(*map(torch.from_numpy, d_disks)), d_T
+
+    return shown, back

@@ -2,6 +2,7 @@
 
 import functools
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,6 +13,8 @@ from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import to_device
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
 from geogs.world.disks import DiskParameters
+
+WayBack = Callable[[Sequence[Tensor | None], bool], tuple[DiskParameters, Tensor | None]]
 
 _KEPT = 4
 """Rasterizers at rest; those used longest ago are dropped."""
@@ -72,27 +75,19 @@ def _pool() -> RasterizerPool:
     return RasterizerPool()
 
 
-@dataclass(frozen=True, slots=True)
-class Trace:
-    """What a forward pass leaves for backward passes; its rasterizer serves no other meanwhile."""
-
-    disks: DiskParameters
-    views: Views
-    loan: Loan
-    shape: tuple[int, ...]
-    """That of the maps: of the poses, then height and width."""
-
-
-def forward_pass(
+def rendered(
     disks: DiskParameters,
     camera: Camera,
     T_cw: Float[Tensor, "*b 4 4"],
     near: float,
     with_trace: bool = True,
-) -> tuple[Maps, Trace]:
-    """Maps of one pose or of several, on the GPU that holds the disks.
+) -> tuple[tuple[Tensor, ...], WayBack]:
+    """Maps of one pose or of several, as a ``RenderOutput`` has them, on the GPU that holds the
+    disks, and what takes their gradients back.
 
-    Without trace a backward pass is not possible.
+    That gives the gradients of the disks and, float64 on their device, of the poses; it takes those
+    of depth, normal (components last), alpha and distortion, None for zero, but not all of them. It
+    may be asked again, but not without trace; until it is gone its rasterizer serves no other.
 
     The compositing is launched on the guess that the list entries fit where the last ones did, and
     once more if they do not: that is known as soon as the projection is done, while the GPU goes
@@ -109,25 +104,23 @@ def forward_pass(
     if not rasterizer.has_room():
         rasterizer.project(disks, views, maps)
         rasterizer.blend(views, maps, with_trace)
-    return maps, Trace(disks, views, loan, (*T_cw.shape[:-2], camera.height, camera.width))
+    shape = (*T_cw.shape[:-2], camera.height, camera.width)
+
+    def back(
+        gradients: Sequence[Tensor | None], with_pose: bool
+    ) -> tuple[DiskParameters, Float[Tensor, "b 4 4"] | None]:
+        d_disks = DiskParameters(*(torch.empty_like(p) for p in disks))
+        d_poses = torch.empty_like(views.poses) if with_pose else None
+        given = _map_gradients(gradients, shape)
+        loan.rasterizer.backward(disks, views, given, d_disks, d_poses)
+        return d_disks, d_poses
+
+    normal = maps.normal.movedim(-3, -1)
+    shown = maps.depth, normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible
+    return shown, back
 
 
-def backward_pass(
-    trace: Trace, gradients: tuple[Tensor | None, ...], with_poses: bool
-) -> tuple[DiskParameters, Float[Tensor, "b 4 4"] | None]:
-    """Gradients of the disks and, float64 on their device, of the poses.
-
-    ``gradients`` are those of depth, normal (components last), alpha and distortion; None for zero,
-    but not all of them. May be asked for again.
-    """
-    d_disks = DiskParameters(*(torch.empty_like(p) for p in trace.disks))
-    d_poses = torch.empty_like(trace.views.poses) if with_poses else None
-    maps = _map_gradients(gradients, trace.shape)
-    trace.loan.rasterizer.backward(trace.disks, trace.views, maps, d_disks, d_poses)
-    return d_disks, d_poses
-
-
-def _map_gradients(gradients: tuple[Tensor | None, ...], shape: tuple[int, ...]) -> MapGradients:
+def _map_gradients(gradients: Sequence[Tensor | None], shape: tuple[int, ...]) -> MapGradients:
     """Contiguous float32 gradients; zeros for those that are missing."""
     known = next(g for g in gradients if g is not None)
     depth, normal, alpha, distortion = gradients

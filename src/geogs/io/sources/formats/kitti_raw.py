@@ -70,6 +70,8 @@ def open_posed_kitti_raw(place: Place) -> PosedSet:
 
 def _imu_trajectory(oxts: Path) -> Trajectory:
     """Poses of the unit (x forward, y left, z up) from its axes to east, north and up."""
+    from scipy.spatial.transform import Rotation
+
     times = _dates(oxts / "timestamps.txt")
     names = sorted(name for name in file_names(oxts / "data") if name.endswith(".txt"))
     if len(names) != len(times):
@@ -82,18 +84,8 @@ def _imu_trajectory(oxts: Path) -> Trajectory:
     T[:, 1, 3] = scale * np.log(np.tan(np.pi / 4 + latitude / 2))
     T[:, 2, 3] = altitude
     T[:, :3, 3] -= T[:1, :3, 3]  # near the origin, where digits are left
-    T[:, :3, :3] = _turned(rows[:, 3:])
+    T[:, :3, :3] = Rotation.from_euler("xyz", rows[:, 3:]).as_matrix()  # roll, pitch, then yaw
     return matrix_trajectory(oxts, times, T, is_rigid(T))
-
-
-def _turned(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Rotations about x by the roll, then y by the pitch, then z by the yaw, radians."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles).T, np.sin(angles).T
-    return np.stack([
-        np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], 1),
-        np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], 1),
-        np.stack([-sp, cp * sr, cp * cr], 1),
-    ], 1)  # fmt: skip
 
 
 def _six(file: Path) -> Float64[np.ndarray, "6"]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -15,6 +16,14 @@ class TensorMesh:
     """float32, map units."""
     faces: Int[Tensor, "m 3"]
     """int64."""
+
+    @staticmethod
+    def of(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> "TensorMesh":
+        """The mesh of arrays, copied."""
+        return TensorMesh(
+            torch.from_numpy(np.array(vertices, order="C")),
+            torch.from_numpy(np.array(faces, np.int64, order="C")),
+        )
 
     def normals(self) -> Float[Tensor, "n 3"]:
         """Unit normals in float32, the mean of a vertex's faces weighted by area."""
