@@ -16,9 +16,9 @@ from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.row_correction import FIRST_STEP, _readout_gradient, _Search, correct_rows
 from geogs.tracking.frames.pose_filling import row_errors
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
-from geogs.tracking.frames.row_twists import row_twists
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
+from geogs.tracking.row_twists import row_twists
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid

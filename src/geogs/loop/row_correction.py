@@ -15,9 +15,9 @@ from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
-from geogs.tracking.frames.row_twists import EVIDENCE, row_twists
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.row_twists import EVIDENCE, row_twists
 from geogs.tracking.tracker import Tracker
 from geogs.world.edges import PackedEdge, Pair, edge_matches
 

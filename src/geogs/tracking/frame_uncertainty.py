@@ -11,9 +11,9 @@ from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import HUBER, ITERATIONS, observed, row_errors, tracked_on
-from geogs.tracking.frames.row_twists import row_twists
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 from geogs.tracking.locate.pose_deviation import PoseDeviation, left_open
+from geogs.tracking.row_twists import row_twists
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
 from geogs.world.frames import FrameLog

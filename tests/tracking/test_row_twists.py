@@ -6,8 +6,8 @@ import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frames.row_errors import RowErrors, slope_at_zero
-from geogs.tracking.frames.row_twists import EVIDENCE, solved_twist
 from geogs.tracking.locate.pose_deviation import PoseDeviation
+from geogs.tracking.row_twists import EVIDENCE, solved_twist
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA

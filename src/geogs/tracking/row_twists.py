@@ -61,7 +61,8 @@ def row_twists(
     Each is estimated together with a step of the frame's pose, and is known before to be as small
     as two polynomials through the poses around differ (:meth:`RowErrors.twist_doubt`). Depths, and
     the poses of the frames that matches begin in, are taken for right.
-    Source: the twist of a rolling shutter camera as an unknown (Hedborg et al. 2012); Bayes' rule.
+    Source: pose and velocity from one image of a rolling shutter (Ait-Aider et al. 2006), with what
+    is known of the velocity before by Bayes' rule.
 
     Args:
         errors: of rows by the present trajectory, of the readout that is taken for right.
