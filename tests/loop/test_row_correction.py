@@ -14,6 +14,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.row_correction import FIRST_STEP, _readout_gradient, _Search, correct_rows
+from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.frames.pose_filling import row_errors
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -152,6 +153,23 @@ def test_a_knock_between_images_is_told_by_the_rows_of_a_frame(monkeypatch, are_
     missed = RATE * (read @ (moved(frame + read) - course.T)) / (read @ read)
     assert abs(missed[4]) > 0.1
     np.testing.assert_allclose(found.numpy()[3:], missed[3:], atol=0.3 * abs(missed[4]))
+
+
+def test_what_rows_leave_open_is_in_the_deviations_of_frames():
+    tracker = tracker_of_rows(as_read())
+    global_bundle(tracker)
+    graph, log = tracker.map.graph, tracker.segment.frames
+    errors = row_errors(log, tracker.keyframes)
+    assert errors is not None
+    found = row_twists(errors, tracker.keyframes, graph.edges, log, True)
+    by_rows = [found[n].leaves_open for n in range(COUNT)]
+    around, known = keyframe_uncertainty(tracker), frame_uncertainty(tracker)
+    for one in ("position", "rotation"):
+        rows = [getattr(deviation, one) for deviation in by_rows]
+        assert min(rows) > 0
+        np.testing.assert_allclose(getattr(known, one), np.hypot(getattr(around, one), rows))
+    log.rows.clear()
+    np.testing.assert_allclose(frame_uncertainty(tracker).position, around.position)
 
 
 def test_the_gradient_falls_to_zero_at_the_true_readout():
