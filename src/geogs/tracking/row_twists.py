@@ -7,6 +7,7 @@ the time of its row.
 """
 
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -72,9 +73,9 @@ def row_twists(
             say.
     """
     sums: dict[int, Float64[Tensor, "12 13"]] = {}
-    for part in (
-        *_of_keyframes(errors, keyframes, edges, are_corrected),
-        *_of_frames(errors, keyframes, log, are_corrected),
+    for part in chain(  # some edges at a time, as their equations take memory
+        _of_keyframes(errors, keyframes, edges, are_corrected),
+        _of_frames(errors, keyframes, log, are_corrected),
     ):
         for frame, equations in zip(part.frames, _equations(errors, keyframes, part), strict=True):
             sums[frame] = sums.get(frame, 0) + equations
