@@ -10,14 +10,16 @@ from torch import Tensor
 
 from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.row_correction import FIRST_STEP, _readout_gradient, _Search, correct_rows
+from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.frames.pose_filling import row_errors
-from geogs.tracking.frames.row_errors import RowErrors
+from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
+from geogs.tracking.row_twists import row_twists
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid
@@ -120,6 +122,54 @@ def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch
     global_bundle(tracker)
     assert bent[0] > 0.05
     assert error(tracker.keyframes.poses(tracker.keyframes.ids)) < 0.4 * bent[0]
+
+
+@pytest.mark.parametrize("are_corrected", [False, True])
+def test_a_knock_between_images_is_told_by_the_rows_of_a_frame(monkeypatch, are_corrected):
+    even, frame = pose, 4
+
+    def knocked(k: np.ndarray) -> Tensor:
+        xi = np.zeros((len(k), 6))
+        xi[:, 4] = 0.03 * np.clip(k - frame, 0, None) ** 2
+        return se3_exp(torch.from_numpy(xi)) @ even(k)
+
+    monkeypatch.setitem(globals(), "pose", knocked)
+    tracker = tracker_of_rows(as_read())
+    graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.segment.frames
+    graph.measure([(2, frame), (3, frame), (5, frame)], packed=True)
+    errors = row_errors(log, keyframes)
+    assert errors is not None
+    edges = dict(graph.edges)
+    if are_corrected:
+        for part, (shift, _) in edge_shifts(errors, keyframes, graph.edges):
+            edges |= {e: edges[e].moved(CAMERA, s) for e, s in zip(part, shift, strict=True)}
+    found = row_twists(errors, keyframes, edges, log, are_corrected)[frame].twist
+
+    def moved(k: np.ndarray) -> np.ndarray:
+        return se3_log(knocked(k) @ se3_inverse(knocked(np.array([float(frame)])))).numpy()
+
+    around, read = np.arange(-2.0, 3), RATE * READOUT * np.linspace(-0.5, 0.5, 41)
+    course = np.stack([np.polyval(np.polyfit(around, x, 4), read) for x in moved(frame + around).T])
+    missed = RATE * (read @ (moved(frame + read) - course.T)) / (read @ read)
+    assert abs(missed[4]) > 0.1
+    np.testing.assert_allclose(found.numpy()[3:], missed[3:], atol=0.3 * abs(missed[4]))
+
+
+def test_what_rows_leave_open_is_in_the_deviations_of_frames():
+    tracker = tracker_of_rows(as_read())
+    global_bundle(tracker)
+    graph, log = tracker.map.graph, tracker.segment.frames
+    errors = row_errors(log, tracker.keyframes)
+    assert errors is not None
+    found = row_twists(errors, tracker.keyframes, graph.edges, log, True)
+    by_rows = [found[n].leaves_open for n in range(COUNT)]
+    around, known = keyframe_uncertainty(tracker), frame_uncertainty(tracker)
+    for one in ("position", "rotation"):
+        rows = [getattr(deviation, one) for deviation in by_rows]
+        assert min(rows) > 0
+        np.testing.assert_allclose(getattr(known, one), np.hypot(getattr(around, one), rows))
+    log.rows.clear()
+    np.testing.assert_allclose(frame_uncertainty(tracker).position, around.position)
 
 
 def test_the_gradient_falls_to_zero_at_the_true_readout():

@@ -7,16 +7,17 @@ was found in the video, and may be off by some percent, is found once more on th
 where all matches together would become neither better nor worse with another.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
-from geogs.tracking.frames.row_errors import RowErrors, RowShifts, edge_shifts
+from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.row_twists import EVIDENCE, row_twists
 from geogs.tracking.tracker import Tracker
 from geogs.world.edges import PackedEdge, Pair, edge_matches
 
@@ -30,8 +31,6 @@ BETWEEN = 4
 """Steps of an adjustment that another follows, which goes on from there."""
 FIRST_STEP, FARTHEST = 0.04, 0.25
 """Fraction of the readout that is tried first, and by which it changes at most."""
-EVIDENCE = 0.02
-"""Fraction of what matches say of the readout that counts, as those of an edge err together."""
 
 
 def correct_rows(
@@ -64,7 +63,9 @@ def correct_rows(
             if abs(search.factor - before) < SETTLED:
                 last = n
         present = errors.with_readout(search.factor)
-        for part, (shift, _) in _shifts(graph, measured, present):
+        found = row_twists(present, keyframes, measured, log)
+        present = present.with_twists({frame: known.twist for frame, known in found.items()})
+        for part, (shift, _) in edge_shifts(present, keyframes, measured):
             graph.edges.update(
                 {e: measured[e].moved(grid.camera, s) for e, s in zip(part, shift, strict=True)}
             )
@@ -106,7 +107,7 @@ def _readout_gradient(
     """Half the derivative of the cost by the factor on the readout, and of what was known of it."""
     total = (factor - 1) / errors.doubt**2
     grid, keyframes = graph.keyframes.grid, graph.keyframes
-    for part, (shift, slope) in _shifts(graph, measured, errors.with_readout(factor)):
+    for part, (shift, slope) in edge_shifts(errors.with_readout(factor), keyframes, measured):
         T, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
         weight = static_weight(keyframes, part, pixels, weight)
@@ -114,10 +115,3 @@ def _readout_gradient(
         residual, weight = weighed_residuals(p, pixels + shift, weight, options.huber)
         total += EVIDENCE * float((weight * residual * slope).double().sum())
     return total
-
-
-def _shifts(
-    graph: FrameGraph, measured: dict[Pair, PackedEdge], errors: RowErrors
-) -> Iterator[tuple[list[Pair], RowShifts]]:
-    keyframes = graph.keyframes
-    return edge_shifts(errors, keyframes, measured, lambda id: keyframes[id].frame_index)

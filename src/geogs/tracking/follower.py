@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
-from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion
+from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, with_depth
 from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
 from geogs.tracking.matching.flow_chain import MIN_TEXTURE
 from geogs.types import Frame
@@ -79,8 +79,10 @@ class Follower:
         encoded = self._locator.operator.encode(frame.image)
         if self._locator.operator.texture(encoded) < MIN_TEXTURE:
             return None
-        motion = self._locator.locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
-        if motion is None or motion.known < MIN_KNOWN:
+        guess, locator = last.predicted(keyframe, frame.timestamp), self._locator
+        expected = with_depth(locator.locate(keyframe, encoded, guess))
+        motion = locator.best(keyframe, encoded, expected)
+        if motion is None:
             return None
         seen = motion.flow, motion.overlap, motion.parallax
         if calls_for_keyframe(config, camera.long_edge, *seen, patience=FARTHER):

@@ -10,9 +10,10 @@ from geogs.bundle.flow_term import normal_equations, residual_norms, weighed_res
 from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import sparse_cells
-from geogs.tracking.frames.pose_filling import HUBER, ITERATIONS, observed, tracked_on
+from geogs.tracking.frames.pose_filling import HUBER, ITERATIONS, observed, row_errors, tracked_on
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 from geogs.tracking.locate.pose_deviation import PoseDeviation, left_open
+from geogs.tracking.row_twists import row_twists
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
 from geogs.world.frames import FrameLog
@@ -29,21 +30,27 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     """Deviations of all tracked frames of a tracker that has a map, by its present edges.
 
     A frame between keyframes is as far off as they are (their deviations, interpolated in
-    time), and by what its own few matches leave open beside (:func:`own_deviations`); the two
+    time), and by what its own few matches leave open beside (:func:`own_deviations`); every frame
+    by what is not known of the camera's motion while its rows were read (:func:`row_twists`); all
     are independent. Depths are those of the keyframes around.
     """
     log, keyframes = tracker.map.recorder.log, tracker.keyframes
     tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
     times = np.array([r.timestamp for r in tracked], np.float64)
     around = keyframe_uncertainty(tracker).at(times)
-    known = {k.frame_index: PoseDeviation(0.0, 0.0) for k in keyframes}
+    none, unknown = PoseDeviation(0.0, 0.0), PoseDeviation(np.inf, np.inf)
+    known = dict.fromkeys((k.frame_index for k in keyframes), none)
     known |= own_deviations(log, keyframes)
-    unknown = PoseDeviation(np.inf, np.inf)
-    own = [known.get(r.index, unknown) for r in tracked]
+    errors, edges = row_errors(log, keyframes), tracker.map.graph.edges
+    twists = {} if errors is None else row_twists(errors, keyframes, edges, log, True)
+    read = {frame: twist.leaves_open for frame, twist in twists.items()}
+    own = [(known.get(r.index, unknown), read.get(r.index, none)) for r in tracked]
+    position = np.hypot(*np.array([[d.position for d in two] for two in own]).T)
+    rotation = np.hypot(*np.array([[d.rotation for d in two] for two in own]).T)
     return Uncertainty(
         times,
-        np.hypot(around.position, np.array([d.position for d in own])),
-        np.hypot(around.rotation, np.array([d.rotation for d in own])),
+        np.hypot(around.position, position),
+        np.hypot(around.rotation, rotation),
         around.depth,
     )
 

@@ -6,11 +6,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse
+from geogs.tracking.frames.rotation_averaging import orientations
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion
 from geogs.tracking.locate.visible_keyframes import visible_keyframes
-from geogs.tracking.start.early_frames import oriented_frames
 from geogs.world.keyframes import KeyframeSet
 
 
@@ -18,22 +18,23 @@ def track_back(local: LocalMapping, locator: FrameLocator) -> None:
     """Locate the frames that have no pose between the keyframes of a start, the latest first.
 
     Each is searched for where the camera was at the nearest time that is known, with the
-    orientation that relative rotations say. Those that were keyframes of attempts which failed
-    become keyframes again by the rule by which frames do: else all would hang on a keyframe that
-    sees them at its border, and what they show would have no depth.
+    orientation that relative rotations to it say; they err alike while the camera turns, and along
+    a whole turn that adds up to more than flow can bridge. Those that were keyframes of attempts
+    which failed become keyframes again by the rule by which frames do: else all would hang on a
+    keyframe that sees them at its border, and what they show would have no depth.
     """
     recorder, keyframes = local.map.recorder, local.keyframes
     waiting = recorder.unplaced()
     if not waiting:
         return
-    oriented = oriented_frames(recorder.log, keyframes)
+    rotations = {r.index: r.rotations for r in recorder.log.records}
     placed = {k.frame_index: k.T_cw for k in keyframes}
     # Of the frames on a keyframe that was given up the earliest was that keyframe.
     given_up = {r.anchor: r for r in reversed(waiting) if r.anchor is not None}
     for record in reversed(waiting):
         guess = placed[min(placed, key=lambda index: abs(index - record.index))]
-        if record.index in oriented:
-            guess = _turned(guess, oriented[record.index])
+        R = orientations(rotations, {n: T[:3, :3] for n, T in placed.items()}).get(record.index)
+        guess = guess if R is None else _turned(guess, R)
         was, record.anchor = record.anchor, None
         motion = _located(keyframes, locator, record.index, recorder.encoded(record), guess)
         if motion is None:

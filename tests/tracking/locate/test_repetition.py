@@ -1,7 +1,6 @@
 """A pattern that repeats, in which a wrong guess leads to the wrong one of its repetitions."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +8,9 @@ import torch
 
 import tracking_scenes
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.locate.frame_locator import SAME, FrameMotion
-from geogs.tracking.locate.localiser import BORNE_OUT, DOUBTFUL, SegmentLocaliser
+from geogs.tracking.follower import Follower
+from geogs.tracking.locate.frame_locator import BORNE_OUT, DOUBTFUL, SAME, FrameMotion
+from geogs.tracking.locate.localiser import SegmentLocaliser
 from geogs.tracking.matching.photometric_check import PhotometricCheck
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch, Frame
@@ -39,11 +39,10 @@ def searched(
     def found(name, result):
         return lambda *_: (asked.append(name), result)[1]
 
-    localiser.locator = SimpleNamespace(
-        locate=lambda *_: expected,
-        relocate=found("cold", cold),
-        relocate_by_features=found("features", features),
-    )
+    locator = localiser.locator
+    locator.locate = lambda *_: expected
+    locator.relocate = found("cold", cold)
+    locator.relocate_by_features = found("features", features)
     return localiser.track(Frame(1, 1 / 30, image), None), len(asked)
 
 
@@ -94,13 +93,32 @@ def error_cm(true: np.ndarray, guess: np.ndarray) -> float:
     return 100 * float(np.linalg.norm(found - true[:3, 3]))
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("angle", [0.3, 1.35, 2.4, 5.55])
-def test_a_camera_that_turns_back_before_a_chessboard_does_not_slip(monkeypatch, angle):
+@pytest.fixture
+def chessboards(monkeypatch):
+    """Squares of 14 cm on what the camera faces."""
     rows = np.arange(512) // 16
     board = np.where((rows[:, None] + rows) % 2, 225, 30).astype(np.float32)
     textures = [board, *tracking_scenes.TEXTURES[1:-1], board]
     monkeypatch.setattr(tracking_scenes, "TEXTURES", textures)
+
+
+@pytest.mark.usefixtures("chessboards")
+def test_what_comes_while_a_keyframe_is_completed_is_searched_for_a_second_time_too():
+    true = pose(0.075, -0.047, yaw=0.02)
+    tracker = on_the_move(pose(-0.075, 0.047, yaw=-0.02))
+    last = tracker.segment.status.last
+    keyframe = tracker.keyframes[last.keyframe]
+    locator = SegmentLocaliser(tracker.map).locator
+    follower = Follower(locator, tracker.config, last, keyframe, keyframe, motion(0.9, 0.5))
+    assert follower.follow(Frame(1, 1 / 30, render(true)[0])) is not None
+    found = se3_inverse(follower.T_cw)[:3, 3].numpy()
+    assert 100 * float(np.linalg.norm(found - true[:3, 3])) < 0.5
+
+
+@pytest.mark.system
+@pytest.mark.usefixtures("chessboards")
+@pytest.mark.parametrize("angle", [0.3, 1.35, 2.4, 5.55])
+def test_a_camera_that_turns_back_before_a_chessboard_does_not_slip(angle):
     true = pose(0.25 * np.cos(angle), 0.18 * np.sin(angle), yaw=0.03)
     guess = pose(-0.15 * np.cos(angle), -0.11 * np.sin(angle), yaw=-0.03)
-    assert error_cm(true, guess) < 1.0  # a square is 14 cm
+    assert error_cm(true, guess) < 1.0

@@ -89,18 +89,27 @@ def rows_in_doubt(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
 
 def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> None:
     """Correct what was found of frames by the errors of their rows and their keyframes'."""
+    for part, _, _, _, shift in observed_rows(frames, keyframes, errors):
+        steps = in_steps(keyframes.grid.camera, shift)
+        for (_, observation), step in zip(part, steps, strict=True):
+            observation.shift = step
+
+
+def observed_rows(
+    frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors
+) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int], Tensor, Tensor, Tensor]]:
+    """What was found of frames in keyframes, the ids of these and the motions from there, where
+    cells were found, and by how much rows put them off; some at a time."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     for part, ids in seen_by_keyframes(frames, keyframes):
         T = errors.poses([r.index for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
+        pixels = unpacked_positions(grid, torch.stack([o.position for _, o in part]))
         shifts = errors.of_matches(
             [keyframes[k].frame_index for k in ids], [r.index for r, _ in part], T,
-            grid.rays[cells], keyframes.inverse_depths(ids)[:, cells],
-            unpacked_positions(grid, torch.stack([o.position for _, o in part])),
+            grid.rays[cells], keyframes.inverse_depths(ids)[:, cells], pixels,
         )  # fmt: skip
-        steps = in_steps(grid.camera, shifts.shift)
-        for (_, observation), shift in zip(part, steps, strict=True):
-            observation.shift = shift
+        yield part, ids, T, pixels, shifts.shift
 
 
 def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None:

@@ -8,16 +8,16 @@ that by fractions of a pixel, so the matches are corrected to first order and th
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from geogs.bundle.projection import MIN_Z, carried_over, project, seen_from_targets
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.shutter.rows import CELL
 from geogs.types import SeenRows, Trajectory
 from geogs.world.edges import Edge, Pair, edge_matches
@@ -98,6 +98,44 @@ class RowErrors:
         other = copy.copy(self)
         other._factor = factor
         return other
+
+    def with_twists(self, twists: Mapping[int, Float[Tensor, "6"]]) -> "RowErrors":
+        """The same, the camera moving by so much more per second while it reads frames."""
+        other = copy.copy(self)
+        other._rectified = dict(self._rectified)
+        for frame in twists.keys() & self._rectified.keys():
+            f = self._rectified[frame]
+            more = se3_exp(f.times[:, None].double() * twists[frame])
+            other._rectified[frame] = replace(f, motions=more.float() @ f.motions)
+        return other
+
+    def twist_doubt(self, frame: int) -> Float64[Tensor, "6"]:
+        """Deviations of the twist of a frame, as the poses around tell it: how far the slope of the
+        polynomial through all of them is from that through the nearest three, in either half.
+
+        Zero for frames without rows. Source: embedded formulas of numerical differentiation.
+        """
+        f = self._rectified.get(frame)
+        if f is None:
+            return torch.zeros(6, dtype=torch.float64)
+        times, moved = f.times.double(), se3_log(f.motions.double())
+        all_of_them = slope_at_zero(times, moved)
+        nearest = times.abs().argsort()[:3]
+        apart = (all_of_them - slope_at_zero(times[nearest], moved[nearest])).reshape(2, 3)
+        return apart.norm(dim=1).repeat_interleave(3)
+
+    def seconds(
+        self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
+    ) -> Float[Tensor, "e p"]:
+        """When pixels of frames were seen, from the middle row; zero of frames without rows."""
+        found = torch.zeros_like(pixels[..., 0])
+        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        if known:
+            rows = [self._rectified[frames[n]].rows for n in known]
+            at = torch.tensor(known, device=pixels.device)
+            _, when = seen_rows(rows, torch.arange(len(known), device=pixels.device), pixels[at])
+            found[at] = self._factor * when
+        return found
 
     def poses(self, frames: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera of frames in the trajectory, float64."""
@@ -221,12 +259,13 @@ def edge_shifts(
     errors: RowErrors,
     keyframes: KeyframeSet,
     measured: Mapping[Pair, Edge],
-    frame_of: Callable[[int], int],
+    frame_of: Callable[[int], int] | None = None,
 ) -> Iterator[tuple[list[Pair], RowShifts]]:
     """Pixels by which the matches of edges are to be corrected, some edges at a time.
 
-    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame.
+    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame, if not its own.
     """
+    frame_of = frame_of or (lambda id: keyframes[id].frame_index)
     pairs, grid = sorted(measured), keyframes.grid
     size = TOGETHER[grid.on_gpu]
     for start in range(0, len(pairs), size):
@@ -255,6 +294,14 @@ def lagrange(
         weights.append(ab * cd * by)
         changes.append((ab * (c + d) + cd * (a + b)) * by)
     return weights, changes
+
+
+def slope_at_zero(
+    times: Float64[Tensor, "k"], values: Float64[Tensor, "k m"]
+) -> Float64[Tensor, "m"]:
+    """Derivative at zero of the polynomial through values at so many times."""
+    powers = torch.linalg.solve(torch.linalg.vander(times / times.abs().max()), values)
+    return powers[1] / times.abs().max()
 
 
 def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:

@@ -27,6 +27,14 @@ FIT_HUBER = 5.0
 SAME = 1.0
 """Pixels by which matches of two ways to the same place differ in the median at most; those of two
 repetitions of a pattern differ by its period."""
+DOUBTFUL = 0.7
+"""A frame near where it was expected is also looked for without a guess where less than this
+fraction of the keyframe's known depths agrees: a guess that is off by half a period of a pattern
+leads to the wrong one of its repetitions, which agree over a part of the image."""
+BORNE_OUT = 0.95
+"""Correlation of the images' windows from which a place to which flow leads with a guess and
+without needs no third opinion. Of 32 wrong places before rendered chessboards 3 are left so, as
+where features are always asked, and 9 where both ways are enough; a real corridor has 0.97."""
 FEATURE_CANDIDATES = 2
 """Keyframes with which the features of a frame are compared when the camera is lost."""
 
@@ -203,3 +211,22 @@ class FrameLocator:
         attempts += [(self.relocate_by_features, k) for k in keyframes[:FEATURE_CANDIDATES]]
         motions = (attempt(keyframe, encoded) for attempt, keyframe in attempts)
         return next((motion for motion in motions if motion is not None), None)
+
+    def best(
+        self, keyframe: Keyframe, encoded: Any, expected: FrameMotion | None
+    ) -> FrameMotion | None:
+        """The frame where most of the keyframe agrees: as expected, or where nothing but the
+        images led, if that was doubtful; features are asked where flow led elsewhere."""
+        if expected is None or expected.overlap >= DOUBTFUL:
+            return expected
+        cold = with_depth(self.relocate(keyframe, encoded))
+        found = [expected] if cold is None else [expected, cold]
+        if cold is None or not (cold.is_where(expected) and cold.check.correlation >= BORNE_OUT):
+            features = with_depth(self.relocate_by_features(keyframe, encoded))
+            found += [] if features is None else [features]
+        return max(found, key=lambda motion: motion.matched)
+
+
+def with_depth(motion: FrameMotion | None) -> FrameMotion | None:
+    """A motion that enough cells of known depth say."""
+    return None if motion is None or motion.known < MIN_KNOWN else motion

@@ -6,7 +6,12 @@ from typing import Any
 import torch
 
 from geogs.tracking.keyframes.segment_map import SegmentMap
-from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion, Recognition
+from geogs.tracking.locate.frame_locator import (
+    FrameLocator,
+    FrameMotion,
+    Recognition,
+    with_depth,
+)
 from geogs.tracking.locate.orientation_follower import Followed
 from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.tracking.matching.flow_chain import MIN_MATCHED
@@ -21,14 +26,6 @@ RECOGNISED = 0.25
 what is asked where the camera was expected."""
 TRIED = 5
 """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
-DOUBTFUL = 0.7
-"""A frame near where it was expected is also looked for without a guess where less than this
-fraction of the keyframe's known depths agrees: a guess that is off by half a period of a pattern
-leads to the wrong one of its repetitions, which agree over a part of the image."""
-BORNE_OUT = 0.95
-"""Correlation of the images' windows from which a place to which flow leads with a guess and
-without needs no third opinion. Of 32 wrong places before rendered chessboards 3 are left so, as
-where features are always asked, and 9 where both ways are enough; a real corridor has 0.97."""
 RELOCALISE_EVERY = 5
 """While a camera only rotates, its orientation says what it sees; only every so many frames it is
 searched for as if it could be anywhere."""
@@ -56,7 +53,7 @@ class SegmentLocaliser:
                 motion = locate(keyframe, encoded, given @ keyframe.T_cw)
         if motion is None and last.velocity is not None:
             motion = locate(keyframe, encoded, last.T_cw(keyframe))
-        return self._best(keyframe, encoded, self._with_depth(motion))
+        return self.locator.best(keyframe, encoded, with_depth(motion))
 
     def relocalise(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
         """The frame anywhere: first where the camera would be if it had only rotated."""
@@ -68,11 +65,11 @@ class SegmentLocaliser:
             guess = rotation @ last.T_cw(self.map.keyframes[last.keyframe])
             for keyframe in visible_keyframes(keyframes, guess):
                 motion = self.locator.locate(keyframe, encoded, guess, is_expected=False)
-                if self._with_depth(motion) is not None:
+                if with_depth(motion) is not None:
                     return motion
             if followed.is_pure and status.misses % RELOCALISE_EVERY:
                 return None
-        return self._with_depth(self.locator.relocate_any(self._candidates(keyframes), encoded))
+        return with_depth(self.locator.relocate_any(self._candidates(keyframes), encoded))
 
     def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
         """The frame at one of some keyframes that look like it.
@@ -84,28 +81,10 @@ class SegmentLocaliser:
                 continue
             keyframe = self.map.keyframes[candidate.keyframe]
             motion = self.locator.locate_relative(keyframe, encoded, candidate.T_rel)
-            motion = self._with_depth(motion)
+            motion = with_depth(motion)
             if motion is not None and motion.matched >= RECOGNISED:
                 return motion
         return None
-
-    def _best(
-        self, keyframe: Keyframe, encoded: Any, expected: FrameMotion | None
-    ) -> FrameMotion | None:
-        """The frame where most of the keyframe agrees: as expected, or where nothing but the
-        images led, if that was doubtful; features are asked where flow led elsewhere."""
-        if expected is None or expected.overlap >= DOUBTFUL:
-            return expected
-        cold = self._with_depth(self.locator.relocate(keyframe, encoded))
-        found = [expected] if cold is None else [expected, cold]
-        if cold is None or not (cold.is_where(expected) and cold.check.correlation >= BORNE_OUT):
-            features = self._with_depth(self.locator.relocate_by_features(keyframe, encoded))
-            found += [] if features is None else [features]
-        return max(found, key=lambda motion: motion.matched)
-
-    def _with_depth(self, motion: FrameMotion | None) -> FrameMotion | None:
-        """A motion that enough cells of known depth say."""
-        return None if motion is None or motion.known < MIN_KNOWN else motion
 
     def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
         """Where to search for a lost camera: recent keyframes, and older ones by turns."""

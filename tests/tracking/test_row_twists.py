@@ -1,0 +1,81 @@
+"""Velocity of the camera while it reads a frame: equations, and what is known of it before."""
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.tracking.frames.row_errors import RowErrors, slope_at_zero
+from geogs.tracking.locate.pose_deviation import PoseDeviation
+from geogs.tracking.row_twists import EVIDENCE, solved_twist
+from geogs.types import SeenRows, Trajectory
+from geogs.world.grid import SampleGrid
+from tracking_scenes import CAMERA
+
+RATE, COUNT, FRAME = 30.0, 9, 4
+XI = torch.tensor([0.4, -0.2, 0.1, 0.3, -1.2, 0.2], dtype=torch.float64)
+KNOCK = torch.tensor([3.0, 1.0, -2.0, 10.0, -25.0, 5.0], dtype=torch.float64)
+
+
+def errors(knock: torch.Tensor) -> RowErrors:
+    """Of a camera that moves evenly, and is accelerated from one frame on."""
+    times = (np.arange(COUNT) - FRAME) / RATE
+    T_cw = [se3_exp(XI * t + knock * max(t, 0.0) ** 2 / 2) for t in times]
+    path = Trajectory(times, np.stack([se3_inverse(T).numpy() for T in T_cw]), np.ones(COUNT, bool))
+    v = torch.arange(-1, CAMERA.height // 8 + 1) * 8 + 3.5
+    seconds = 0.02 * (v / (CAMERA.height - 1) - 0.5)[:, None].repeat(1, CAMERA.width // 8 + 2)
+    rows = SeenRows(torch.zeros(*seconds.shape, 2).half(), seconds.half(), 0.0)
+    return RowErrors(SampleGrid(CAMERA), dict.fromkeys(range(COUNT), rows), range(COUNT), path)
+
+
+@pytest.mark.parametrize("times", [(-2, -1, 0, 1, 2), (-1, 0, 1), (0, 1, 2, 3, 4), (-0.4, 0, 1.1)])
+def test_the_slope_is_that_of_the_polynomial_through_all(times):
+    t = torch.tensor(times, dtype=torch.float64) / RATE
+    values = torch.from_numpy(np.random.default_rng(3).normal(size=(len(times), 6)))
+    reference = np.polyfit(t.numpy(), values.numpy(), len(times) - 1)[-2]
+    np.testing.assert_allclose(slope_at_zero(t, values), reference, rtol=1e-8)
+
+
+def test_the_twist_is_the_most_likely_one_and_leaves_open_what_the_pose_follows_it_by():
+    rng = np.random.default_rng(5)
+    J, r = torch.from_numpy(rng.normal(size=(40, 12))), torch.from_numpy(rng.normal(size=(40, 1)))
+    doubt = torch.from_numpy(rng.uniform(0.1, 2.0, 6))
+    A = J.mT @ torch.cat([J, r], 1)
+    prior = torch.eye(12, dtype=torch.float64)[6:] / doubt[:, None]
+    weighed = torch.cat([EVIDENCE**0.5 * J, prior])
+    right = torch.cat([EVIDENCE**0.5 * r, torch.zeros(6, 1, dtype=torch.float64)])
+    found = solved_twist(A, doubt)
+    torch.testing.assert_close(found.twist, torch.linalg.lstsq(weighed, right).solution[6:, 0])
+    both, alone = torch.linalg.inv(weighed.mT @ weighed), torch.linalg.inv(J[:, :6].mT @ J[:, :6])
+    squares = (both[:6, :6] - alone / EVIDENCE).diagonal().reshape(2, 3).sum(1)
+    open_ = found.leaves_open
+    np.testing.assert_allclose([open_.position, open_.rotation], squares.sqrt())
+    nothing, no_doubt = torch.zeros_like(A), torch.zeros_like(doubt)
+    assert not solved_twist(A, no_doubt).twist.any()
+    assert solved_twist(A, no_doubt).leaves_open == PoseDeviation(0.0, 0.0)
+    assert not solved_twist(nothing, doubt).twist.any()
+
+
+def test_an_even_motion_leaves_no_doubt_and_a_knock_as_much_as_it_is_missed_by():
+    assert float(errors(0 * KNOCK).twist_doubt(FRAME).max()) < 1e-4
+    knocked = errors(KNOCK)
+    # A quartic through the poses takes the rate for this much higher where it begins to change.
+    missed = KNOCK / RATE / 6
+    told = knocked.twist_doubt(FRAME)
+    for part in (slice(0, 3), slice(3, 6)):
+        assert 0.3 < float(told[part][0] / missed[part].norm()) < 1.0
+    assert not knocked.twist_doubt(COUNT).any()
+
+
+def test_twists_move_what_rows_show_in_proportion_to_their_times():
+    grid = SampleGrid(CAMERA)
+    before, more = errors(0 * KNOCK), torch.tensor([0.0, 0, 0, 0, 0.1, 0], dtype=torch.float64)
+    after, depth = before.with_twists({FRAME: more}), torch.zeros(1, grid.size)
+    pixels, frames = grid.pixels[None], [FRAME]
+    moved = (
+        after.of_pixels(frames, pixels, depth).shift - before.of_pixels(frames, pixels, depth).shift
+    )
+    x = (pixels[..., 0] - CAMERA.cx) / CAMERA.fx
+    expected = -CAMERA.fx * (1 + x.square()) * 0.1 * after.seconds(frames, pixels)
+    torch.testing.assert_close(moved[..., 0], expected, atol=5e-3, rtol=0.05)
+    assert not after.seconds([COUNT], pixels).any()
