@@ -43,7 +43,8 @@ class PairMatches:
 def verified_matches(
     model: Any, database: Path, pictures: Collection[int]
 ) -> Iterator[PairMatches]:
-    """Those of all pairs of some pictures that have a pose."""
+    """Those of all pairs of some pictures that have a pose, but of pixels that the lens which was
+    found does not see."""
     colmap = load_colmap()
     with closing(colmap.Database.open(database)) as opened:
         ids, _ = opened.read_two_view_geometry_num_inliers()
@@ -52,15 +53,20 @@ def verified_matches(
             if one not in rays or other not in rays:
                 continue
             matches = opened.read_two_view_geometry(one, other).inlier_matches
+            a, b = rays[one][matches[:, 0]], rays[other][matches[:, 1]]
+            is_seen = np.isfinite(a).all(1) & np.isfinite(b).all(1)
+            if not is_seen.any():
+                continue
             first, second = (world_to_camera(model.images[n]) for n in (one, other))
             yield PairMatches(
                 one, other, second @ np.linalg.inv(first),
-                (rays[one][matches[:, 0]], rays[other][matches[:, 1]]),
+                (a[is_seen], b[is_seen]),
                 float(model.cameras[model.images[one].camera_id].mean_focal_length()),
             )  # fmt: skip
 
 
 def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:
+    """Of all points of interest; not finite where a lens that bends too much shows nothing."""
     camera = model.cameras[model.images[number].camera_id]
     pixels = np.asarray(opened.read_keypoints(number), np.float64)[:, :2]
     return homogeneous(np.asarray(camera.cam_from_img(pixels), np.float64)[:, :2])
