@@ -134,6 +134,22 @@ def test_the_bend_is_told_as_it_is():
     assert (bend.k1, bend.k2) == pytest.approx(BEND, rel=0.1)
 
 
+def test_deviations_are_the_standard_errors_that_those_before_the_run_are(monkeypatch):
+    """Against single standard errors of the same matches."""
+    said = []
+    for errors in (1.0, lens_correction.STANDARD_ERRORS):
+        monkeypatch.setattr(lens_correction, "STANDARD_ERRORS", errors)
+        tracker, _ = tracker_of(BEND)
+        ids = list(range(COUNT))
+        tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
+        tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+        said.append(lens_correction.correct_lens(tracker, ids[1:], ids, GLOBAL_OPTIONS))
+    one, three = said
+    assert (three.k1, three.k2) == (one.k1, one.k2)
+    assert three.deviation_k1 == pytest.approx(3 * one.deviation_k1)
+    assert three.deviation_k2 == pytest.approx(3 * one.deviation_k2)
+
+
 def test_the_end_of_tracking_straightens_images_once():
     tracker, truth = tracker_of(BEND)
     global_bundle(tracker)

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, PRIOR, SHAPES, LensBend
+from geogs.tracking.calibration.focal_uncertainty import STANDARD_ERRORS
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
 from geogs.tracking.frames.row_errors import TOGETHER, RowErrors
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -103,7 +104,8 @@ def correct_lens(
         shift_rows(log, keyframes, rows.with_readout(readout + longer))
         log.set_readout(readout + longer, deviation.pop())
     shift_lens(log, keyframes, bend)
-    *of_focal, k1, k2 = deviation
+    # Matches of different keyframes err alike too (docs/lens.md), here as before the run.
+    *of_focal, k1, k2 = (STANDARD_ERRORS * error for error in deviation)
     found = FoundLens(bend.k1, bend.k2, k1, k2)
     if not is_asked:
         return found
