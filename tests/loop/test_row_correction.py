@@ -143,7 +143,8 @@ def test_a_knock_between_images_is_told_by_the_rows_of_a_frame(monkeypatch, are_
     if are_corrected:
         for part, (shift, _) in edge_shifts(errors, keyframes, graph.edges):
             edges |= {e: edges[e].moved(CAMERA, s) for e, s in zip(part, shift, strict=True)}
-    found = row_twists(errors, keyframes, edges, log, are_corrected)[frame].twist
+    twists = row_twists(errors, keyframes, edges, log, are_corrected)
+    found = twists.twist[twists.frames.index(frame)]
 
     def moved(k: np.ndarray) -> np.ndarray:
         return se3_log(knocked(k) @ se3_inverse(knocked(np.array([float(frame)])))).numpy()
@@ -162,7 +163,7 @@ def test_what_rows_leave_open_is_in_the_deviations_of_frames():
     errors = row_errors(log, tracker.keyframes)
     assert errors is not None
     found = row_twists(errors, tracker.keyframes, graph.edges, log, True)
-    by_rows = [found[n].leaves_open for n in range(COUNT)]
+    by_rows = [found.leaves_open[found.frames.index(n)] for n in range(COUNT)]
     around, known = keyframe_uncertainty(tracker), frame_uncertainty(tracker)
     for one in ("position", "rotation"):
         rows = [getattr(deviation, one) for deviation in by_rows]

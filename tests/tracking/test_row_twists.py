@@ -7,7 +7,7 @@ import torch
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frames.row_errors import RowErrors, slope_at_zero
 from geogs.tracking.locate.pose_deviation import PoseDeviation
-from geogs.tracking.row_twists import EVIDENCE, solved_twist
+from geogs.tracking.row_twists import EVIDENCE, solved_twists
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA
@@ -31,46 +31,53 @@ def errors(knock: torch.Tensor) -> RowErrors:
 @pytest.mark.parametrize("times", [(-2, -1, 0, 1, 2), (-1, 0, 1), (0, 1, 2, 3, 4), (-0.4, 0, 1.1)])
 def test_the_slope_is_that_of_the_polynomial_through_all(times):
     t = torch.tensor(times, dtype=torch.float64) / RATE
-    values = torch.from_numpy(np.random.default_rng(3).normal(size=(len(times), 6)))
-    reference = np.polyfit(t.numpy(), values.numpy(), len(times) - 1)[-2]
-    np.testing.assert_allclose(slope_at_zero(t, values), reference, rtol=1e-8)
+    values = torch.from_numpy(np.random.default_rng(3).normal(size=(2, len(times), 6)))
+    found = slope_at_zero(torch.stack([t, 2 * t]), values)
+    for own, value, slope in zip((t, 2 * t), values, found, strict=True):
+        reference = np.polyfit(own.numpy(), value.numpy(), len(times) - 1)[-2]
+        np.testing.assert_allclose(slope, reference, rtol=1e-8)
 
 
 def test_the_twist_is_the_most_likely_one_and_leaves_open_what_the_pose_follows_it_by():
     rng = np.random.default_rng(5)
-    J, r = torch.from_numpy(rng.normal(size=(40, 12))), torch.from_numpy(rng.normal(size=(40, 1)))
-    doubt = torch.from_numpy(rng.uniform(0.1, 2.0, 6))
-    A = J.mT @ torch.cat([J, r], 1)
-    prior = torch.eye(12, dtype=torch.float64)[6:] / doubt[:, None]
-    weighed = torch.cat([EVIDENCE**0.5 * J, prior])
-    right = torch.cat([EVIDENCE**0.5 * r, torch.zeros(6, 1, dtype=torch.float64)])
-    found = solved_twist(A, doubt)
-    torch.testing.assert_close(found.twist, torch.linalg.lstsq(weighed, right).solution[6:, 0])
-    both, alone = torch.linalg.inv(weighed.mT @ weighed), torch.linalg.inv(J[:, :6].mT @ J[:, :6])
-    squares = (both[:6, :6] - alone / EVIDENCE).diagonal().reshape(2, 3).sum(1)
-    open_ = found.leaves_open
-    np.testing.assert_allclose([open_.position, open_.rotation], squares.sqrt())
-    nothing, no_doubt = torch.zeros_like(A), torch.zeros_like(doubt)
-    assert not solved_twist(A, no_doubt).twist.any()
-    assert solved_twist(A, no_doubt).leaves_open == PoseDeviation(0.0, 0.0)
-    assert not solved_twist(nothing, doubt).twist.any()
+    J, r = (torch.from_numpy(rng.normal(size=(3, 40, n))) for n in (12, 1))
+    doubts = torch.from_numpy(rng.uniform(0.1, 2.0, (3, 6)))
+    A = J.mT @ torch.cat([J, r], 2)
+    twists, open_ = solved_twists(A, doubts)
+    for n, (own, right, doubt) in enumerate(zip(J, r, doubts, strict=True)):
+        prior = torch.eye(12, dtype=torch.float64)[6:] / doubt[:, None]
+        weighed = torch.cat([EVIDENCE**0.5 * own, prior])
+        right = torch.cat([EVIDENCE**0.5 * right, torch.zeros(6, 1, dtype=torch.float64)])
+        torch.testing.assert_close(twists[n], torch.linalg.lstsq(weighed, right).solution[6:, 0])
+        both = torch.linalg.inv(weighed.mT @ weighed)[:6, :6]
+        alone = torch.linalg.inv(own[:, :6].mT @ own[:, :6])
+        squares = (both - alone / EVIDENCE).diagonal().reshape(2, 3).sum(1)
+        np.testing.assert_allclose([open_[n].position, open_[n].rotation], squares.sqrt())
+    nothing, no_doubt = torch.zeros_like(A), torch.zeros_like(doubts)
+    twists, open_ = solved_twists(A, no_doubt)
+    assert not twists.any()
+    assert open_[0] == PoseDeviation(0.0, 0.0)
+    assert not solved_twists(nothing, doubts)[0].any()
 
 
 def test_an_even_motion_leaves_no_doubt_and_a_knock_as_much_as_it_is_missed_by():
-    assert float(errors(0 * KNOCK).twist_doubt(FRAME).max()) < 1e-4
+    assert float(errors(0 * KNOCK).twist_doubts([FRAME]).max()) < 1e-4
     knocked = errors(KNOCK)
     # A quartic through the poses takes the rate for this much higher where it begins to change.
     missed = KNOCK / RATE / 6
-    told = knocked.twist_doubt(FRAME)
+    told, none = knocked.twist_doubts([FRAME, COUNT])
     for part in (slice(0, 3), slice(3, 6)):
         assert 0.3 < float(told[part][0] / missed[part].norm()) < 1.0
-    assert not knocked.twist_doubt(COUNT).any()
+    assert not none.any()
 
 
 def test_twists_move_what_rows_show_in_proportion_to_their_times():
     grid = SampleGrid(CAMERA)
     before, more = errors(0 * KNOCK), torch.tensor([0.0, 0, 0, 0, 0.1, 0], dtype=torch.float64)
-    after, depth = before.with_twists({FRAME: more}), torch.zeros(1, grid.size)
+    after, depth = (
+        before.with_twists([COUNT, FRAME], torch.stack([2 * more, more])),
+        torch.zeros(1, grid.size),
+    )
     pixels, frames = grid.pixels[None], [FRAME]
     moved = (
         after.of_pixels(frames, pixels, depth).shift - before.of_pixels(frames, pixels, depth).shift

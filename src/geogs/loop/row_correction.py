@@ -64,7 +64,7 @@ def correct_rows(
                 last = n
         present = errors.with_readout(search.factor)
         found = row_twists(present, keyframes, measured, log)
-        present = present.with_twists({frame: known.twist for frame, known in found.items()})
+        present = present.with_twists(found.frames, found.twist)
         for part, (shift, _) in edge_shifts(present, keyframes, measured):
             graph.edges.update(
                 {e: measured[e].moved(grid.camera, s) for e, s in zip(part, shift, strict=True)}

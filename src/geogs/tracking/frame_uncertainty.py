@@ -42,8 +42,8 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     known = dict.fromkeys((k.frame_index for k in keyframes), none)
     known |= own_deviations(log, keyframes)
     errors, edges = row_errors(log, keyframes), tracker.map.graph.edges
-    twists = {} if errors is None else row_twists(errors, keyframes, edges, log, True)
-    read = {frame: twist.leaves_open for frame, twist in twists.items()}
+    twists = None if errors is None else row_twists(errors, keyframes, edges, log, True)
+    read = {} if twists is None else dict(zip(twists.frames, twists.leaves_open, strict=True))
     own = [(known.get(r.index, unknown), read.get(r.index, none)) for r in tracked]
     position = np.hypot(*np.array([[d.position for d in two] for two in own]).T)
     rotation = np.hypot(*np.array([[d.rotation for d in two] for two in own]).T)

@@ -41,12 +41,13 @@ class _Matches(NamedTuple):
     weight: Float[Tensor, "e p 2"]
 
 
-class SolvedTwist(NamedTuple):
-    """The twist of a frame while it was read."""
+class RowTwists(NamedTuple):
+    """Twists of frames while they were read."""
 
-    twist: Float64[Tensor, "6"]
+    frames: list[int]
+    twist: Float64[Tensor, "n 6"]
     """Per second, beside that of the trajectory; a left perturbation of the frame's pose."""
-    leaves_open: PoseDeviation
+    leaves_open: list[PoseDeviation]
     """Of the frame's pose, which follows what is not known of the twist."""
 
 
@@ -56,11 +57,11 @@ def row_twists(
     edges: Mapping[Pair, Edge],
     log: FrameLog,
     are_corrected: bool = False,
-) -> dict[int, SolvedTwist]:
+) -> RowTwists:
     """Twists of frames while they were read, by the matches that end in them.
 
     Each is estimated together with a step of the frame's pose, and is known before to be as small
-    as two polynomials through the poses around differ (:meth:`RowErrors.twist_doubt`). Depths, and
+    as two polynomials through the poses around differ (:meth:`RowErrors.twist_doubts`). Depths, and
     the poses of the frames that matches begin in, are taken for right.
     Source: pose and velocity from one image of a rolling shutter (Ait-Aider et al. 2006), with what
     is known of the velocity before by Bayes' rule.
@@ -79,20 +80,29 @@ def row_twists(
     ):
         for frame, equations in zip(part.frames, _equations(errors, keyframes, part), strict=True):
             sums[frame] = sums.get(frame, 0) + equations
-    return {frame: solved_twist(A, errors.twist_doubt(frame)) for frame, A in sums.items()}
+    frames = [*sums]
+    A = torch.stack([*sums.values()]) if sums else torch.zeros(0, 12, 13, dtype=torch.float64)
+    return RowTwists(frames, *solved_twists(A, errors.twist_doubts(frames)))
 
 
-def solved_twist(A: Float64[Tensor, "12 13"], doubt: Float64[Tensor, "6"]) -> SolvedTwist:
-    """Most likely twist by the normal equations of a step of the pose and a twist, and their right
-    side, ``EVIDENCE`` of which counts, and its deviations before."""
-    H, v = EVIDENCE * A[:, :12], EVIDENCE * A[:, 12:]
+def solved_twists(
+    A: Float64[Tensor, "n 12 13"], doubt: Float64[Tensor, "n 6"]
+) -> tuple[Float64[Tensor, "n 6"], list[PoseDeviation]]:
+    """Most likely twists, and what they leave open of the poses, by the normal equations of steps
+    of the poses and twists, with their right sides, ``EVIDENCE`` of which counts, and the twists'
+    deviations before."""
+    H, v = EVIDENCE * A[..., :12], EVIDENCE * A[..., 12:]
     eye = torch.eye(6, dtype=H.dtype)
-    damped = H[:6, :6] + 1e-9 * H[:6, :6].diagonal().max().clamp(min=1e-9) * eye
-    follow, step = torch.linalg.solve(damped, torch.cat([H[:6, 6:], v[:6]], 1)).split([6, 1], 1)
-    S, g = H[6:, 6:] - H[6:, :6] @ follow, v[6:] - H[6:, :6] @ step
-    open_ = doubt[:, None] * torch.linalg.inv(doubt[:, None] * S * doubt + eye) * doubt
-    squares = (follow @ open_ @ follow.mT).diagonal().reshape(2, 3).sum(1)
-    return SolvedTwist((open_ @ g)[:, 0], PoseDeviation(*squares.clamp(min=0).sqrt().tolist()))
+    of_pose, both, of_twist = H[:, :6, :6], H[:, 6:, :6], H[:, 6:, 6:]
+    largest = of_pose.diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-9)
+    damped = of_pose + 1e-9 * largest[:, None, None] * eye
+    follow, step = torch.linalg.solve(damped, torch.cat([both.mT, v[:, :6]], 2)).split([6, 1], 2)
+    S, g = of_twist - both @ follow, v[:, 6:] - both @ step
+    rows, columns = doubt[..., None], doubt[:, None]
+    open_ = rows * torch.linalg.inv(rows * S * columns + eye) * columns
+    squares = (follow @ open_ @ follow.mT).diagonal(dim1=1, dim2=2).reshape(-1, 2, 3).sum(2)
+    left = [PoseDeviation(*two) for two in squares.clamp(min=0).sqrt().tolist()]
+    return (open_ @ g)[..., 0], left
 
 
 def _equations(

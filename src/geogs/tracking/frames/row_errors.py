@@ -99,30 +99,39 @@ class RowErrors:
         other._factor = factor
         return other
 
-    def with_twists(self, twists: Mapping[int, Float[Tensor, "6"]]) -> "RowErrors":
-        """The same, the camera moving by so much more per second while it reads frames."""
+    def with_twists(self, frames: Sequence[int], twists: Float64[Tensor, "n 6"]) -> "RowErrors":
+        """The same, the camera moving by so much more per second while it reads these frames."""
+        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
         other = copy.copy(self)
-        other._rectified = dict(self._rectified)
-        for frame in twists.keys() & self._rectified.keys():
-            f = self._rectified[frame]
-            more = se3_exp(f.times[:, None].double() * twists[frame])
-            other._rectified[frame] = replace(f, motions=more.float() @ f.motions)
+        if known:
+            own = [self._rectified[frames[n]] for n in known]
+            times = torch.stack([f.times for f in own]).double()
+            more = se3_exp(times[..., None] * twists[known][:, None]).float()
+            moved = more @ torch.stack([f.motions for f in own])
+            other._rectified = self._rectified | {
+                frames[n]: replace(f, motions=T) for n, f, T in zip(known, own, moved, strict=True)
+            }
         return other
 
-    def twist_doubt(self, frame: int) -> Float64[Tensor, "6"]:
-        """Deviations of the twist of a frame, as the poses around tell it: how far the slope of the
-        polynomial through all of them is from that through the nearest three, in either half.
+    def twist_doubts(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
+        """Deviations of the twists of frames, as the poses around tell them: how far the slope of
+        the polynomial through all of them is from that through the nearest three, in either half.
 
         Zero for frames without rows. Source: embedded formulas of numerical differentiation.
         """
-        f = self._rectified.get(frame)
-        if f is None:
-            return torch.zeros(6, dtype=torch.float64)
-        times, moved = f.times.double(), se3_log(f.motions.double())
-        all_of_them = slope_at_zero(times, moved)
-        nearest = times.abs().argsort()[:3]
-        apart = (all_of_them - slope_at_zero(times[nearest], moved[nearest])).reshape(2, 3)
-        return apart.norm(dim=1).repeat_interleave(3)
+        doubts = torch.zeros(len(frames), 6, dtype=torch.float64)
+        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        if known:
+            own = [self._rectified[frames[n]] for n in known]
+            times = torch.stack([f.times for f in own]).double()
+            moved = se3_log(torch.stack([f.motions for f in own]).double())
+            nearest = times.abs().argsort(1)[:, :3]
+            by_three = slope_at_zero(
+                times.gather(1, nearest), moved.gather(1, nearest[..., None].expand(-1, -1, 6))
+            )
+            apart = (slope_at_zero(times, moved) - by_three).reshape(-1, 2, 3).norm(dim=2)
+            doubts[known] = apart.repeat_interleave(3, 1)
+        return doubts
 
     def seconds(
         self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
@@ -297,11 +306,11 @@ def lagrange(
 
 
 def slope_at_zero(
-    times: Float64[Tensor, "k"], values: Float64[Tensor, "k m"]
-) -> Float64[Tensor, "m"]:
-    """Derivative at zero of the polynomial through values at so many times."""
-    powers = torch.linalg.solve(torch.linalg.vander(times / times.abs().max()), values)
-    return powers[1] / times.abs().max()
+    times: Float64[Tensor, "n k"], values: Float64[Tensor, "n k m"]
+) -> Float64[Tensor, "n m"]:
+    """Derivatives at zero of the polynomials through values at so many times."""
+    unit = times.abs().amax(1, keepdim=True)
+    return torch.linalg.solve(torch.linalg.vander(times / unit), values)[:, 1] / unit
 
 
 def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
