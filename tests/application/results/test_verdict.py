@@ -33,13 +33,6 @@ def test_a_good_run_says_how_good():
     assert "known to 0.03% of the extent" in best.sentence
 
 
-def test_a_run_against_which_most_of_the_image_moves_says_so():
-    parts = walk(30, 30), walk(5, 5), known(0.0035, 0.02)
-    most = verdict(*parts, moving=0.66).sentence
-    assert most.endswith(" 66% of what is seen moves against what is followed.")
-    assert verdict(*parts, moving=0.4).sentence == verdict(*parts).sentence
-
-
 @pytest.mark.parametrize(
     ("tracked", "position", "depth", "reason"),
     [

@@ -72,9 +72,8 @@ class Result:
         """Whether trajectory and shape are to be relied on; none where the poses were given."""
         if self.uncertainty is None:
             return None
-        why_not, moving = self.why_no_map or "", self.scene.statistics().get("moving")
-        moving = moving if isinstance(moving, float) else 0.0
-        return verdict(self.trajectory, self.keyframes, self.uncertainty, why_not, moving)
+        why_not = self.why_no_map or ""
+        return verdict(self.trajectory, self.keyframes, self.uncertainty, why_not)
 
     @property
     def why_no_map(self) -> str | None:

@@ -16,9 +16,6 @@ MAX_POSITION_DEVIATION = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MAX_DEPTH_DEVIATION = 0.2
 """Relative deviation of the best known depths."""
-MOST_MOVING = 0.5
-"""Fraction of what is seen that moves against what is followed, above which that is said: which of
-the two stands still, matches do not tell."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -49,11 +46,7 @@ class Verdict:
 
 
 def verdict(
-    trajectory: Trajectory,
-    keyframes: Trajectory,
-    known: Uncertainty,
-    why_not: str = "",
-    moving: float = 0.0,
+    trajectory: Trajectory, keyframes: Trajectory, known: Uncertainty, why_not: str = ""
 ) -> Verdict:
     """Whether trajectory and shape are to be relied on.
 
@@ -62,7 +55,6 @@ def verdict(
         keyframes: of the keyframes alone.
         known: how well frames are known.
         why_not: why no map could be started, if so.
-        moving: fraction of what keyframes see that is held for moving.
     """
     extent = extent_of(keyframes.T_wc)
     states = trajectory.states
@@ -89,8 +81,6 @@ def verdict(
             "Trajectory and shape are reliable: the camera's place is known to "
             f"{_finely(position)} of the extent of its path, the best known depths to {depth:.1%}."
         )
-    if moving > MOST_MOVING:
-        sentence += f" {moving:.0%} of what is seen moves against what is followed."
     return Verdict(not reasons, sentence, lost, orientation_only, position, rotation, depth)
 
 
