@@ -45,8 +45,8 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     twists = None if errors is None else row_twists(errors, keyframes, edges, log, True)
     read = {} if twists is None else dict(zip(twists.frames, twists.leaves_open, strict=True))
     own = [(known.get(r.index, unknown), read.get(r.index, none)) for r in tracked]
-    position = np.hypot(*np.array([[d.position for d in two] for two in own]).T)
-    rotation = np.hypot(*np.array([[d.rotation for d in two] for two in own]).T)
+    position = np.array([math.hypot(*(d.position for d in both)) for both in own], np.float64)
+    rotation = np.array([math.hypot(*(d.rotation for d in both)) for both in own], np.float64)
     return Uncertainty(
         times,
         np.hypot(around.position, position),
