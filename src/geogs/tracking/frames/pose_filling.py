@@ -129,8 +129,10 @@ def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None
 def seen_by_keyframes(
     frames: FrameLog, keyframes: KeyframeSet
 ) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int]]]:
-    """What was found of frames in keyframes, and the ids of these; some at a time."""
-    seen = [(r, o) for r in frames.records for o in r.observations if o.keyframe in keyframes]
+    """What was found in keyframes of frames that have a place on them, and the ids of these; some
+    at a time."""
+    tracked = tracked_on(frames, keyframes)
+    seen = [(r, o) for r in tracked for o in r.observations if o.keyframe in keyframes]
     size = SOLVED_TOGETHER[keyframes.grid.on_gpu]
     for start in range(0, len(seen), size):
         part = seen[start : start + size]
