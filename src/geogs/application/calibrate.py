@@ -131,14 +131,12 @@ def refined(
     was = "was assumed" if before.is_guess else f"says {before.fx:.1f}"
     origin = f"refined from the video: {focal:.1f} +- {deviation:.1f} pixels"
     distortion, deviations = calibration.distortion, found.deviations
-    if found.distortion is not None:
-        distortion = (*found.distortion, 0.0, 0.0)
     if assumed is not None:
         bend, refinement = found.distortion or (0.0, 0.0), calibration.refinement
-        distortion = with_bend(
-            calibration.camera(), calibration.distortion, calibration.lens, bend, factor
-        )
-        deviations = deviations or (refinement.deviations if refinement is not None else None)
+        distortion = with_bend(calibration.camera(), distortion, calibration.lens, bend, factor)
+        deviations = deviations or (refinement.deviations if refinement else None)
+    elif found.distortion is not None:
+        distortion = (*found.distortion, 0.0, 0.0)
     if deviations is not None:
         for name, k, error in zip(("k1", "k2"), distortion, deviations, strict=False):
             origin += f", {name} {k:.4f} +- {error:.4f}"

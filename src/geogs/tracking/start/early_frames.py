@@ -1,8 +1,6 @@
 """Poses of the frames between the keyframes of a start."""
 
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
 from geogs.tracking.frames.rotation_averaging import orientations
@@ -21,7 +19,10 @@ def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
     """
     ordered = list(keyframes)
     indices = [k.frame_index for k in ordered]
-    oriented = oriented_frames(log, keyframes)
+    oriented = orientations(
+        {r.index: r.rotations for r in log.records},
+        {k.frame_index: k.T_cw[:3, :3] for k in ordered},
+    )
     for record in log.records:
         if record.anchor is None or record.anchor not in keyframes:
             continue
@@ -36,11 +37,3 @@ def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
             angle = so3_log(R @ (record.T_rel @ a.T_cw)[:3, :3].mT).norm()
             if float(angle) > MAX_DISAGREEMENT:
                 record.anchor = None
-
-
-def oriented_frames(log: FrameLog, keyframes: KeyframeSet) -> dict[int, Float64[Tensor, "3 3"]]:
-    """World to camera of frames that rotations link to keyframes, by the index of the frame."""
-    return orientations(
-        {r.index: r.rotations for r in log.records},
-        {k.frame_index: k.T_cw[:3, :3] for k in keyframes},
-    )
