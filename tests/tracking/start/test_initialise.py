@@ -84,8 +84,36 @@ def test_a_pair_that_other_views_contradict_is_not_started_from() -> None:
     assert n > 0
     ratio = view.inverse_depth[view.good] * depth[view.good]
     assert (ratio / ratio.median() - 1).abs().median() < 0.02
-    of_all = [sum(agreement(grid, v, match) for match in flows) for v in (views[0], view)]
+    of_all = [
+        sum(int(agreement(grid, v, match).sum()) for match in flows) for v in (views[0], view)
+    ]
     assert of_all[1] > 3 * of_all[0]
+
+
+def test_a_car_ahead_that_is_followed_longest_is_not_started_from() -> None:
+    """A sixth of the view moves with the camera, and more; of the rest ever less stays in sight."""
+    grid = SampleGrid(CAMERA)
+    depth = torch.from_numpy(render(pose(0.0))[1][4:-3:8, 4:-3:8].reshape(-1).copy()).float()
+    across = (grid.pixels / grid.pixels.amax(0) - 0.5).abs().amax(1)
+    car, beside = across < 0.2, across.argsort(descending=True)
+    flows = []
+    for k in range(1, 13):
+        left = torch.zeros_like(car)
+        left[beside[: int(0.6 * 0.7 ** (k - 1) * grid.size)]] = True
+        scene = _flow(depth, pose(0.1 * k, 0.0, 0.03 * k), left & ~car)
+        ahead = _flow(depth, pose(-0.04 * k, 0.05 * k, -0.01 * k), car)
+        flows.append(
+            FlowMatch(
+                torch.where(car[:, None], ahead.pixels, scene.pixels), ahead.weight + scene.weight
+            )
+        )
+    on_car = [float(match.sure()[0][car].sum() / match.sure()[0].sum()) for match in flows]
+    assert on_car[0] < 0.4
+    assert sum(share > 0.5 for share in on_car) > 6
+    _, view = best_two_view(CAMERA, flows, 2.0)
+    ratio = (view.inverse_depth * depth)[view.good & ~car]
+    assert (ratio / ratio.median() - 1).abs().median() < 0.1
+    assert view.good[~car].float().mean() > 2 * view.good[car].float().mean()
 
 
 def test_without_parallax_there_is_no_pair_to_start_from() -> None:

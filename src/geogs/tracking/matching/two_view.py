@@ -42,8 +42,9 @@ def best_two_view(
     """The pair to start from, of the flows from one view to others; None without parallax.
 
     An essential matrix of a short baseline may be wrong and yet suit its pair well, so a few of
-    the pairs that have parallax over most good cells are compared: the depth that most cells of
-    all the flows agree with is right.
+    the pairs that have parallax over most good cells are compared: the depth that most cells
+    agree with, wherever they are matched, is right. Each cell has one vote: what is followed
+    longest may be the car ahead.
 
     Args:
         camera: of all views.
@@ -62,23 +63,24 @@ def best_two_view(
         return able[0] if able else None
     grid = SampleGrid(camera)
     pairs = [(view, match) for _, view in able for match in flows]
-    agreeing = thread_map(lambda pair: agreement(grid, *pair), pairs)
-    support = torch.tensor(agreeing).reshape(len(able), -1).sum(1)
+    agreeing = torch.stack(thread_map(lambda pair: agreement(grid, *pair), pairs))
+    matched = torch.stack([match.sure()[0] for match in flows]).sum(0).clamp(min=1)
+    support = (agreeing.reshape(len(able), len(flows), -1).sum(1) / matched).sum(1)
     return able[int(support.argmax())]
 
 
-def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> int:
-    """How many cells of a flow agree with the depth of a pair of views, wherever it leads to.
+def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> Bool[Tensor, "p"]:
+    """Which cells of a flow agree with the depth of a pair of views, wherever it leads to.
 
     The pose there is found from them (PnP). All on the CPU.
     """
     good = view.good & match.sure()[0]
     T = pnp(grid, view.inverse_depth, match.pixels[0], good)
     if T is None:
-        return 0
+        return torch.zeros_like(good)
     at = project(grid.camera, grid.rays, T[None].float(), view.inverse_depth[None])
     near = (at.pixels[0] - match.pixels[0]).norm(dim=-1) < AGREEING * grid.camera.long_edge
-    return int((good & near & at.valid[0]).sum())
+    return good & near & at.valid[0]
 
 
 def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
