@@ -9,7 +9,7 @@ from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.protocols import BundleOptions
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.graph.dynamic_cells import RELEASED, propagated
+from geogs.tracking.graph.dynamic_cells import propagated
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, frame_distances, proximity_pairs
 from geogs.tracking.keyframes.keyframe_depth_sensor import stands_alone
@@ -150,7 +150,7 @@ class LocalMapping:
                 edges, poses, depths, BundleOptions(iterations=ITERATIONS, huber=HUBER)
             )
             if n == 0:
-                self.graph.update_dynamic(deep, self.config.moving, RELEASED)
+                self.graph.update_dynamic(deep, self.config.moving)
             if n == ROUNDS - 1:
                 priors.adjust(depths)
         self.graph.release(moving)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import (
-    RELEASED,
     dynamic_cells,
     dynamic_fraction,
     propagated,
@@ -144,16 +144,26 @@ def test_cells_of_a_keyframe_without_matches_stay_what_they_were():
     assert not bool(held_cells(none + 0.5, none + 1, before).any())
 
 
-@pytest.mark.parametrize(("ratio", "held", "fresh"), [(4.0, 1, 1), (2.7, 1, 0), (2.0, 0, 0)])
-def test_what_is_held_has_to_suit_better_than_what_is_not(ratio: float, held: int, fresh: int):
-    """A car ahead suits its epipolar lines almost as well as what stands, for a while."""
-    before = block(slice(6, 14), slice(2, 10))
-    near = before | block(slice(6, 14), slice(16, 24))
-    total = torch.where(near, ratio, 1.0)
-    grid, count = SampleGrid(CAMERA), torch.ones_like(total)
-    (found,) = dynamic_cells(grid, total[None], count[None], before[None], THRESHOLD, RELEASED)
-    assert float(found[block(slice(8, 12), slice(4, 8))].float().mean()) == held
-    assert float(found[block(slice(8, 12), slice(18, 22))].float().mean()) == fresh
+def test_what_was_held_and_keeps_its_place_in_the_image_is_held_on():
+    """A car ahead suits its epipolar lines: as if it were infinitely far. So does a wall near by,
+    which is let go."""
+    graph = walked()
+    ahead, wall = block(slice(6, 14), slice(2, 10)), block(slice(6, 14), slice(16, 24))
+    store = graph.keyframes
+    T_cw, grid = store.poses(store.ids), store.grid
+    for (i, j), edge in graph.edges.items():
+        T_ji = (T_cw[j] @ se3_inverse(T_cw[i]))[None].float()
+        far = project(grid.camera, grid.rays, T_ji, torch.zeros(1, grid.size)).pixels[0]
+        edge.pixels[ahead] = far[ahead]
+    judged(graph)
+    assert dynamic_fraction(store) == 0
+    for keyframe in store:
+        keyframe.moving = ahead | wall
+    judged(graph)
+    for keyframe in store:
+        assert keyframe.moving is not None
+        assert float(keyframe.moving[ahead].float().mean()) == 1
+        assert float(keyframe.moving[wall].float().mean()) < 0.2
 
 
 def test_what_moves_includes_its_inside_that_is_not_matched():

@@ -85,7 +85,7 @@ def test_a_pair_that_other_views_contradict_is_not_started_from() -> None:
     ratio = view.inverse_depth[view.good] * depth[view.good]
     assert (ratio / ratio.median() - 1).abs().median() < 0.02
     of_all = [
-        sum(int(agreement(grid, v, match).sum()) for match in flows) for v in (views[0], view)
+        sum(float(agreement(grid, v, match).sum()) for match in flows) for v in (views[0], view)
     ]
     assert of_all[1] > 3 * of_all[0]
 

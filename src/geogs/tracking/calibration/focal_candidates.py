@@ -18,7 +18,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
 from geogs.tracking.matching.pnp import pnp
-from geogs.tracking.matching.two_view import best_two_view
+from geogs.tracking.matching.two_view import best_two_view, without
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -57,6 +57,7 @@ def try_candidate(
     if found is None:
         return None
     best, view = 1 + 2 * found[0], found[1]
+    flows = [without(f, view.apart) for f in flows]
     depth = grid_fields(grid).fill(view.inverse_depth, view.good.float())
     poses = [torch.eye(4, dtype=torch.float64)]
     for n, match in enumerate(flows):

@@ -15,6 +15,7 @@ from torch.nn.functional import avg_pool2d
 
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.problem import source_chunks
+from geogs.bundle.projection import project, relative_motion
 from geogs.bundle.rigidity import best_residuals
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
@@ -26,9 +27,9 @@ WORSE = 3.0
 """Times the usual residual of all edges that of one of them is at most taken to be."""
 MOST = 10.0
 """Times the usual residual that a single match can speak for motion."""
-RELEASED = 0.75
-"""Part of the threshold below which what was held for moving is scene again, as long as only the
-pairs of a window tell: along a straight road a car ahead suits their epipolar lines for a while."""
+STANDING = 0.25
+"""Part of the scene's usual parallax below which a cell keeps its place in the image, as something
+infinitely far would: what moves with the camera does, too, and is not scene again by that."""
 ENOUGH = 0.7
 """Matches per cell of a surrounding from which it can be decided."""
 FILLED = 0.8
@@ -75,20 +76,20 @@ def update_dynamic(
     edges: Mapping[Pair, Edge],
     decided: Sequence[Pair],
     threshold: float,
-    released: float = 1.0,
 ) -> None:
     """Say anew of the sources of some directed edges which of their cells move.
 
     ``decided`` are all edges of these sources that have a say; where they say too little of a cell,
     it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
-    residual around a cell must be; around one that was held for moving ``released`` of that.
+    residual around a cell must be. One that was held for moving and keeps its place in the image
+    (``STANDING``) is held on.
     """
     directed = sorted(decided)
     if not directed:
         return
     source = torch.tensor([i for i, _ in directed])
     for chunk in source_chunks(source, EDGES_TOGETHER):
-        residual, static = _residuals(keyframes, edges, directed[chunk])
+        residual, parallax, static = _residuals(keyframes, edges, directed[chunk])
         ratio = (residual / _usual(residual, static)[:, None]).clamp(max=MOST)
         ids, row = source[chunk].unique(return_inverse=True)
         row = row.to(ratio.device)
@@ -97,8 +98,12 @@ def update_dynamic(
         total = total.index_add(0, row, ratio.nan_to_num(0.0))
         before = [keyframes[k].moving for k in ids.tolist()]
         none = torch.zeros_like(static[0])
-        dynamic = torch.stack([none if b is None else b for b in before])
-        dynamic = dynamic_cells(keyframes.grid, total, count, dynamic, threshold, released)
+        held = torch.stack([none if b is None else b for b in before])
+        dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
+        # The median over the static cells of an edge is its usual parallax.
+        usual = torch.where(static, parallax, torch.nan).nanmedian(1).values[:, None]
+        moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
+        dynamic |= held & (count > 0) & (moved < STANDING * count)
         for n, k in enumerate(ids.tolist()):
             keyframes[k].moving = dynamic[n].clone()
 
@@ -109,10 +114,8 @@ def dynamic_cells(
     count: Float[Tensor, "n p"],
     before: Bool[Tensor, "n p"],
     threshold: float,
-    released: float = 1.0,
 ) -> Bool[Tensor, "n p"]:
-    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold,
-    ``released`` of it where a cell was dynamic ``before``.
+    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold.
 
     A cell that cannot be decided goes with its surroundings, and each with the majority of those
     around it, so that what moves includes its border. All stay what they were ``before`` where none
@@ -120,8 +123,7 @@ def dynamic_cells(
     """
     near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
     known = seen >= ENOUGH
-    most = torch.where(before, released * threshold, threshold)
-    core = (near > most * seen) & known
+    core = (near > threshold * seen) & known
     is_known = known.any(1, keepdim=True) & (core.sum(1) <= FILLED * known.sum(1))[:, None]
     filled = grid_fields(grid).fill(core.to(total), known.to(total))
     return torch.where(is_known, _mean(grid, filled, 5) >= REGION, before)
@@ -153,19 +155,24 @@ def _static(
 
 def _residuals(
     keyframes: KeyframeSet, edges: Mapping[Pair, Edge], directed: Sequence[Pair]
-) -> tuple[Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
-    """Best residuals of some edges, not a number without a match; and what is static."""
+) -> tuple[Float[Tensor, "e p"], Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
+    """Best residuals of some edges, and pixels that no rotation explains, neither a number without
+    a match; and what is static."""
     grid = keyframes.grid
     ids = sorted({k for e in directed for k in e})
     slot = {k: n for n, k in enumerate(ids)}
     pixels, weight = edge_matches(grid, [edges[e] for e in directed])
+    poses = keyframes.poses(ids)
+    first, second = (torch.tensor([slot[e[k]] for e in directed]) for k in (0, 1))
     residual = best_residuals(
-        grid.camera, grid.rays, keyframes.poses(ids), keyframes.inverse_depths(ids),
-        torch.tensor([slot[i] for i, _ in directed]), torch.tensor([slot[j] for _, j in directed]),
-        pixels, weight,
-    )  # fmt: skip
-    residual = torch.where(weight[..., 0] > 0, residual, torch.nan)
-    return residual, _static(keyframes, directed, pixels)
+        grid.camera, grid.rays, poses, keyframes.inverse_depths(ids), first, second, pixels, weight
+    )
+    T_ji = relative_motion(poses, first, second).to(pixels)
+    far = project(grid.camera, grid.rays, T_ji, torch.zeros_like(residual)).pixels
+    is_matched = weight[..., 0] > 0
+    residual = torch.where(is_matched, residual, torch.nan)
+    parallax = torch.where(is_matched, (pixels - far).norm(dim=-1), torch.nan)
+    return residual, parallax, _static(keyframes, directed, pixels)
 
 
 def _usual(residual: Float[Tensor, "e p"], static: Bool[Tensor, "e p"]) -> Float[Tensor, "e"]:

@@ -203,14 +203,14 @@ class FrameGraph:
         )
         return problem, ids
 
-    def update_dynamic(self, ids: Collection[int], threshold: float, released: float = 1.0) -> None:
+    def update_dynamic(self, ids: Collection[int], threshold: float) -> None:
         """Say anew which cells of some keyframes move, by all their edges (:func:`update_dynamic`).
 
         A threshold of 0 says nothing.
         """
         if threshold > 0:
             decided = [e for e in self.edges if e[0] in ids]
-            update_dynamic(self.keyframes, self.edges, decided, threshold, released)
+            update_dynamic(self.keyframes, self.edges, decided, threshold)
 
     def adjust(
         self,

@@ -11,8 +11,9 @@ from enum import Enum
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.protocols import BundleOptions
@@ -115,10 +116,12 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
     segment = graph.keyframes
     chosen, view = best
     keyframes, fields = list(segment), grid_fields(segment.grid)
-    for keyframe in keyframes:
-        keyframe.moving = None  # what a failed attempt held for moving was judged by wrong poses
     first = keyframes[0]
     device, grid = segment.grid.device, SampleGrid(segment.grid.camera)
+    # What a failed attempt held for moving was judged by wrong poses.
+    held = [view.apart, *(_carried(grid, view.apart, match) for match in flows)]
+    for keyframe, cells in zip(keyframes, held, strict=True):
+        keyframe.moving = cells.to(device) if view.apart.any() else None
     first.T_cw, known = torch.eye(4, dtype=torch.float64), view.good
     first.information = known.float().to(device)
     first.inverse_depth = fields.fill(view.inverse_depth.to(device), first.information)
@@ -137,11 +140,22 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
         )
 
 
+def _carried(grid: SampleGrid, cells: Bool[Tensor, "p"], match: FlowMatch) -> Bool[Tensor, "p"]:
+    """Where some cells of the first view, and those around, lie in another; all on the CPU."""
+    there, inside = grid.cells_of(match.pixels[0, cells & match.sure()[0]])
+    found = torch.zeros(1, 1, grid.height, grid.width)
+    found.view(-1)[there[inside]] = 1.0
+    return max_pool2d(found, 3, 1, 1).view(-1) > 0
+
+
 def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
     """Pose of a keyframe by PnP on the depth of the one before it, or that one's pose."""
     grid, pair = graph.keyframes.grid, [before.encoded, keyframe.encoded]
     ((match, _),) = guided_flows(grid, graph.operator, pair[:1], pair[1:])
-    T_rel = pnp(grid, before.inverse_depth, match.pixels[0], match.sure()[0])
+    good = match.sure()[0]
+    if before.moving is not None:
+        good = good & ~before.moving
+    T_rel = pnp(grid, before.inverse_depth, match.pixels[0], good)
     return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
 
 
