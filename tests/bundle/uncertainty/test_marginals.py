@@ -20,6 +20,7 @@ from geogs.bundle.uncertainty.marginals import (
     Marginals,
     common_errors,
     marginals,
+    weighted_median,
 )
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
@@ -233,3 +234,25 @@ def test_parts_of_a_large_problem_are_fetched():
     assert len(parts) > 4
     assert torch.equal(one.pose, other.pose)
     assert torch.equal(one.relative_depth, other.relative_depth)
+
+
+def test_half_of_what_is_said_lies_below_the_weighted_median():
+    """Against copies: each value as many times as it weighs."""
+    g = torch.Generator().manual_seed(3)
+    values, copies = torch.randn(40, generator=g), torch.randint(1, 9, (40,), generator=g)
+    expected = values.repeat_interleave(copies).median()  # the lower one of two in the middle
+    assert weighted_median(values, copies.float()) == pytest.approx(expected.item())
+    assert weighted_median(values[:1], torch.ones(1)) == pytest.approx(values[0].item())
+
+
+def test_matches_that_say_nothing_do_not_tell_how_well_others_fit():
+    grid, problem = turning(0.1)
+    g = torch.Generator().manual_seed(4)
+    noise = 0.5 * torch.randn(problem.pixels.shape, generator=g)
+    noisy = replace(problem, pixels=problem.pixels + noise)
+    whole = marginals(grid, noisy, EXACT).normalised_residual
+    assert float(whole.mean()) == pytest.approx(math.sqrt(2 * math.log(2)), rel=0.05)
+    is_bare = torch.arange(grid.size) % 3 > 0
+    weight = torch.where(is_bare[:, None], 1e-3, 1.0) * noisy.weight
+    found = marginals(grid, replace(noisy, weight=weight), EXACT).normalised_residual
+    torch.testing.assert_close(found, whole, rtol=0.2, atol=0)

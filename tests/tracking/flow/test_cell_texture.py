@@ -7,6 +7,8 @@ from geogs.tracking.flow.cell_texture import (
     SHARP,
     UNINFORMED,
     cell_structure,
+    common_tensor,
+    structure_of,
     structure_tensor,
 )
 from geogs.world.grid import OFFSET, STRIDE
@@ -63,3 +65,51 @@ def test_it_is_what_one_coordinate_is_known_to_while_the_other_is_open() -> None
     assert found.min() < 0.1
     assert found.max() > 0.5
     np.testing.assert_allclose(found, np.array(expected), rtol=1e-3)
+
+
+def test_what_images_have_in_common_is_the_mean_product_of_their_gradients() -> None:
+    """Against Sobel's operator and the mean written out, pixel by pixel."""
+    rng = np.random.default_rng(2)
+    images = rng.integers(0, 255, (2, 12, 14)).astype(np.uint8)
+    window = 5
+    padded = np.pad(images.astype(np.float64), [(0, 0), (1, 1), (1, 1)], mode="reflect")
+    gradients = np.zeros((2, 2, 12, 14))
+    smooth, change = np.array([1, 2, 1]), np.array([-1, 0, 1])
+    for v in range(12):
+        for u in range(14):
+            around = padded[:, v : v + 3, u : u + 3]
+            gradients[:, 0, v, u] = np.einsum("nab,a,b->n", around, smooth, change) / 8
+            gradients[:, 1, v, u] = np.einsum("nab,a,b->n", around, change, smooth) / 8
+    border = [(0, 0), (0, 0), (window // 2,) * 2, (window // 2,) * 2]
+    gradients = np.pad(gradients, border, mode="reflect")
+    found = common_tensor(images[0], images[1], window)
+    for v in range(12):
+        for u in range(14):
+            a, b = gradients[:, :, v : v + window, u : u + window].reshape(2, 2, -1)
+            products = a @ b.T / window**2
+            expected = products[0, 0], products[1, 1], (products[0, 1] + products[1, 0]) / 2
+            np.testing.assert_allclose([p[v, u] for p in found], expected, rtol=1e-5, atol=1e-3)
+
+
+def test_noise_is_nothing_that_two_images_have_in_common() -> None:
+    rng = np.random.default_rng(3)
+    size, at = 256, (slice(OFFSET, -3, STRIDE),) * 2
+    y, x = np.mgrid[:size, :size]
+    bare = np.full((size, size), 128.0)
+    waves = bare + 3 * np.sin(0.5 * x) + 3 * np.sin(0.5 * y)
+
+    def certainty(scene: np.ndarray, noise: float, is_common: bool) -> float:
+        """Mean of the cells, by one noisy image or by what two of them have in common."""
+        one, two = (
+            np.rint(scene + noise * rng.standard_normal(scene.shape)).astype(np.uint8)
+            for _ in range(2)
+        )
+        tensor = common_tensor(one, two if is_common else one)
+        return float(structure_of(*(p[at].reshape(-1) for p in tensor)).certainty.mean())
+
+    clean = certainty(waves, 0.0, False)
+    assert 0.4 < clean < 0.6
+    assert certainty(bare, 3.0, False) > 0.7
+    assert certainty(bare, 3.0, True) < 0.12
+    assert certainty(waves, 3.0, False) > 0.95
+    assert certainty(waves, 3.0, True) == pytest.approx(clean, abs=0.08)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from geogs.bundle.projection import project
+from geogs.tracking.flow import classical_flow
 from geogs.tracking.flow.classical_flow import ClassicalFlow, match_deviation
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
@@ -108,6 +109,21 @@ def test_little_of_noise_is_matched(operator, views):
     noise = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
     there, _ = operator.measure([views[0]], [operator.encode(noise)], THERE, BACK)
     assert float((there.weight[..., 0] > 0).float().mean()) < 0.3
+
+
+@pytest.mark.parametrize("fine", [True, False])
+def test_a_bare_wall_says_little_however_noisy_the_images_are(monkeypatch, operator, fine):
+    monkeypatch.setattr(classical_flow, "SMALL_IMAGE", 0)
+    rng = np.random.default_rng(5)
+    clean = render(A)[0].astype(np.float64)
+    clean[:, : CAMERA.width // 2] = 128
+    noisy = (np.clip(clean + rng.normal(0, 5, clean.shape), 0, 255) for _ in range(2))
+    a, b = (operator.encode(image.astype(np.uint8)) for image in noisy)
+    there, _ = operator.measure([a], [b], GRID.pixels[None], GRID.pixels[None], fine)
+    weight = there.weight[0].mean(-1) * match_deviation(np.zeros(1), np.zeros(1)).item() ** 2
+    is_bare = GRID.pixels[:, 0] < CAMERA.width // 2 - 12
+    is_textured = GRID.pixels[:, 0] > CAMERA.width // 2 + 12
+    assert float(weight[is_bare].mean()) < 0.1 * float(weight[is_textured].mean())
 
 
 def test_grey_levels_are_those_of_the_image(operator):

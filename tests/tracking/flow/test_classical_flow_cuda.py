@@ -80,15 +80,13 @@ def test_a_subpixel_shift_is_found(device: str, start: str) -> None:
         assert not used[~grid.inside(truth, 0.0)].any()
 
 
-def test_certainty_and_texture_are_those_of_the_cpu(device: str) -> None:
+def test_texture_is_that_of_the_cpu(device: str) -> None:
     operator = operator_on(device)
     camera = operator.grid.camera
     image = shifted(texture(camera.width, camera.height), 0, 0)
     image[:, camera.width // 2 :] = image[:, camera.width // 2 :] // 60 + 90
     reference = ClassicalFlow(SampleGrid(camera))
     expected, found = reference.encode(image), operator.encode(image)
-    certainty = found.data[operator._layout.certainty :].cpu().numpy().reshape(-1, 2)
-    np.testing.assert_allclose(certainty, expected.certainty, rtol=4e-3, atol=2e-3)
     share = operator.texture(found)
     assert 0.3 < share < 0.7
     assert share == pytest.approx(reference.texture(expected), abs=2 / operator.grid.size)

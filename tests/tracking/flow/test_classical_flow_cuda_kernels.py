@@ -10,6 +10,7 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow import classical_flow_cuda
+from geogs.tracking.flow.cell_texture import SHARP, UNINFORMED
 from geogs.tracking.flow.classical_flow import ClassicalFlow, _DenseFlow
 from geogs.tracking.flow.classical_flow_cuda import DEVIATION, SOURCES, CudaClassicalFlow
 from geogs.tracking.flow.start_flow import StartFlow
@@ -180,7 +181,10 @@ def test_matches_are_those_of_the_cpu(device: torch.device, level: int) -> None:
     grid = SampleGrid(camera)
     reference, operator = ClassicalFlow(grid), CudaClassicalFlow(SampleGrid(camera, device))
     rng = np.random.default_rng(4)
-    rgb = rng.integers(0, 255, (camera.height, camera.width, 3), np.uint8)
+    # Structure of all strengths, from hardly any to more than counts.
+    waves = smooth(rng, camera.height, camera.width, 2, 1.0)
+    waves *= np.geomspace(2, 60, camera.width, dtype=np.float32) / waves.std()
+    rgb = np.repeat(np.clip(127 + waves, 0, 255).astype(np.uint8)[..., None], 3, -1)
     half = reference._half if level else reference._full
     h, w = half.u.shape
     # The two directions nearly undo each other.
@@ -188,7 +192,11 @@ def test_matches_are_those_of_the_cpu(device: torch.device, level: int) -> None:
     back = -there + np.stack([smooth(rng, h, w, 5, 0.3) for _ in "xy"], -1)
     warp = np.stack([smooth(rng, grid.height, grid.width, 3, 2.0) for _ in "xy"], -1)
     start = np.stack([grid.pixels.numpy() + s * warp.reshape(-1, 2) for s in (1, -1)])
-    flows = [_DenseFlow(half, StartFlow(s * warp), f) for s, f in ((1, there), (-1, back))]
+    image = reference.encode(rgb)
+    grey = image.half if level else image.grey
+    flows = [
+        _DenseFlow(half, StartFlow(s * warp), f, grey, grey) for s, f in ((1, there), (-1, back))
+    ]
 
     encoded = operator.encode(rgb)
     table = torch.tensor([encoded.data.data_ptr()] * 2, device=device)
@@ -196,13 +204,20 @@ def test_matches_are_those_of_the_cpu(device: torch.device, level: int) -> None:
     begin = torch.from_numpy(start).to(device)
     pixels = torch.empty(2, grid.size, 2, device=device)
     weight = torch.empty_like(pixels)
+    pyramid = operator._layout.pyramid
+    warped = encoded.data[:pyramid].repeat(2, 1)
+    found = torch.empty(2, h, w, device=device)
+    operator._kernels["flow_found"](
+        (-(-w // 32), -(-h // 8), 2), (32, 8), warped, dense, found, pyramid, camera.width,
+        camera.height, level,
+    )  # fmt: skip
     operator._kernels["flow_match"](
-        (-(-grid.size // 8), 2), (32, 8), table, dense, begin[0], begin[1], pixels, weight, 1,
-        camera.width, camera.height, grid.width, grid.height, level,
-        operator._layout.certainty, 1.0, *((1.7 if level else 1.0) * d for d in DEVIATION),
+        (-(-grid.size // 8), 2), (32, 8), table, dense, begin[0], begin[1], found, pixels, weight,
+        1, camera.width, camera.height, grid.width, grid.height, level, SHARP, UNINFORMED, 1.0,
+        *((1.7 if level else 1.0) * d for d in DEVIATION),
     )  # fmt: skip
     for k in (0, 1):
-        expected, expected_weight = reference._match(reference.encode(rgb), flows[k], flows[1 - k])
+        expected, expected_weight = reference._match(flows[k], flows[1 - k])
         # OpenCV interpolates at steps of 1/32 pixel.
         np.testing.assert_allclose(pixels[k].cpu().numpy(), expected, atol=0.03)
         for axis in (0, 1):
@@ -212,4 +227,4 @@ def test_matches_are_those_of_the_cpu(device: torch.device, level: int) -> None:
             assert both.mean() > 0.3
             ratio = np.sqrt(a[both] / b[both])
             assert np.abs(np.median(ratio) - 1) < 0.01
-            assert np.quantile(np.abs(ratio - 1), 0.9) < (0.15 if level else 0.05)
+            assert np.quantile(np.abs(ratio - 1), 0.9) < (0.2 if level else 0.05)

@@ -64,7 +64,8 @@ class Marginals:
     """Deviation of the inverse depth of some cells of each frame, as a part of it."""
     normalised_residual: Float[Tensor, "n"]
     """Median residual of the matches from each frame, in their own standard deviations (two
-    dimensions): 1.2 where errors are as expected, more where the scene is not as modelled."""
+    dimensions), each counted by what it says: 1.2 where errors are as expected, more where the
+    scene is not as modelled."""
 
     @property
     def pose(self) -> Float[Tensor, "n 6 6"]:
@@ -222,12 +223,24 @@ def pose_covariance(problem: AnyProblem, H: Float[Tensor, "m m"]) -> Float[Tenso
 def _normalised_residual(
     problem: AnyProblem, part: ThinnedProblem, options: BundleOptions
 ) -> Float[Tensor, "n"]:
-    """Median residual from each frame; infinite without matches."""
+    """Median residual from each frame; infinite without matches.
+
+    On a bare wall the flow goes on as it does around: residuals of matches that say next to nothing
+    are a small part of their deviations, however well or badly the others fit, so that by number
+    alone the more of an image is bare, the better all would seem to be known.
+    """
     found = torch.full((len(problem.T_cw),), torch.inf)
-    for frame, norm in part.residuals(options):
+    for frame, norm, information in part.residuals(options):
         if len(norm):
-            found[frame] = norm.median()
+            found[frame] = weighted_median(norm, information)
     return found
+
+
+def weighted_median(values: Float[Tensor, "m"], weights: Float[Tensor, "m"]) -> float:
+    """The least value up to which lies half of the weight; there is at least one."""
+    order = values.argsort()
+    below = weights[order].double().cumsum(0)
+    return float(values[order[int(torch.searchsorted(below, below[-1] / 2))]])
 
 
 def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:

@@ -57,8 +57,11 @@ class ThinnedProblem:
         told = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
         return torch.where(told[:, None], left / scale[:, None], 0.0)
 
-    def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
-        """Each source in order, and norms of its matches' residuals in standard deviations."""
+    def residuals(
+        self, options: BundleOptions
+    ) -> Iterator[tuple[int, Float[Tensor, "m"], Float[Tensor, "m"]]]:
+        """Each source in order, norms of its matches' residuals in standard deviations, and what
+        these matches say along both axes together, 1 / pixel^2."""
         for part in self.parts(options):
             i, j = part.source, part.target
             T_ji = relative_motion(part.T_cw, i, j)
@@ -66,7 +69,8 @@ class ThinnedProblem:
             norm = residual_norms(at, part.pixels, part.weight)
             used = at.valid & (part.weight[..., 0] > 0)
             for frame, edges in sources_within(i):
-                yield frame, norm[edges][used[edges]]
+                own = used[edges]
+                yield frame, norm[edges][own], part.weight[edges].sum(-1)[own]
 
     def parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
         """Some edges at a time, with the terms of depths."""

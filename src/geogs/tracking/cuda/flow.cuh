@@ -77,6 +77,19 @@ __device__ __forceinline__ float sample_cubic(const float* image, int width, int
   return sum;
 }
 
+__device__ __forceinline__ int mirrored(int i, int size) {
+  return i < 0 ? -i : (i >= size ? 2 * size - 2 - i : i);
+}
+
+// Gradient at a pixel by Sobel's operator, mirrored at the border; grey levels / pixel.
+__device__ __forceinline__ float2 gradient_at(const float* image, int width, int height, int u, int v) {
+  int l = mirrored(u - 1, width), r = mirrored(u + 1, width);
+  const float *above = image + mirrored(v - 1, height) * width, *row = image + v * width;
+  const float* below = image + mirrored(v + 1, height) * width;
+  return make_float2((above[r] - above[l] + 2.f * (row[r] - row[l]) + below[r] - below[l]) / 8.f,
+                     (below[l] - above[l] + 2.f * (below[u] - above[u]) + below[r] - above[r]) / 8.f);
+}
+
 // Position of the sample grid's first cell and its spacing, in pixels.
 #define GRID_OFFSET 4
 #define GRID_STRIDE 8

@@ -46,10 +46,6 @@ extern "C" __global__ void flow_grey(const unsigned char* rgb, float* out, int* 
   write_levels(tile, out, width, height, levels);
 }
 
-__device__ __forceinline__ int mirrored(int i, int size) {
-  return i < 0 ? -i : (i >= size ? 2 * size - 2 - i : i);
-}
-
 // Mean brightness around a pixel of MEAN_LEVEL: Gaussian of 1/16 of the long edge; one warp.
 __device__ float local_mean(const float* pyramid, int width, int height, int x, int y) {
   Level size = pyramid_level(width, height, MEAN_LEVEL);
@@ -68,11 +64,9 @@ __device__ float local_mean(const float* pyramid, int width, int height, int x, 
   return warp_sum(sum) / warp_sum(total);
 }
 
-// What a match of each cell of the grid says along x and along y, by the structure tensor over 9 x 9
-// pixels around it: each eigenvalue l becomes min(1, l / sharp + uninformed), and of either axis
-// counts what is known while the other is open. The number of cells whose smaller eigenvalue (grey
-// levels^2 / pixel^2) is above `least`, and the local means. A warp each.
-extern "C" __global__ void flow_structure(float* image, int* textured, int width, int height, int grid_width, int grid_height, int mean_offset, int certainty_offset, float least, float sharp, float uninformed) {
+// The number of cells of the grid whose structure tensor over 9 x 9 pixels has a smaller eigenvalue
+// (grey levels^2 / pixel^2) above `least`, and the local means. A warp each.
+extern "C" __global__ void flow_structure(float* image, int* textured, int width, int height, int grid_width, int grid_height, int mean_offset, float least) {
   int index = blockIdx.x * blockDim.y + threadIdx.y, lane = threadIdx.x;
   int cells = grid_width * grid_height;
   Level coarse = pyramid_level(width, height, MEAN_LEVEL);
@@ -87,25 +81,16 @@ extern "C" __global__ void flow_structure(float* image, int* textured, int width
   float xx = 0.f, yy = 0.f, xy = 0.f;
   for (int k = lane; k < 81; k += 32) {
     int u = mirrored(x + k % 9 - 4, width), v = mirrored(y + k / 9 - 4, height);
-    int l = mirrored(u - 1, width), r = mirrored(u + 1, width);
-    const float* above = image + mirrored(v - 1, height) * width;
-    const float *row = image + v * width, *below = image + mirrored(v + 1, height) * width;
-    float gx = (above[r] - above[l] + 2.f * (row[r] - row[l]) + below[r] - below[l]) / 8.f;
-    float gy = (below[l] - above[l] + 2.f * (below[u] - above[u]) + below[r] - above[r]) / 8.f;
-    xx += gx * gx;
-    yy += gy * gy;
-    xy += gx * gy;
+    float2 g = gradient_at(image, width, height, u, v);
+    xx += g.x * g.x;
+    yy += g.y * g.y;
+    xy += g.x * g.y;
   }
   xx = warp_sum(xx) / 81.f;
   yy = warp_sum(yy) / 81.f;
   xy = warp_sum(xy) / 81.f;
   if (lane) return;
   float half = 0.5f * (xx - yy), mean = 0.5f * (xx + yy), radius = sqrtf(half * half + xy * xy);
-  float across = fminf(1.f, (mean + radius) / sharp + uninformed);
-  float along = fminf(1.f, (mean - radius) / sharp + uninformed);
-  float in_x = 0.5f + 0.5f * half / fmaxf(radius, 1e-6f);  // squared cosine of the direction across
-  image[certainty_offset + 2 * index] = across * along / (across + (along - across) * in_x);
-  image[certainty_offset + 2 * index + 1] = across * along / (along + (across - along) * in_x);
   if (mean - radius > least) atomicAdd(textured, 1);
 }
 

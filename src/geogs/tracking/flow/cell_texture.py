@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from geogs.world.grid import OFFSET, STRIDE
 
@@ -51,7 +51,10 @@ class CellStructure:
         in either.
         """
         eigenvalues = (self.mean + self.radius, self.smaller)
-        across, along = (np.minimum(1, value / SHARP + UNINFORMED) for value in eigenvalues)
+        # Of what two images have in common they may be negative, which is nothing.
+        across, along = (
+            np.clip(value / SHARP, 0, 1 - UNINFORMED) + UNINFORMED for value in eigenvalues
+        )
         in_x = 0.5 + 0.5 * self.half / np.maximum(self.radius, 1e-6)  # squared cosine of across
         x, y = along + (across - along) * in_x, across + (along - across) * in_x
         return np.stack([across * along / y, across * along / x], -1)
@@ -59,7 +62,15 @@ class CellStructure:
 
 def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> CellStructure:
     """Structure of an image at the cells of the sample grid."""
-    xx, yy, xy = (p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(grey))
+    return structure_of(
+        *(p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(grey))
+    )
+
+
+def structure_of(
+    xx: Float[np.ndarray, "p"], yy: Float[np.ndarray, "p"], xy: Float[np.ndarray, "p"]
+) -> CellStructure:
+    """That of tensors at the cells."""
     half = (xx - yy) / 2
     return CellStructure((xx + yy) / 2, half, np.sqrt(half * half + xy * xy))
 
@@ -73,7 +84,25 @@ def structure_tensor(
     grey: UInt8[np.ndarray, "h w"],
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """Squares and product of the gradient's parts, xx, yy and xy, averaged over 9 x 9 pixels."""
-    gx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
-    gy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)
-    xx, yy, xy = (cv2.boxFilter(p, -1, (9, 9)) for p in (gx * gx, gy * gy, gx * gy))
+    return common_tensor(grey, grey)
+
+
+def common_tensor(
+    first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], window: int = 9
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Structure tensor of what two images have in common that show the same at each pixel: products
+    of the gradients of the one and of the other, averaged over a window of so many pixels a side.
+
+    Noise adds its own gradients' squares to the structure of an image, but nothing to this in the
+    mean, as that of two images is independent.
+    """
+    ax, ay = _gradients(first)
+    bx, by = (ax, ay) if second is first else _gradients(second)
+    products = ax * bx, ay * by, (ax * by + ay * bx) / 2
+    xx, yy, xy = (cv2.boxFilter(p, -1, (window, window)) for p in products)
     return xx, yy, xy
+
+
+def _gradients(grey: UInt8[np.ndarray, "h w"]) -> list[Float32[np.ndarray, "h w"]]:
+    """Along x and y, grey levels / pixel."""
+    return [cv2.Sobel(grey, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))]

@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.threads import opencv_on_one_thread, worker_count
-from geogs.tracking.flow.cell_texture import cell_structure
+from geogs.tracking.flow.cell_texture import cell_structure, common_tensor, structure_of
 from geogs.tracking.flow.flow_operator import Memories
 from geogs.tracking.flow.start_flow import Lattice, StartFlow
 from geogs.types import FlowMatch
@@ -43,8 +43,6 @@ class ClassicalImage:
     """The same at half resolution; its pixel x is 2 x + 1/2 of the image."""
     textured: float
     """Fraction of the grid that has texture."""
-    certainty: Float[np.ndarray, "p 2"]
-    """What matches of the cells say along x and y, see :class:`CellStructure`."""
 
 
 class _Level:
@@ -77,6 +75,9 @@ class _DenseFlow:
     """Image pixels, over cells of the grid."""
     rest: np.ndarray
     """On the level's pixels, level pixels."""
+    source: UInt8[np.ndarray, "a b"]
+    target: UInt8[np.ndarray, "a b"]
+    """The images that it is the flow between; the latter is warped already."""
 
     def at(self, points: Float[np.ndarray, "p 2"], outside: float) -> Float[np.ndarray, "p 2"]:
         """Flow of image points; ``outside`` where they are not in the image."""
@@ -93,6 +94,16 @@ class _DenseFlow:
         window = 8 // self.level.step + 1
         return _sample(cv2.blur(norm, (window, window)), self.level.from_image(points), None)
 
+    def certainty(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2"]:
+        """What matches of image points say along x and y, by what both images show there."""
+        level = self.level
+        x, y = level.u + self.rest[..., 0], level.v + self.rest[..., 1]
+        found = _warped(self.target, x, y)
+        tensor = common_tensor(self.source, found, 8 // level.step + 1)
+        # Gradients of the level are by its own pixels.
+        at = level.from_image(points)
+        return structure_of(*(_sample(p, at, None) / level.step**2 for p in tensor)).certainty
+
 
 class ClassicalFlow:
     """The DIS operator on one grid; directions and images are matched side by side in threads."""
@@ -108,8 +119,7 @@ class ClassicalFlow:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         even = np.pad(grey, [(0, n % 2) for n in grey.shape], mode="edge")
         half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        structure = cell_structure(grey)
-        return ClassicalImage(grey, half, structure.textured_fraction, structure.certainty)
+        return ClassicalImage(grey, half, cell_structure(grey).textured_fraction)
 
     def texture(self, encoded: ClassicalImage) -> float:
         return encoded.textured
@@ -136,7 +146,7 @@ class ClassicalFlow:
         pool = self._workers()
         flows = list(pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
-        matches = list(pool.map(self._match, a, flows, reverse))
+        matches = list(pool.map(self._match, flows, reverse))
         pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
@@ -182,11 +192,9 @@ class ClassicalFlow:
         target = _match_brightness(target, source)
         # OpenCV makes the output where None is given, which its stubs do not say.
         flow = self._dis(start is None).calc(source, target, None)  # type: ignore[call-overload]
-        return _DenseFlow(level, warp, flow)
+        return _DenseFlow(level, warp, flow, source, target)
 
-    def _match(
-        self, image: ClassicalImage, there: _DenseFlow, back: _DenseFlow
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _match(self, there: _DenseFlow, back: _DenseFlow) -> tuple[np.ndarray, np.ndarray]:
         """Positions on the grid and their weights."""
         flow = there.at(self._pixels, 0.0)
         q = self._pixels + flow
@@ -198,7 +206,7 @@ class ClassicalFlow:
         if there.level.step > 1:
             deviation = deviation * COARSE_DEVIATION
         # Without texture the flow stays where it started, smooth and consistent but uninformed.
-        weight = (ok / deviation**2)[:, None] * image.certainty
+        weight = (ok / deviation**2)[:, None] * there.certainty(self._pixels)
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
         return q, weight.astype(np.float32)
 

@@ -77,8 +77,7 @@ class CudaImage:
     """An image as the operator keeps it, on the device."""
 
     data: Float[Tensor, "n"]
-    """Grey pyramid, local means of the brightness, what matches of the cells say along x and y (see
-    :func:`~geogs.tracking.flow.cell_texture.CellStructure`), one after the other."""
+    """Grey pyramid, then local means of the brightness."""
     textured: Int[Tensor, "1"]
     """Number of cells with structure, int32."""
 
@@ -95,8 +94,7 @@ class _Layout:
         self.pyramid = sum(w * h for w, h in self.sizes)
         w, h = self.sizes[MEAN_LEVEL]
         self.means = w * h
-        self.certainty = self.pyramid + self.means
-        self.total = self.certainty + 2 * grid.size
+        self.total = self.pyramid + self.means
         self.coarsest = max(k for k, size in enumerate(self.sizes) if min(size) >= PATCH or k == 0)
 
     def patches(self, level: int) -> int:
@@ -129,8 +127,7 @@ class CudaClassicalFlow:
         self._kernels["flow_grey"](_tiles(w, h), (TILE, 8), rgb, data, textured, w, h, LEVELS)
         self._kernels["flow_structure"](
             -(-(grid.size + layout.means) // 8), (32, 8), data, textured, w, h,
-            grid.width, grid.height, layout.pyramid, layout.certainty, MIN_STRUCTURE, SHARP,
-            UNINFORMED,
+            grid.width, grid.height, layout.pyramid, MIN_STRUCTURE,
         )  # fmt: skip
         return CudaImage(data, textured)
 
@@ -175,12 +172,18 @@ class CudaClassicalFlow:
         forward, backward = (None, None) if start is None else start
         warped = self._warped(table, forward, backward)
         flow = self._coarse_to_fine(table, warped, start is None, finest)
+        width, height = layout.sizes[finest]
+        found = torch.empty(2 * pairs, height, width, device=self.device)
+        self._kernels["flow_found"](
+            (-(-width // 32), -(-height // 8), 2 * pairs), (32, 8), warped, flow, found,
+            layout.pyramid, w, h, finest,
+        )  # fmt: skip
         pixels = torch.empty(2, pairs, grid.size, 2, device=self.device)
         weight = torch.empty_like(pixels)
         scale = COARSE_DEVIATION if finest else 1.0
         self._kernels["flow_match"](
-            (-(-grid.size // 8), 2 * pairs), (32, 8), table, flow, forward, backward, pixels,
-            weight, pairs, w, h, grid.width, grid.height, finest, layout.certainty,
+            (-(-grid.size // 8), 2 * pairs), (32, 8), table, flow, forward, backward, found,
+            pixels, weight, pairs, w, h, grid.width, grid.height, finest, SHARP, UNINFORMED,
             MAX_DISAGREEMENT, *(scale * d for d in DEVIATION),
         )  # fmt: skip
         return pixels, weight
