@@ -15,7 +15,7 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, PRIOR, SHAPES, LensBend
 from geogs.tracking.calibration.focal_uncertainty import STANDARD_ERRORS
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
-from geogs.tracking.frames.row_errors import TOGETHER, RowErrors
+from geogs.tracking.frames.row_errors import RowErrors, in_parts
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import said_of_lens
 from geogs.tracking.tracker import Tracker
@@ -128,10 +128,8 @@ def _shift(
 ) -> None:
     """Have the measured edges with their matches where a pinhole would have them, whose rows were
     seen over a readout that is longer by a part of it."""
-    grid, keyframes, pairs = graph.keyframes.grid, graph.keyframes, sorted(measured)
-    size = TOGETHER[grid.on_gpu]
-    for start in range(0, len(pairs), size):
-        part = pairs[start : start + size]
+    grid, keyframes = graph.keyframes.grid, graph.keyframes
+    for part in in_parts(sorted(measured), grid.on_gpu):
         T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         shifts = bend.of_matches(grid.camera, grid.rays, T_ji, depth)
         if rows is not None and longer != 0:

@@ -37,11 +37,11 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     log, keyframes = tracker.map.recorder.log, tracker.keyframes
     tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
     times = np.array([r.timestamp for r in tracked], np.float64)
-    around = keyframe_uncertainty(tracker).at(times)
+    errors, edges = row_errors(log, keyframes), tracker.map.graph.edges
+    around = keyframe_uncertainty(tracker, errors).at(times)
     none, unknown = PoseDeviation(0.0, 0.0), PoseDeviation(np.inf, np.inf)
     known = dict.fromkeys((k.frame_index for k in keyframes), none)
     known |= own_deviations(log, keyframes)
-    errors, edges = row_errors(log, keyframes), tracker.map.graph.edges
     twists = None if errors is None else row_twists(errors, keyframes, edges, log, True)
     read = {} if twists is None else dict(zip(twists.frames, twists.leaves_open, strict=True))
     own = [(known.get(r.index, unknown), read.get(r.index, none)) for r in tracked]

@@ -34,8 +34,9 @@ USUAL_RESIDUAL = 0.23
 videos (docs/uncertainty.md has the table)."""
 
 
-def keyframe_uncertainty(tracker: Tracker) -> Uncertainty:
-    """Uncertainty of all keyframes of a tracker that has a map, from its present edges.
+def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> Uncertainty:
+    """Uncertainty of all keyframes of a tracker that has a map, from its present edges; ``errors``
+    are those of its frames' rows where they were solved already.
 
     What it says of poses is what is left of their errors when the trajectory is laid over the truth
     by a similarity, for frame and unit of the map are anyone's
@@ -49,7 +50,8 @@ def keyframe_uncertainty(tracker: Tracker) -> Uncertainty:
     ids = tracker.segment.free
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
-    propagated, rows = np.zeros(2), rows_in_doubt(tracker.map.recorder.log, tracker.keyframes)
+    rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
+    propagated = np.zeros(2)
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
         found = _marginals(tracker, ids[part], rows)

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import linearise
+from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import sparse_cells
-from geogs.tracking.frames.pose_filling import HUBER, depth_aware_weight, observed_rows
-from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
+from geogs.tracking.frames.pose_filling import HUBER, depth_aware_weight, seen_by_keyframes
+from geogs.tracking.frames.row_errors import RowErrors, in_parts
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.locate.pose_deviation import PoseDeviation
 from geogs.world.edges import Edge, Pair, edge_matches, unpacked_positions
@@ -30,14 +31,16 @@ EVIDENCE = 0.02
 
 
 class _Matches(NamedTuple):
-    """Matches that end in frames, corrected for their rows."""
+    """Matches that end in frames."""
 
-    frames: list[int]
+    source: list[int]
+    """Frames that they begin in."""
+    target: list[int]
     T_ji: Float[Tensor, "e 4 4"]
     rays: Float[Tensor, "p 3"]
     inverse_depth: Float[Tensor, "e p"]
-    information: Float[Tensor, "e p"]
     pixels: Float[Tensor, "e p 2"]
+    information: Float[Tensor, "e p"]
     weight: Float[Tensor, "e p 2"]
 
 
@@ -75,10 +78,11 @@ def row_twists(
     """
     sums: dict[int, Float64[Tensor, "12 13"]] = {}
     for part in chain(  # some edges at a time, as their equations take memory
-        _of_keyframes(errors, keyframes, edges, are_corrected),
-        _of_frames(errors, keyframes, log, are_corrected),
+        _of_keyframes(keyframes, edges), _of_frames(errors, keyframes, log, are_corrected)
     ):
-        for frame, equations in zip(part.frames, _equations(errors, keyframes, part), strict=True):
+        if not are_corrected:
+            part = part._replace(pixels=part.pixels + errors.of_matches(*part[:6]).shift)
+        for frame, equations in zip(part.target, _equations(errors, keyframes, part), strict=True):
             sums[frame] = sums.get(frame, 0) + equations
     frames = [*sums]
     A = torch.stack([*sums.values()]) if sums else torch.zeros(0, 12, 13, dtype=torch.float64)
@@ -112,23 +116,21 @@ def _equations(
     p = linearise(keyframes.grid.camera, m.rays, m.T_ji, m.inverse_depth)
     weight = depth_aware_weight(m.weight, p.depth_jacobian, m.information)
     r, w = weighed_residuals(p, m.pixels, weight, HUBER)
-    seconds = errors.seconds(m.frames, m.pixels)
+    seconds = errors.seconds(m.target, m.pixels)
     J = torch.cat([p.pose_jacobian, seconds[:, None, None] * p.pose_jacobian], 1).flatten(2)
     wJ = J * w.mT.flatten(1)[:, None]
     return (wJ @ torch.cat([J, r.mT.flatten(1)[:, None]], 1).mT).double().cpu()
 
 
-def _of_keyframes(
-    errors: RowErrors, keyframes: KeyframeSet, edges: Mapping[Pair, Edge], are_corrected: bool
-) -> Iterator[_Matches]:
+def _of_keyframes(keyframes: KeyframeSet, edges: Mapping[Pair, Edge]) -> Iterator[_Matches]:
     grid = keyframes.grid
-    for part, (shift, _) in edge_shifts(errors, keyframes, edges):
-        source = [i for i, _ in part]
+    for part in in_parts(sorted(edges), grid.on_gpu):
+        ids = [i for i, _ in part]
         pixels, weight = edge_matches(grid, [edges[pair] for pair in part])
         yield _Matches(
+            [keyframes[i].frame_index for i in ids],
             [keyframes[j].frame_index for _, j in part], keyframes.relative_poses(part), grid.rays,
-            keyframes.inverse_depths(source), keyframes.informations(source),
-            pixels if are_corrected else pixels + shift,
+            keyframes.inverse_depths(ids), pixels, keyframes.informations(ids),
             static_weight(keyframes, part, pixels, weight),
         )  # fmt: skip
 
@@ -138,12 +140,13 @@ def _of_frames(
 ) -> Iterator[_Matches]:
     grid = keyframes.grid
     cells = sparse_cells(grid)
-    for part, ids, T_ji, pixels, shift in observed_rows(log, keyframes, errors):
-        corrected = pixels + shift
-        if are_corrected:
-            corrected = unpacked_positions(grid, torch.stack([o.shifted for _, o in part]))
+    for part, ids in seen_by_keyframes(log, keyframes):
+        target = [record.index for record, _ in part]
+        found = torch.stack([o.shifted if are_corrected else o.position for _, o in part])
         yield _Matches(
-            [record.index for record, _ in part], T_ji, grid.rays[cells],
-            keyframes.inverse_depths(ids)[:, cells], keyframes.informations(ids)[:, cells],
-            corrected, torch.stack([o.half_weight for _, o in part]).float(),
+            [keyframes[k].frame_index for k in ids], target,
+            errors.poses(target) @ se3_inverse(keyframes.poses(ids)), grid.rays[cells],
+            keyframes.inverse_depths(ids)[:, cells], unpacked_positions(grid, found),
+            keyframes.informations(ids)[:, cells],
+            torch.stack([o.half_weight for _, o in part]).float(),
         )  # fmt: skip

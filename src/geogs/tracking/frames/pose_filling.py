@@ -16,15 +16,12 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.interpolation import bridged
 from geogs.tracking.frames.rotation_averaging import orientations
-from geogs.tracking.frames.row_errors import RowErrors
+from geogs.tracking.frames.row_errors import RowErrors, in_parts
 from geogs.types import Trajectory
 from geogs.world.edges import in_steps, unpacked_positions
 from geogs.world.frames import FrameLog, FrameRecord, Observation
 from geogs.world.keyframes import KeyframeSet
 
-SOLVED_TOGETHER = 64, 512
-"""Frames whose poses are solved, or observations that are corrected, at a time, on the CPU and on a
-GPU; bounds memory."""
 ITERATIONS = 8
 """Steps of the motion-only adjustment of a frame."""
 HUBER = 3.0
@@ -75,11 +72,13 @@ def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
     return RowErrors(keyframes.grid, frames.rows, indices, solve_trajectory(frames, keyframes))
 
 
-def rows_in_doubt(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
-    """The same where their readout is not known for sure, and where they were not rectified as
-    it is not known at all; none where it was told."""
+def rows_in_doubt(
+    frames: FrameLog, keyframes: KeyframeSet, known: RowErrors | None = None
+) -> RowErrors | None:
+    """The same (``known`` where they were solved already) where their readout is not known for
+    sure, and where they were not rectified as it is not known at all; none where it was told."""
     if frames.open_rows is None:
-        errors = row_errors(frames, keyframes)
+        errors = known or row_errors(frames, keyframes)
     else:
         every = dict.fromkeys((record.index for record in frames.records), frames.open_rows)
         errors = row_errors(replace(frames, rows=every), keyframes)
@@ -89,27 +88,19 @@ def rows_in_doubt(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
 
 def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> None:
     """Correct what was found of frames by the errors of their rows and their keyframes'."""
-    for part, _, _, _, shift in observed_rows(frames, keyframes, errors):
-        steps = in_steps(keyframes.grid.camera, shift)
-        for (_, observation), step in zip(part, steps, strict=True):
-            observation.shift = step
-
-
-def observed_rows(
-    frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors
-) -> Iterator[tuple[list[tuple[FrameRecord, Observation]], list[int], Tensor, Tensor, Tensor]]:
-    """What was found of frames in keyframes, the ids of these and the motions from there, where
-    cells were found, and by how much rows put them off; some at a time."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     for part, ids in seen_by_keyframes(frames, keyframes):
-        T = errors.poses([r.index for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
-        pixels = unpacked_positions(grid, torch.stack([o.position for _, o in part]))
+        seen = [record.index for record, _ in part]
         shifts = errors.of_matches(
-            [keyframes[k].frame_index for k in ids], [r.index for r, _ in part], T,
-            grid.rays[cells], keyframes.inverse_depths(ids)[:, cells], pixels,
+            [keyframes[k].frame_index for k in ids], seen,
+            errors.poses(seen) @ se3_inverse(keyframes.poses(ids)),
+            grid.rays[cells], keyframes.inverse_depths(ids)[:, cells],
+            unpacked_positions(grid, torch.stack([o.position for _, o in part])),
         )  # fmt: skip
-        yield part, ids, T, pixels, shifts.shift
+        steps = in_steps(grid.camera, shifts.shift)
+        for (_, observation), step in zip(part, steps, strict=True):
+            observation.shift = step
 
 
 def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None:
@@ -133,9 +124,7 @@ def seen_by_keyframes(
     at a time."""
     tracked = tracked_on(frames, keyframes)
     seen = [(r, o) for r in tracked for o in r.observations if o.keyframe in keyframes]
-    size = SOLVED_TOGETHER[keyframes.grid.on_gpu]
-    for start in range(0, len(seen), size):
-        part = seen[start : start + size]
+    for part in in_parts(seen, keyframes.grid.on_gpu):
         yield part, [o.keyframe for _, o in part]
 
 
@@ -156,9 +145,7 @@ def observed(
         r for r in tracked
         if r.index not in are_keyframes and any(o.keyframe in keyframes for o in r.observations)
     ]  # fmt: skip
-    size = SOLVED_TOGETHER[keyframes.grid.on_gpu]
-    for start in range(0, len(seen), size):
-        part = seen[start : start + size]
+    for part in in_parts(seen, keyframes.grid.on_gpu):
         yield part, _problem(part, keyframes)
 
 

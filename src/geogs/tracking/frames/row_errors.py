@@ -9,7 +9,7 @@ that by fractions of a pixel, so the matches are corrected to first order and th
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -29,9 +29,11 @@ NODES = 5
 LONGEST_INTERVAL = 0.07
 """Seconds between two frames; over more, their poses say less of the rows than the video does."""
 TOGETHER = 64, 512
-"""Edges that are corrected at a time, on the CPU and on a GPU; bounds memory."""
+"""Edges, or frames, that are looked at together, on the CPU and on a GPU; bounds memory."""
 LARGEST = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
+
+T = TypeVar("T")
 
 
 class RowShifts(NamedTuple):
@@ -275,17 +277,21 @@ def edge_shifts(
     ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame, if not its own.
     """
     frame_of = frame_of or (lambda id: keyframes[id].frame_index)
-    pairs, grid = sorted(measured), keyframes.grid
-    size = TOGETHER[grid.on_gpu]
-    for start in range(0, len(pairs), size):
-        part = pairs[start : start + size]
-        source, target = ([pair[k] for pair in part] for k in (0, 1))
-        T_ji = keyframes.relative_poses(part)
+    grid = keyframes.grid
+    for part in in_parts(sorted(measured), grid.on_gpu):
         pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
         yield part, errors.of_matches(
-            [frame_of(k) for k in source], [frame_of(k) for k in target], T_ji, grid.rays,
-            keyframes.inverse_depths(source), pixels,
+            [frame_of(i) for i, _ in part], [frame_of(j) for _, j in part],
+            keyframes.relative_poses(part), grid.rays,
+            keyframes.inverse_depths([i for i, _ in part]), pixels,
         )  # fmt: skip
+
+
+def in_parts(items: list[T], on_gpu: bool) -> Iterator[list[T]]:
+    """As many of them in turn as are looked at together."""
+    size = TOGETHER[on_gpu]
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
 
 
 def lagrange(
