@@ -1,8 +1,7 @@
 """Rendering the map: one contract, several backends."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
+from geogs.splat.protocols import Forward
 from geogs.splat.reference import render_reference
 from geogs.types import MapSnapshot
 from geogs.world.disks import DiskParameters, GaussianMap
@@ -96,8 +96,8 @@ def chosen_backend(disks: DiskParameters, backend: Backend) -> Literal["referenc
     return backend
 
 
-def passes_of(backend: Literal["cpu", "cuda"]) -> Callable[..., Any]:
-    """The compiled ``rendered`` of a backend."""
+def passes_of(backend: Literal["cpu", "cuda"]) -> Forward:
+    """The compiled passes of a backend."""
     if backend == "cuda":
         from geogs.splat.cuda import passes as on_gpu
 
@@ -127,7 +127,7 @@ class Rasterized(torch.autograd.Function):
             ctx.back = back
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*maps[4:])
-        return cast(tuple[Tensor, ...], maps)
+        return maps
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from jaxtyping import Float, Float64
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
+from geogs.splat.protocols import Forward
 from geogs.splat.reference import render_reference
 from geogs.splat.render import (
     NEAR,
@@ -104,14 +104,15 @@ _Rendered = tuple[RenderOutput, Callable[[_Gradients], RenderGradients]]
 
 
 def _compiled(
-    rendered: Callable[..., Any], disks: DiskParameters, camera: Camera, T_cw: Tensor, near: float
+    rendered: Forward, disks: DiskParameters, camera: Camera, T_cw: Tensor, near: float
 ) -> _Rendered:
-    maps, back = rendered(disks, camera, T_cw, near)
+    maps, back = rendered(disks, camera, T_cw, near, True)
     device = disks.position.device
 
     def backward(gradients: _Gradients) -> RenderGradients:
         there = [None if g is None else g.detach().to(device) for g in gradients]
         d_disks, d_T = back(there, True)
+        assert d_T is not None
         return RenderGradients(d_disks, d_T.view(4, 4))
 
     return RenderOutput(*maps), backward

@@ -1,6 +1,6 @@
 """The two passes of the renderer on a CPU, on tensors, without autograd."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -8,10 +8,9 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
+from geogs.splat.protocols import Backward
 from geogs.threads import worker_count
 from geogs.world.disks import DiskParameters
-
-WayBack = Callable[[Sequence[Tensor | None], bool], tuple[DiskParameters, Tensor | None]]
 
 
 def rendered(
@@ -19,8 +18,8 @@ def rendered(
     camera: Camera,
     T_cw: Float[Tensor, "4 4"],
     near: float,
-    with_trace: bool = True,
-) -> tuple[tuple[Tensor, ...], WayBack]:
+    with_trace: bool,
+) -> tuple[tuple[Tensor, ...], Backward]:
     """Maps of one pose, as a ``RenderOutput`` has them, and what takes their gradients back.
 
     That gives the gradients of the disks and, float64, of the pose; it takes those of depth,

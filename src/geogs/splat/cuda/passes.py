@@ -2,7 +2,7 @@
 
 import functools
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,9 +12,8 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import to_device
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
+from geogs.splat.protocols import Backward
 from geogs.world.disks import DiskParameters
-
-WayBack = Callable[[Sequence[Tensor | None], bool], tuple[DiskParameters, Tensor | None]]
 
 _KEPT = 4
 """Rasterizers at rest; those used longest ago are dropped."""
@@ -80,8 +79,8 @@ def rendered(
     camera: Camera,
     T_cw: Float[Tensor, "*b 4 4"],
     near: float,
-    with_trace: bool = True,
-) -> tuple[tuple[Tensor, ...], WayBack]:
+    with_trace: bool,
+) -> tuple[tuple[Tensor, ...], Backward]:
     """Maps of one pose or of several, as a ``RenderOutput`` has them, on the GPU that holds the
     disks, and what takes their gradients back.
 
