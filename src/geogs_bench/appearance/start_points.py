@@ -1,7 +1,7 @@
 """Points to start the baseline from: COLMAP's triangulation of features under the known poses."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,6 @@ from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.pycolmap_library import load_colmap
 
-Progress = Callable[[str, float], None]
-"""Called with the name of a stage and its finished fraction."""
-
 
 @dataclass(frozen=True)
 class StartPoints:
@@ -36,20 +33,14 @@ class StartPoints:
         return len(self.positions)
 
 
-def find_start_points(
-    views: Sequence[TrainingView],
-    seed: int = 0,
-    progress: Progress = lambda stage, fraction: None,
-) -> StartPoints:
+def find_start_points(views: Sequence[TrainingView], seed: int = 0) -> StartPoints:
     """Features, matches, triangulation; cut to the visual hull where there are masks.
 
     Raises:
         InputError: pycolmap is missing, or no point comes out.
     """
-    features = thread_map(
-        lambda view: find_features(view.image, view.mask), views, lambda f: progress("features", f)
-    )
-    pairs = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
+    features = thread_map(lambda view: find_features(view.image, view.mask), views)
+    pairs = choose_pairs(features, seed)
     cameras = list(dict.fromkeys(view.camera for view in views))
     shared = [
         SharedCamera(Calibration(c.fx, c.fy, c.cx, c.cy, width=c.width, height=c.height), True)
@@ -62,7 +53,7 @@ def find_start_points(
     with tempfile.TemporaryDirectory(prefix="geogs-points-") as folder:
         database = Path(folder) / "database.db"
         write_database(database, shared, entries)
-        match_pairs(database, entries, pairs, seed, lambda f: progress("matching", f))
+        match_pairs(database, entries, pairs, seed, lambda fraction: None)
         model = _triangulated(database, views, seed)
     positions = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     inside = in_visual_hull(views, positions)

@@ -59,7 +59,7 @@ def read_true_surface(
 
 
 def score_surface(
-    mesh: Surface, truth: TrueSurface, use_icp: bool, seed: int, threshold: float = 0.05
+    mesh: Surface, truth: TrueSurface, use_icp: bool, seed: int
 ) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
     """Vertex-weighted and, last, area-weighted scores in cm, and where the mesh is wrong.
 
@@ -67,12 +67,11 @@ def score_surface(
     A truth without triangles has no vertex-weighted score.
     """
     area = evaluate_reconstruction(
-        mesh, truth.whole, truth.points or truth.seen,
-        use_icp=use_icp, threshold=threshold, seed=seed,
-    )  # fmt: skip
+        mesh, truth.whole, truth.points or truth.seen, use_icp=use_icp, seed=seed
+    )
     scores = [in_cm("area", area.scores)]
     if truth.seen.is_mesh:
-        vertices = evaluate_vertices(mesh, truth.seen, use_icp, threshold, seed)
+        vertices = evaluate_vertices(mesh, truth.seen, use_icp, seed=seed)
         scores.insert(0, in_cm("vertices", vertices.scores))
     points, distance = area.reconstruction_points, area.accuracy
     return tuple(scores), SurfaceComparison(area.scores, mesh, truth.whole, points, distance)

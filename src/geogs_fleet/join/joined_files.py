@@ -14,6 +14,7 @@ from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.documents import read_bytes
 from geogs.geometry.camera import Camera
+from geogs.io.sources.frame_source import RecordingSpan
 from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.io.writers.keyframe_folder import image_path, rows_path, write_image, write_rows
@@ -23,7 +24,6 @@ from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mapping.map_frame import WORLD
 from geogs.types import MapSnapshot, SeenRows, Trajectory
 from geogs_fleet.join.joined_trajectory import (
-    Span,
     joined_trajectory,
     keyframe_poses,
     moved_trajectory,
@@ -39,7 +39,7 @@ class JoinedPart:
     result: SavedResult
     views: PartViews
     placement: Placement
-    span: Span
+    span: RecordingSpan
 
     @property
     def trajectory(self) -> Trajectory:

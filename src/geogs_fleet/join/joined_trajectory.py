@@ -1,43 +1,24 @@
 """The frames of all parts in the joint world and in one time."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, sim3_scale, so3_exp, so3_log
-from geogs.io.sources.frame_source import PAUSE
+from geogs.io.sources.frame_source import PAUSE, RecordingSpan
 from geogs.types import Trajectory
 from geogs_fleet.join.part import PartViews
 from geogs_fleet.join.part_graph import Placement
 
 
-@dataclass(frozen=True)
-class Span:
-    """A part within the joint trajectory."""
-
-    name: str
-    first_frame: int
-    first_time: float
-    """Seconds, in the joint time."""
-    own_time: float
-    """Time of its first frame in its own clock."""
-
-    @property
-    def shift(self) -> float:
-        """From its own time to the joint one."""
-        return self.first_time - self.own_time
-
-
-def spans_of(names: list[str], times: list[Float64[np.ndarray, "n"]]) -> list[Span]:
+def spans_of(names: list[str], times: list[Float64[np.ndarray, "n"]]) -> list[RecordingSpan]:
     """The parts one after the other, as ``geogs run`` puts several videos."""
-    spans: list[Span] = []
+    spans: list[RecordingSpan] = []
     frames, end = 0, 0.0
     for name, own in zip(names, times, strict=True):
         first = end + PAUSE if spans else float(own[0])
-        spans.append(Span(name, frames, first, float(own[0])))
+        spans.append(RecordingSpan(name, frames, first, float(own[0])))
         frames, end = frames + len(own), float(own[-1]) + first - float(own[0])
     return spans
 
@@ -67,7 +48,7 @@ def _moved(S: Float[Tensor, "n 4 4"], T_wc: Float[Tensor, "n 4 4"]) -> Float[Ten
     return moved
 
 
-def joined_trajectory(parts: list[Trajectory], spans: list[Span]) -> Trajectory:
+def joined_trajectory(parts: list[Trajectory], spans: list[RecordingSpan]) -> Trajectory:
     """All of them, in the joint time."""
     times = [t.timestamps + span.shift for t, span in zip(parts, spans, strict=True)]
     return Trajectory(

@@ -32,6 +32,11 @@ class RecordingSpan:
     own_time: float
     """Time of its first frame in its own clock."""
 
+    @property
+    def shift(self) -> float:
+        """Seconds from its own clock to the joint time."""
+        return self.first_time - self.own_time
+
 
 @dataclass(frozen=True, slots=True)
 class RecordingPlace:

@@ -65,23 +65,13 @@ class ModelImage:
 
 
 @dataclass(frozen=True, slots=True)
-class ModelPoints:
-    """Triangulated points with their tracks."""
-
-    positions: Float64[np.ndarray, "n 3"]
-    seen_point: Int64[np.ndarray, "m"]
-    """Index of the point of observation k."""
-    seen_image: Int64[np.ndarray, "m"]
-    """Identifier of the image of observation k."""
-
-
-@dataclass(frozen=True, slots=True)
 class SparseModel:
     """A reconstruction; cameras and images by their identifiers."""
 
     cameras: dict[int, ModelCamera]
     images: dict[int, ModelImage]
-    points: ModelPoints | None
+    points: SparsePoints | None
+    """Seen by images that have their identifiers for indices."""
 
 
 def is_model(folder: Path) -> bool:
@@ -115,13 +105,13 @@ def read_model(folder: Path) -> SparseModel:
     return SparseModel(cameras, images, points)
 
 
-def _collected(points: Iterator[tuple[list[float], list[int]]]) -> ModelPoints:
+def _collected(points: Iterator[tuple[list[float], list[int]]]) -> SparsePoints:
     positions, seen_point, seen_image = [], [], []
     for index, (position, images) in enumerate(points):
         positions.append(position)
         seen_point += [index] * len(images)
         seen_image += images
-    return ModelPoints(
+    return SparsePoints(
         np.array(positions, dtype=np.float64).reshape(-1, 3),
         np.array(seen_point, dtype=np.int64),
         np.array(seen_image, dtype=np.int64),
