@@ -9,6 +9,7 @@ from jaxtyping import Float64
 
 from geogs.application.structure_from_motion.completion import about
 from geogs.io.sources.calibration import Calibration
+from geogs.stopwatch import StageProgress
 from geogs.threads import thread_map
 from geogs.types import FoundFrames, Frame
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
@@ -17,7 +18,7 @@ from geogs_photos.fragments import believed
 from geogs_photos.incremental_mapping import continued, placed_images, world_to_camera
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import frame_pairs
-from geogs_photos.poses import FEWEST_FEATURES, Progress
+from geogs_photos.poses import FEWEST_FEATURES
 
 
 def place_lost(
@@ -25,7 +26,7 @@ def place_lost(
     T_cw: Sequence[Float64[np.ndarray, "4 4"] | None],
     seen_by: Calibration,
     seed: int,
-    progress: Progress,
+    progress: StageProgress,
 ) -> FoundFrames:
     """As asked of it in ``geogs.application.structure_from_motion.photos.place_lost``."""
     features = thread_map(

@@ -1,7 +1,7 @@
 """Photographs in; a COLMAP model of the largest part that hangs together out, and what is not."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from geogs.io.pictures import read_mask
 from geogs.io.sources.formats.colmap import mask_beside
 from geogs.io.sources.known_intrinsics import calibration_from_exif, resolve_intrinsics
 from geogs.io.sources.posed.stored_pictures import read_picture
+from geogs.stopwatch import StageProgress
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import (
     Entry,
@@ -27,9 +28,6 @@ from geogs_photos.photo_pairs import Pairs, choose_pairs
 from geogs_photos.photograph import Lens, PhotoFolder, Photograph
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.upright import upright_rotation
-
-Progress = Callable[[str, float], None]
-"""Called with the name of a stage and its finished part; what it raises ends the work."""
 
 FEWEST_FEATURES = 50
 """Features of a picture that can be matched with others."""
@@ -52,7 +50,7 @@ def find_poses(
     model: Path,
     intrinsics: str,
     seed: int,
-    progress: Progress,
+    progress: StageProgress,
     most_features: int = MAX_FEATURES,
 ) -> FoundPoses:
     """Find where photographs were taken, and write it as a COLMAP model.
@@ -109,7 +107,7 @@ def structure_of(
     entries: Sequence[Entry],
     pairs: Pairs,
     seed: int,
-    progress: Progress,
+    progress: StageProgress,
 ) -> tuple[list[Any], np.ndarray]:
     """Parts that hang together, largest first, and the kept matches of any two pictures."""
     write_database(database, cameras, entries)

@@ -15,6 +15,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
+from geogs.stopwatch import StageProgress
 from geogs.threads import thread_map
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
@@ -29,7 +30,7 @@ from geogs_photos.incremental_mapping import (
 from geogs_photos.only_turns import only_turns
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import frame_pairs
-from geogs_photos.poses import Progress, structure_of
+from geogs_photos.poses import structure_of
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.rolling_rows import with_rows_at_once
 from geogs_photos.upright import upright_rotation
@@ -46,7 +47,7 @@ def place_frames(
     is_found: bool,
     is_rolling: bool,
     seed: int,
-    progress: Progress,
+    progress: StageProgress,
 ) -> PlacedVideo:
     """As asked of it in ``geogs.application.structure_from_motion.photos.place_frames``."""
     colmap = load_colmap()

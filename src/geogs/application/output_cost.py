@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from geogs.application.progress.forecast import Clock
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.result_page import write_page, write_pictures
 from geogs.application.results.surfaces import fusion_views
@@ -21,8 +22,6 @@ from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.reconstruction import Reconstruction
 
 _log = logging.getLogger(__name__)
-
-Clock = Callable[[], float]
 
 VIEWS = 3
 """Views of the rehearsal; one of them alone makes ready what is needed but once, before it."""

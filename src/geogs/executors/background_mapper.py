@@ -93,7 +93,7 @@ class BackgroundMapper:
         def answer() -> None:
             try:
                 answers.append(question(self._mapper))
-                self._wait_for_gpu()
+                wait_for(self._stream)
             finally:
                 done.set()
 
@@ -150,7 +150,7 @@ class BackgroundMapper:
                     self._failure = error
                     self._tasks.clear()
                     return
-            self._wait_for_gpu()
+            wait_for(self._stream)
 
     def _next(self) -> Callable[[], None] | None:
         with self._news:
@@ -162,13 +162,15 @@ class BackgroundMapper:
         if len(self._tasks) <= MAX_WAITING and not self._is_closed:
             self._gate.give()
 
-    def _wait_for_gpu(self) -> None:
-        if self._stream is not None:
-            self._stream.synchronize()
-
     def _raise(self) -> None:
         """What ended the thread, if anything did."""
         if isinstance(self._failure, GeogsError | torch.cuda.OutOfMemoryError):
             raise self._failure
         if self._failure is not None:
             raise RuntimeError("mapping failed in its thread") from self._failure
+
+
+def wait_for(stream: "torch.cuda.Stream | None") -> None:
+    """Wait until a GPU has done what its stream was given; on a CPU nothing is left to do."""
+    if stream is not None:
+        stream.synchronize()

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.concurrent import BackgroundTask
-from geogs.executors.background_mapper import BackgroundMapper
+from geogs.executors.background_mapper import BackgroundMapper, wait_for
 from geogs.executors.in_order import Advance, InOrder
 from geogs.mapping.mapper import Mapper
 from geogs.scene_mask import SceneMask
@@ -76,7 +76,7 @@ class Live(InOrder):
             self._completion.start(partial(self._complete, tracked, advance))
         else:
             advance(tracked)
-            self._wait_for_gpu()  # others may read what it has written
+            wait_for(self._stream)  # others may read what it has written
         return tracked.state
 
     @property
@@ -113,7 +113,7 @@ class Live(InOrder):
         follower, self._follower = self._follower, None
         with torch.cuda.stream(self._stream):
             self.segments.tracker_of(follower.last.keyframe).take_over(follower)
-        self._wait_for_gpu()
+        wait_for(self._stream)
 
     def in_order(self) -> InOrder:
         """What runs the stages after the last frame, on the map as the thread has made it."""
@@ -121,10 +121,6 @@ class Live(InOrder):
             mapper = self._background.settled()
         self._switching.end()
         return InOrder(self.segments, mapper, self.stopwatch, self.mask)
-
-    def _wait_for_gpu(self) -> None:
-        if self._stream is not None:
-            self._stream.synchronize()
 
     # --- the map -----------------------------------------------------------------------------
 

@@ -9,15 +9,8 @@ hence no ``nnan``.
 import numpy as np
 from numba import njit
 
-from geogs.kernel_parts import inlined
+from geogs.losses.cpu.single_view_kernels import KERNEL, PART
 
-KERNEL = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
-}
-PART = inlined(KERNEL)
 ZERO, HALF, ONE, TWO, HUGE = (np.float32(v) for v in (0, 0.5, 1, 2, 1e30))
 
 

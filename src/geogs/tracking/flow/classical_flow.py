@@ -20,7 +20,7 @@ from torch import Tensor
 from geogs.threads import opencv_on_one_thread, worker_count
 from geogs.tracking.flow.cell_texture import cell_structure, common_tensor, structure_of
 from geogs.tracking.flow.flow_operator import Memories
-from geogs.tracking.flow.start_flow import Lattice, StartFlow
+from geogs.tracking.flow.start_flow import Lattice, StartFlow, bilinear
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
@@ -211,17 +211,13 @@ class ClassicalFlow:
         return q, weight.astype(np.float32)
 
 
-def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
 def _sample(
     image: np.ndarray, points: Float[np.ndarray, "p 2"], outside: float | None
 ) -> np.ndarray:
     """Bilinear values at points; ``outside`` beyond the border, None replicates it."""
     u, v = (points[None, :, k].astype(np.float32) for k in (0, 1))
     if outside is None:
-        return _bilinear(image, u, v)[0]
+        return bilinear(image, u, v)[0]
     return cv2.remap(
         image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[outside] * 4
     )[0]

@@ -30,11 +30,11 @@ class StartFlow:
     def on(self, lattice: "Lattice") -> Float32[np.ndarray, "h w 2"]:
         """At all places of a lattice that is made for such a grid."""
         x, height = lattice, len(lattice.u)
-        found = _remap(self._flow, x.u, x.v)
+        found = bilinear(self._flow, x.u, x.v)
         # Both numbers of a row behind each other: NumPy is slow on axes of two.
         flat = found.reshape(height, -1)
-        flat -= x.factor_u * _remap(self._bend_u, x.cell_u, x.v).reshape(height, -1)
-        flat -= x.factor_v * _remap(self._bend_v, x.u, x.cell_v).reshape(height, -1)
+        flat -= x.factor_u * bilinear(self._bend_u, x.cell_u, x.v).reshape(height, -1)
+        flat -= x.factor_v * bilinear(self._bend_v, x.u, x.cell_v).reshape(height, -1)
         return found
 
     def at(self, points: Float[np.ndarray, "p 2"]) -> Float32[np.ndarray, "p 2"]:
@@ -96,5 +96,6 @@ def _limited_bend(flow: Float32[np.ndarray, "r c 2"], axis: int) -> Float32[np.n
     return bend
 
 
-def _remap(field: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def bilinear(field: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Values of a field at columns and rows; beyond its border, those there."""
     return cv2.remap(field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
