@@ -15,7 +15,8 @@ from geogs.evaluation.surfaces.silhouettes import (
     inside_masks,
     mesh_silhouettes,
 )
-from geogs.evaluation.surfaces.surface import Surface, closest_point_on_triangle, read_surface
+from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.surface_distance import closest_point_on_triangle
 from geogs.evaluation.surfaces.triangle_tree import TriangleTree
 from geogs.geometry.camera import Camera
 from surface_shapes import CAMERA, NO_FACES, joined, moved, plane
@@ -47,7 +48,10 @@ def test_tree_finds_the_nearest_of_all_triangles(count):
     points[200:] = points[200] + np.cumsum(rng.normal(size=(200, 3)) * 1e-3, 0)  # in order
     expected = all_pairs(points, mesh)
     tree = TriangleTree(mesh)
-    assert np.abs(tree(points) - expected).max() < 1e-12
+    distance, face = tree.nearest(points)
+    assert np.abs(distance - expected).max() < 1e-12
+    at = closest_point_on_triangle(points, *corners[face].transpose(1, 0, 2))
+    assert np.abs(np.linalg.norm(at - points, axis=1) - expected).max() < 1e-12
     limited = tree(points, 0.3)
     assert np.array_equal(np.isinf(limited), expected > 0.3)
     near = expected <= 0.3

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from geogs.evaluation.surfaces.surface import SurfaceDistance
+from geogs.evaluation.surfaces.surface_distance import SurfaceDistance
 from geogs.geometry.lie import se3_exp
 from geogs.geometry.umeyama import umeyama
 

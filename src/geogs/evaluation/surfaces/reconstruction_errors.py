@@ -7,13 +7,13 @@ from jaxtyping import Bool, Float
 
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.icp import icp
-from geogs.evaluation.surfaces.surface import Surface, SurfaceDistance, sample_surface
+from geogs.evaluation.surfaces.surface import Surface, sample_surface
+from geogs.evaluation.surfaces.surface_distance import SurfaceDistance
 from geogs.evaluation.surfaces.surface_errors import SurfaceErrors
 from geogs.evaluation.surfaces.visibility import Visibility
 from geogs.threads import on_one_torch_thread
 
 _ICP_POINTS = 40_000
-_MARGIN = 0.5
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,7 @@ def evaluate_reconstruction(
     rng = np.random.default_rng(seed)
     if not reconstruction.is_mesh or not reconstruction.areas.sum() > 0:
         raise InputError("The reconstruction has no triangles with an area; nothing to evaluate.")
-    box = reconstruction.vertices.min(0) - _MARGIN, reconstruction.vertices.max(0) + _MARGIN
-    to_truth = SurfaceDistance(truth, box, seed=seed)
+    to_truth = SurfaceDistance(truth)
     shift = 0.0
     if use_icp:
         probe = sample_surface(reconstruction, _ICP_POINTS, rng)[0]
@@ -103,7 +102,7 @@ def evaluate_reconstruction(
         points = _cull(points, visibility.seen(points), "the reconstruction")
     reference = _reference_samples(truth_points or truth, visibility, samples, rng)
     accuracy = to_truth(points)
-    completeness = SurfaceDistance(reconstruction, seed=seed)(reference)
+    completeness = SurfaceDistance(reconstruction)(reference)
     scores = surface_scores(accuracy, completeness, threshold, shift)
     return SurfaceErrors(scores, points, accuracy, reference, completeness)
 

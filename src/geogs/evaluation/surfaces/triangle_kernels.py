@@ -57,8 +57,9 @@ def _to_box(px, py, pz, box):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest_triangles(points, triangles, boxes, leaf_size, maximum, distance):
-    """Write the distance of every point to the nearest triangle; inf where it is above maximum.
+def nearest_triangles(points, triangles, boxes, leaf_size, maximum, distance, nearest):
+    """Write the distance of every point to the nearest triangle and which that is; inf where it is
+    above maximum.
 
     Node i of ``boxes`` has the children 2 i and 2 i + 1; the second half are leaves of
     ``leaf_size`` triangles each. The distance to the neighbour before bounds the next one's from
@@ -90,6 +91,7 @@ def nearest_triangles(points, triangles, boxes, leaf_size, maximum, distance):
                     if d <= best:
                         best = d
                         found = d
+                        nearest[i] = k
                 continue
             left = _to_box(px, py, pz, boxes[2 * node])
             right = _to_box(px, py, pz, boxes[2 * node + 1])

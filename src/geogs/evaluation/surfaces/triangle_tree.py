@@ -1,7 +1,5 @@
 """Exact distances of millions of points to a triangle mesh."""
 
-from functools import partial
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -12,14 +10,14 @@ from geogs.threads import thread_map
 
 _LEAF = 4
 _BITS = 21
-_BATCH = 50_000
+_BATCH = 8_192
 
 
 class TriangleTree:
     """A tree of bounding boxes over a mesh's triangles, put in order along a Z-curve.
 
-    Every distance is that to the nearest of all triangles. Points in spatial order, as
-    sample_surface gives them, are several times faster than shuffled ones.
+    Every distance is that to the nearest of all triangles. Points are asked for in that order, too,
+    as each is bounded by the one before it.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -27,26 +25,38 @@ class TriangleTree:
         if not surface.is_mesh:
             raise InputError("A surface has no triangles to measure distances to.")
         corners = np.ascontiguousarray(surface.vertices[surface.faces], np.float64)
-        order = np.argsort(morton_codes(_cells(corners.mean(1)), _BITS), kind="stable")
-        self._triangles = corners[order].reshape(-1, 9)
-        self._boxes = _boxes(corners[order])
+        self._order = _along_curve(corners.mean(1))
+        corners = corners[self._order]
+        self._triangles, self._boxes = corners.reshape(-1, 9), _boxes(corners)
 
     def __call__(
         self, points: Float[np.ndarray, "n 3"], maximum: float = np.inf
     ) -> Float[np.ndarray, "n"]:
         """Unsigned distances in the unit of the points; inf where they are above ``maximum``."""
-        points = np.ascontiguousarray(points, np.float64)
-        parts = np.split(points, range(_BATCH, len(points), _BATCH))
-        return np.concatenate(thread_map(partial(self._distances, maximum=maximum), parts))
+        return self.nearest(points, maximum)[0]
 
-    def _distances(
+    def nearest(
+        self, points: Float[np.ndarray, "n 3"], maximum: float = np.inf
+    ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Distances, and the nearest triangles; any where a distance is above ``maximum``."""
+        points = np.asarray(points, np.float64)
+        order = _along_curve(points)
+        parts = np.split(order, range(_BATCH, len(order), _BATCH))
+        found = thread_map(lambda part: self._nearest(points[part], maximum), parts)
+        distance, face = np.empty(len(points)), np.empty(len(points), np.int64)
+        for part, (d, place) in zip(parts, found, strict=True):
+            distance[part], face[part] = d, self._order[place]
+        return distance, face
+
+    def _nearest(
         self, points: Float[np.ndarray, "n 3"], maximum: float
-    ) -> Float[np.ndarray, "n"]:
+    ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
         from geogs.evaluation.surfaces.triangle_kernels import nearest_triangles
 
-        distance = np.empty(len(points))
-        nearest_triangles(points, self._triangles, self._boxes, _LEAF, maximum, distance)
-        return distance
+        distance, place = np.empty(len(points)), np.zeros(len(points), np.int64)
+        tree = self._triangles, self._boxes, _LEAF
+        nearest_triangles(points, *tree, maximum, distance, place)
+        return distance, place
 
 
 def _boxes(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "k 6"]:
@@ -66,7 +76,10 @@ def _boxes(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "k 6"]:
     return boxes
 
 
-def _cells(points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m 3"]:
-    """Points in steps of their largest extent."""
+def _along_curve(points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+    """The order of points along a Z-curve, of steps of their largest extent."""
+    if not len(points):
+        return np.zeros(0, np.int64)
     low, extent = points.min(0), np.ptp(points, axis=0).max()
-    return ((points - low) / (extent or 1.0) * (2**_BITS - 1)).astype(np.int64)
+    cells = ((points - low) / (extent or 1.0) * (2**_BITS - 1)).astype(np.int64)
+    return np.argsort(morton_codes(cells, _BITS), kind="stable")
