@@ -9,7 +9,14 @@ from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph.frame_graph import FrameGraph
-from geogs.tracking.matching.two_view import _pose_of, agreement, best_two_view, two_view
+from geogs.tracking.matching.two_view import (
+    _pose_of,
+    agreement,
+    best_two_view,
+    followed_longest,
+    two_view,
+    without,
+)
 from geogs.tracking.start.initialise import has_moved_surely, placed_after
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
@@ -114,6 +121,24 @@ def test_a_car_ahead_that_is_followed_longest_is_not_started_from() -> None:
     ratio = (view.inverse_depth * depth)[view.good & ~car]
     assert (ratio / ratio.median() - 1).abs().median() < 0.1
     assert view.good[~car].float().mean() > 2 * view.good[car].float().mean()
+
+
+def test_what_is_followed_longest_is_found_where_the_rest_leaves_the_view() -> None:
+    grid = SampleGrid(CAMERA)
+    across = (grid.pixels / grid.pixels.amax(0) - 0.5).abs().amax(1)
+    truck, order = across < 0.2, across.argsort(descending=True)
+
+    def flow(left: int) -> FlowMatch:
+        weight = truck.clone()
+        weight[order[:left]] = True
+        return FlowMatch(grid.pixels[None], weight.float()[None, :, None].expand(1, -1, 2))
+
+    leaving = [flow(int(0.6 * 0.7**k * grid.size)) for k in range(9)]
+    found = followed_longest(grid, leaving)
+    assert bool(found[truck].all())
+    assert not bool(found[across > 0.3].any())
+    assert not bool((without(leaving[0], found).weight[0, found] > 0).any())
+    assert not bool(followed_longest(grid, 9 * [flow(grid.size)]).any())  # that is the scene
 
 
 def test_without_parallax_there_is_no_pair_to_start_from() -> None:

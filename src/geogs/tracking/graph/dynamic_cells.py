@@ -99,11 +99,12 @@ def update_dynamic(
         before = [keyframes[k].moving for k in ids.tolist()]
         none = torch.zeros_like(static[0])
         held = torch.stack([none if b is None else b for b in before])
-        dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
         # The median over the static cells of an edge is its usual parallax.
         usual = torch.where(static, parallax, torch.nan).nanmedian(1).values[:, None]
         moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
-        dynamic |= held & (count > 0) & (moved < STANDING * count)
+        stands = held & (moved < STANDING * count)
+        total = torch.where(stands, MOST * count, total)
+        dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
         for n, k in enumerate(ids.tolist()):
             keyframes[k].moving = dynamic[n].clone()
 

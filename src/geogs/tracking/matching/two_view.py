@@ -23,7 +23,7 @@ COMPARED = 5
 """Pairs of views that are compared by what other views say of their depths."""
 LASTING = 2 / 3
 """Fraction of the views that a cell is matched in which is followed longest."""
-SHARE = 0.05, 0.6
+SHARE = 0.05, 0.8
 """Fractions of the first matches that those followed longest may be, for the rest to be asked."""
 CLEARLY = 1.2
 """Times as much must the rest agree without them for them to move by themselves. In streets and
@@ -66,17 +66,21 @@ def best_two_view(
         The index of the pair among the flows, and what it gives.
     """
     grid = SampleGrid(camera)
+    whole = _with_parallax(camera, flows, min_parallax)
+    best = _best_of(grid, flows, whole)
     lasting = followed_longest(grid, flows)
-    found = _with_parallax(camera, flows, min_parallax)
-    whole = len(found)
-    if lasting.any():
-        rest = _with_parallax(camera, [without(f, lasting) for f in flows], min_parallax)
-        found += [(n, replace(view, apart=lasting)) for n, view in rest]
-    if len(found) < 2:
-        return found[0] if found else None
-    support = torch.stack(thread_map(lambda f: _support(grid, flows, *f, ~lasting), found))
-    support[whole:] /= CLEARLY
-    return found[int(support.argmax())]
+    if not lasting.any():
+        return best
+    rest = _with_parallax(camera, [without(f, lasting) for f in flows], min_parallax)
+    other = _best_of(grid, flows, [(n, replace(view, apart=lasting)) for n, view in rest])
+    same = None if other is None else two_view(camera, flows[other[0]])
+    if other is None or same is None:
+        return best
+    n, apart = other
+    with_them, alone = (
+        float(_support(grid, flows, n, view)[~lasting].sum()) for view in (same, apart)
+    )
+    return other if alone > CLEARLY * with_them else best
 
 
 def followed_longest(grid: SampleGrid, flows: Sequence[FlowMatch]) -> Bool[Tensor, "p"]:
@@ -105,19 +109,25 @@ def _with_parallax(
     return able[:COMPARED]
 
 
+def _best_of(
+    grid: SampleGrid, flows: Sequence[FlowMatch], found: Sequence[tuple[int, TwoView]]
+) -> tuple[int, TwoView] | None:
+    """The pair that most cells agree with; none of none."""
+    if len(found) < 2:
+        return found[0] if found else None
+    support = thread_map(lambda f: float(_support(grid, flows, *f).sum()), found)
+    return found[int(np.argmax(support))]
+
+
 def _support(
-    grid: SampleGrid,
-    flows: Sequence[FlowMatch],
-    own: int,
-    view: TwoView,
-    voting: Bool[Tensor, "p"],
-) -> Float[Tensor, ""]:
-    """How many cells agree with the depth of a pair of views, in the mean of the others that each
-    is matched in."""
+    grid: SampleGrid, flows: Sequence[FlowMatch], own: int, view: TwoView
+) -> Float[Tensor, "p"]:
+    """How well each cell agrees with the depth of a pair of views, in the mean of the others that
+    it is matched in."""
     others = [match for n, match in enumerate(flows) if n != own]
     agreeing = torch.stack([agreement(grid, view, match) for match in others]).sum(0)
     matched = torch.stack([match.sure()[0] for match in others]).sum(0).clamp(min=1)
-    return (agreeing / matched)[voting].sum()
+    return agreeing / matched
 
 
 def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> Float[Tensor, "p"]:
