@@ -133,7 +133,7 @@ def test_what_is_followed_longest_is_found_where_the_rest_leaves_the_view() -> N
         weight[order[:left]] = True
         return FlowMatch(grid.pixels[None], weight.float()[None, :, None].expand(1, -1, 2))
 
-    leaving = [flow(int(0.6 * 0.7**k * grid.size)) for k in range(9)]
+    leaving = [flow(int(0.6 * 0.3**k * grid.size)) for k in range(9)]
     found = followed_longest(grid, leaving)
     assert bool(found[truck].all())
     assert not bool(found[across > 0.3].any())
