@@ -81,7 +81,10 @@ def row_twists(
         _of_keyframes(keyframes, edges), _of_frames(errors, keyframes, log, are_corrected)
     ):
         if not are_corrected:
-            part = part._replace(pixels=part.pixels + errors.of_matches(*part[:6]).shift)
+            found = errors.of_matches(
+                part.source, part.target, part.T_ji, part.rays, part.inverse_depth, part.pixels
+            )
+            part = part._replace(pixels=part.pixels + found.shift)
         for frame, equations in zip(part.target, _equations(errors, keyframes, part), strict=True):
             sums[frame] = sums.get(frame, 0) + equations
     frames = [*sums]
