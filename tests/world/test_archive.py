@@ -111,7 +111,7 @@ def test_old_keyframes_are_read_and_encoded_again():
     for n, state in enumerate(store):
         np.testing.assert_array_equal(state.image, images[n])
         again = state.encoded
-        for name in ("grey", "half", "certainty"):
+        for name in ("grey", "half"):
             np.testing.assert_array_equal(getattr(again, name), getattr(encoded[n], name))
         assert state.prior_normal.dtype == torch.float16
         assert float(state.prior_normal.min()) == float(state.prior_normal.max()) == n
