@@ -103,8 +103,8 @@ def update_dynamic(
         usual = torch.where(static, parallax, torch.nan).nanmedian(1).values[:, None]
         moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
         stands = held & (moved < STANDING * count)
-        total = torch.where(stands, MOST * count, total)
         dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
+        dynamic |= _mean(keyframes.grid, stands.to(total), 5) >= REGION  # and its border
         for n, k in enumerate(ids.tolist()):
             keyframes[k].moving = dynamic[n].clone()
 
