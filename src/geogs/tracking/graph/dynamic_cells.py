@@ -104,7 +104,8 @@ def update_dynamic(
         moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
         stands = held & (moved < STANDING * count)
         dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
-        dynamic |= _mean(keyframes.grid, stands.to(total), 5) >= REGION  # and its border
+        border = _mean(keyframes.grid, stands.to(total), 5) >= REGION
+        dynamic |= stands | border
         for n, k in enumerate(ids.tolist()):
             keyframes[k].moving = dynamic[n].clone()
 
