@@ -145,6 +145,7 @@ def test_without_parallax_there_is_no_pair_to_start_from() -> None:
     depth = torch.full((SampleGrid(CAMERA).size,), 3.0)
     turned = [_flow(depth, pose(0.0, yaw=0.05 * k)) for k in range(1, 5)]
     assert best_two_view(CAMERA, turned, 2.0) is None
+    assert best_two_view(CAMERA, [], 2.0) is None
 
 
 @pytest.mark.parametrize("focal", [0.95, 1.0, 1.05])

@@ -66,10 +66,8 @@ def best_two_view(
         The index of the pair among the flows, and what it gives.
     """
     grid = SampleGrid(camera)
-    whole = _with_parallax(camera, flows, min_parallax)
-    best = _best_of(grid, flows, whole)
-    lasting = followed_longest(grid, flows)
-    if not lasting.any():
+    best = _best_of(grid, flows, _with_parallax(camera, flows, min_parallax))
+    if len(flows) < 2 or not (lasting := followed_longest(grid, flows)).any():
         return best
     rest = _with_parallax(camera, [without(f, lasting) for f in flows], min_parallax)
     other = _best_of(grid, flows, [(n, replace(view, apart=lasting)) for n, view in rest])
