@@ -1,4 +1,5 @@
-"""Robust kernels: how much a residual counts, for arrays of NumPy and of PyTorch.
+"""Robust kernels, for arrays of NumPy and of PyTorch: how much a residual counts; and the median by
+weight.
 
 Weights multiply the squares of reweighted least squares. A ``square`` is that of a residual over
 the deviation at which the kernel bends.
@@ -37,3 +38,10 @@ def cauchy_cost(square: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 def geman_mcclure_weight(square: A) -> A:
     """Geman and McClure's weight ``1 / (1 + square)^2``."""
     return 1 / (1 + square) ** 2
+
+
+def weighted_median(values: Float[Tensor, "n"], weights: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """The least value up to which lies half of the weight; there is at least one."""
+    order = values.argsort()
+    below = weights[order].cumsum(0)
+    return values[order[int(torch.searchsorted(below, below[-1] / 2).clamp(max=len(values) - 1))]]

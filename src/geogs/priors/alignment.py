@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.robust import weighted_median
 from geogs.priors.monocular_prior import DepthKind
 
 MIN_CELLS = 32
@@ -44,7 +45,7 @@ def align_inverse_depth(
     x, d, w = (v[known].double() for v in (values, inverse_depth, weight))
     if not kind.has_shift:
         inverse = 1 / values.double()
-        scale = _weighted_median(d * x, w)
+        scale = weighted_median(d * x, w)
         aligned = torch.where(finite, scale * inverse, 0.0)
     else:
         # Both are fits of y = a x + b whose error is measured in parts of y.
@@ -73,7 +74,7 @@ def _robust_line(
 
     def linearised(line: Float[Tensor, "2"]) -> tuple[Tensor, Tensor]:
         error = rows @ line - 1
-        width = _CUT * 1.4826 * _weighted_median(error.abs(), w) + 1e-6
+        width = _CUT * 1.4826 * weighted_median(error.abs(), w) + 1e-6
         v = w / (1 + (error / width).square()).square()
         weighted = rows * v[:, None]
         return rows.mT @ weighted, weighted.sum(0)
@@ -94,7 +95,7 @@ def _best_of_medians(
 ) -> Float[Tensor, "2"] | None:
     """The rising line through the medians of two parts that has the least median error."""
     parts = torch.argsort(x).tensor_split(_BINS)
-    u, v = (torch.stack([_weighted_median(q[p], w[p]) for p in parts]) for q in (x, y))
+    u, v = (torch.stack([weighted_median(q[p], w[p]) for p in parts]) for q in (x, y))
     i, j = torch.triu_indices(_BINS, _BINS, 1, device=x.device)
     slope = (v[j] - v[i]) / (u[j] - u[i]).clamp(min=1e-12)
     rising = (slope > 0) & (u[j] - u[i] > 1e-6 * x.abs().max())
@@ -102,7 +103,7 @@ def _best_of_medians(
         return None
     lines = torch.stack([slope, v[i] - slope * u[i]], -1)[rising]
     errors = (x * lines[:, :1] + lines[:, 1:]).div(y).sub(1).abs()
-    medians = torch.stack([_weighted_median(e, w) for e in errors])
+    medians = torch.stack([weighted_median(e, w) for e in errors])
     return lines[int(medians.argmin())]
 
 
@@ -113,10 +114,3 @@ def _without_far(inverse_depth: Float[Tensor, "p"]) -> Float[Tensor, "p"]:
         return torch.zeros_like(inverse_depth)
     least = FARTHEST * inverse_depth[positive].median()
     return torch.where(inverse_depth > least, inverse_depth, 0.0)
-
-
-def _weighted_median(values: Float[Tensor, "n"], weight: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """The value below which half of the weight lies."""
-    order = torch.argsort(values)
-    total = weight[order].cumsum(0)
-    return values[order][int(torch.searchsorted(total, total[-1] / 2).clamp(max=len(values) - 1))]

@@ -21,6 +21,7 @@ from geogs.bundle.projection import linearise, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.lie import se3_inverse
+from geogs.geometry.robust import weighted_median
 from geogs.world.grid import SampleGrid
 
 ALIKE = 2.25
@@ -232,15 +233,8 @@ def _normalised_residual(
     found = torch.full((len(problem.T_cw),), torch.inf)
     for frame, norm, information in part.residuals(options):
         if len(norm):
-            found[frame] = weighted_median(norm, information)
+            found[frame] = weighted_median(norm, information.double())
     return found
-
-
-def weighted_median(values: Float[Tensor, "m"], weights: Float[Tensor, "m"]) -> float:
-    """The least value up to which lies half of the weight; there is at least one."""
-    order = values.argsort()
-    below = weights[order].double().cumsum(0)
-    return float(values[order[int(torch.searchsorted(below, below[-1] / 2))]])
 
 
 def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:

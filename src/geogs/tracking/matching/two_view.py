@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
+from geogs.geometry.jumps import widened
+from geogs.geometry.robust import cauchy_weight
 from geogs.threads import thread_map
 from geogs.tracking.matching.pnp import pnp
 from geogs.types import FlowMatch
@@ -85,8 +86,8 @@ def followed_longest(grid: SampleGrid, flows: Sequence[FlowMatch]) -> Bool[Tenso
     """Cells of the first view, and those around, that are matched in most views; none where these
     are hardly any, or most of what is matched at first."""
     sure = torch.stack([match.sure()[0] for match in flows])
-    lasting = (sure.float().mean(0) >= LASTING).float().view(1, 1, grid.height, grid.width)
-    lasting = max_pool2d(lasting, 3, 1, 1).view(-1) > 0
+    lasting = (sure.float().mean(0) >= LASTING).view(grid.height, grid.width)
+    lasting = widened(lasting, 1).view(-1)
     share = float((lasting & sure[0]).sum()) / max(int(sure[0].sum()), 1)
     return lasting & (SHARE[0] <= share <= SHARE[1])
 
@@ -130,7 +131,7 @@ def _support(
 
 def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> Float[Tensor, "p"]:
     """How well the cells of a flow agree with the depth of a pair of views, wherever it leads to:
-    1 down to 0, by Geman and McClure's function of the residual in its own deviations.
+    1 down to 0, by Cauchy's weight of the residual in its own deviations.
 
     The pose there is found from them (PnP). All on the CPU.
     """
@@ -140,7 +141,7 @@ def agreement(grid: SampleGrid, view: TwoView, match: FlowMatch) -> Float[Tensor
         return torch.zeros(len(good))
     at = project(grid.camera, grid.rays, T[None].float(), view.inverse_depth[None])
     square = ((at.pixels[0] - match.pixels[0]).square() * match.weight[0]).mean(-1)
-    return torch.where(good & at.valid[0], 1 / (1 + square), 0.0)
+    return torch.where(good & at.valid[0], cauchy_weight(square), 0.0)
 
 
 def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:

@@ -13,12 +13,12 @@ from itertools import pairwise
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.marginals import marginals
 from geogs.config import TrackingConfig
+from geogs.geometry.jumps import widened
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
@@ -118,10 +118,12 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
     keyframes, fields = list(segment), grid_fields(segment.grid)
     first = keyframes[0]
     device, grid = segment.grid.device, SampleGrid(segment.grid.camera)
-    # What a failed attempt held for moving was judged by wrong poses.
-    held = [view.apart, *(_carried(grid, view.apart, match) for match in flows)]
-    for keyframe, cells in zip(keyframes, held, strict=True):
-        keyframe.moving = cells.to(device) if view.apart.any() else None
+    for keyframe in keyframes:
+        keyframe.moving = None  # what a failed attempt held for moving was judged by wrong poses
+    if view.apart.any():
+        held = [view.apart, *(_carried(grid, view.apart, match) for match in flows)]
+        for keyframe, cells in zip(keyframes, held, strict=True):
+            keyframe.moving = cells.to(device)
     first.T_cw, known = torch.eye(4, dtype=torch.float64), view.good
     first.information = known.float().to(device)
     first.inverse_depth = fields.fill(view.inverse_depth.to(device), first.information)
@@ -143,9 +145,9 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
 def _carried(grid: SampleGrid, cells: Bool[Tensor, "p"], match: FlowMatch) -> Bool[Tensor, "p"]:
     """Where some cells of the first view, and those around, lie in another; all on the CPU."""
     there, inside = grid.cells_of(match.pixels[0, cells & match.sure()[0]])
-    found = torch.zeros(1, 1, grid.height, grid.width)
-    found.view(-1)[there[inside]] = 1.0
-    return max_pool2d(found, 3, 1, 1).view(-1) > 0
+    found = torch.zeros(grid.size, dtype=torch.bool)
+    found[there[inside]] = True
+    return widened(found.view(grid.height, grid.width), 1).view(-1)
 
 
 def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
