@@ -52,7 +52,7 @@ class Slam(SlamOutput):
         black_is_masked: bool = False,
         defers_map: bool = False,
         world: World | None = None,
-        lens_is_known: bool = True,
+        focal_deviation: float = 0.0,
     ) -> None:
         """A system that has seen nothing, or goes on with the ``world`` of another.
 
@@ -66,15 +66,16 @@ class Slam(SlamOutput):
                 nor, with ``black_is_masked``, what is quite black in an image.
             defers_map: make the map in :meth:`refine`, of all keyframes at their final poses;
                 ``mapping.when`` may say otherwise.
-            lens_is_known: whether somebody said what lens took the images; else it was but found in
-                the video, and is once more of all matches at the end.
+            focal_deviation: relative standard deviation of the focal length where nobody said what
+                lens took the images, and it was found in the video or guessed; it is found once
+                more of all matches at the end then.
 
         Raises:
             InputError: images of that size cannot be tracked, or the world is of another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
         self.config = c = config or Config()
-        self.lens_is_known = lens_is_known
+        self.focal_deviation = focal_deviation
         maps_at_end = defers_map and not live and c.mapping.may_follow
         self.world = world or World(maps_at_end=maps_at_end)
         self.stopwatch = Stopwatch(self.world.times)
@@ -159,11 +160,11 @@ class Slam(SlamOutput):
         with self.stopwatch("global bundle adjustment"):
             global_bundle(
                 main, lambda f, _: progress("bundle adjustment", f), None, self.world.is_ended,
-                self.lens_is_known,
+                self.focal_deviation,
             )  # fmt: skip
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
-                self.world.uncertainty = frame_uncertainty(main)
+                self.world.uncertainty = frame_uncertainty(main, self.focal_deviation)
         self.loops.replaced_by_bundle()
         self.world.adjusted = len(main.segment.ids)
         self._update_map()

@@ -116,7 +116,7 @@ class SlamOutput:
         could be started there is no keyframe, and nothing is known.
         """
         if self.world.is_ended and not self.segments.keyframe_ids:
-            return Uncertainty(*(np.zeros(0) for _ in range(4)))
+            return Uncertainty(*4 * (np.zeros(0),))
         return self.world.uncertainty
 
     def statistics(self) -> dict[str, object]:

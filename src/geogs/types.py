@@ -222,13 +222,17 @@ class Uncertainty(ShortRepr):
     depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """That of its depths, as a part of them, where the trajectory is as long as the true one: of
     the best known quarter of what it sees, as bare walls tell nothing."""
+    focal: AtLeast0 = 0.0
+    """That of the focal length, as a part of it: of the width of things over their depth."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""
         if not len(self.timestamps):
-            return Uncertainty(timestamps, *(np.full(len(timestamps), np.inf) for _ in range(3)))
+            nothing = np.full(len(timestamps), np.inf)
+            return Uncertainty(timestamps, nothing, nothing, nothing, self.focal)
         known = (self.position, self.rotation, self.depth)
-        return Uncertainty(timestamps, *(np.interp(timestamps, self.timestamps, c) for c in known))
+        position, rotation, depth = (np.interp(timestamps, self.timestamps, c) for c in known)
+        return Uncertainty(timestamps, position, rotation, depth, self.focal)
 
     def with_found(self, found: FoundFrames) -> "Uncertainty":
         """With frames that were found beside these: each is as far off as those around it, and by
@@ -241,7 +245,8 @@ class Uncertainty(ShortRepr):
             (self.rotation, np.hypot(around.rotation, found.rotation)),
             (self.depth, around.depth),
         )
-        return Uncertainty(*(np.concatenate(pair)[order] for pair in columns))
+        times, position, rotation, depth = (np.concatenate(pair)[order] for pair in columns)
+        return Uncertainty(times, position, rotation, depth, self.focal)
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -14,7 +14,7 @@ from geogs.application.interrupt import Interruption
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.geometry.distortion import undistorted_rays
-from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.calibration import GUESS, Calibration
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.tracking.calibration import self_calibration, stretch
@@ -197,6 +197,17 @@ def test_a_lens_is_found_where_the_video_told_its_focal_length_and_nobody_how_it
     assert not refined(nominal, 600.0, nothing).is_found_lens
     assert not refined(bent, 600.0, pinhole).is_found_lens
     assert not nominal.is_found_lens
+
+
+def test_a_focal_length_is_as_unsure_as_who_said_it():
+    given = Calibration(600.0, 600.0, 319.5, 239.5, width=640, height=480)
+    camera = replace(given.camera(), fx=630.0, fy=630.0)
+    pinhole = SelfCalibration(camera, None, 0.05, None, 12, 80)
+    nothing = replace(pinhole, failure="the camera stands still")
+    guess = replace(given, is_guess=True)
+    assert given.focal_deviation == replace(given, is_nominal=True).focal_deviation == 0
+    assert refined(guess, 600.0, pinhole).focal_deviation == pytest.approx(0.05)
+    assert refined(guess, 600.0, nothing).focal_deviation == guess.focal_deviation == GUESS
 
 
 def test_a_focal_length_that_all_matches_find_takes_the_place_of_the_guess():

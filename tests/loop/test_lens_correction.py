@@ -214,11 +214,20 @@ def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypat
     global_bundle(tracker, ends=True)
     assert tracker.keyframes.table.lens is None
     tracker, _ = tracker_of((0.02, -0.03), -0.03)
-    global_bundle(tracker, ends=True, lens_is_known=False)
+    global_bundle(tracker, ends=True, focal_deviation=0.01)
     lens = tracker.keyframes.table.lens
     assert lens is not None
     assert lens.focal == pytest.approx(1 / 1.03, abs=0.01)
     assert (lens.k1, lens.k2) == pytest.approx((0.02, -0.03), abs=0.006)
+
+
+def test_a_guess_that_is_far_off_is_found_by_all_matches():
+    tracker, _ = tracker_of((0.02, -0.03), 0.25)
+    global_bundle(tracker, ends=True, focal_deviation=0.35)
+    lens = tracker.keyframes.table.lens
+    assert lens is not None
+    assert lens.focal == pytest.approx(1 / 0.75, rel=0.05)
+    assert abs(lens.focal * 0.75 - 1) < lens.deviation_focal
 
 
 def test_while_tracking_goes_on_the_focal_length_stays():

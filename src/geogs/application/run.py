@@ -157,7 +157,7 @@ def _begun(
         made = thread.submit(
             Slam, calibrated.camera, config, str(driver.device), prior, calibrated.is_live,
             calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, driver.observer),
-            None, not calibrated.calibration.is_found_lens,
+            None, calibrated.calibration.focal_deviation,
         )  # fmt: skip
         source = with_shutter_found(calibrated, progress, stop)
         slam = made.result()
@@ -208,7 +208,7 @@ def resume(
             slam = Slam(
                 source.camera, config, str(device), prior, mask=source.mask,
                 black_is_masked=source.black_is_masked, world=world,
-                lens_is_known=not source.calibration.is_found_lens,
+                focal_deviation=source.calibration.focal_deviation,
             )  # fmt: skip
         progress.write(f"Going on after {slam.frames} frames.")
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)

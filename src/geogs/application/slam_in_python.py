@@ -59,7 +59,7 @@ def track(
             stream = with_shutter_found(stream)
         slam = Slam(
             stream.camera, settings, device, None, stream.is_live, stream.mask,
-            stream.black_is_masked, lens_is_known=not stream.calibration.is_found_lens,
+            stream.black_is_masked, focal_deviation=stream.calibration.focal_deviation,
         )  # fmt: skip
     for frame in stream:
         yield slam.process(frame)

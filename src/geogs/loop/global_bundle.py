@@ -44,7 +44,7 @@ def global_bundle(
     progress: Callable[[float, str], None] | None = None,
     keyframes: Sequence[int] | None = None,
     ends: bool = False,
-    lens_is_known: bool = True,
+    focal_deviation: float = 0.0,
 ) -> PoseCorrection:
     """Refine keyframes of a tracker on a fresh graph that also joins places seen again.
 
@@ -57,8 +57,8 @@ def global_bundle(
     message. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking and a
     lens was found, everything is straightened by that, matched and adjusted once more, and what
     matches say of the lens then is taken off them and the images; so it is found in any case where
-    what the images were taken for was but found in the video (not ``lens_is_known``). A tracker
-    without a map is left alone, and one whose images are straight already.
+    the focal length is only known to a ``focal_deviation``, relative. A tracker without a map is
+    left alone, and one whose images are straight already.
     """
     config, segment, store = tracker.config, tracker.segment, tracker.keyframes
     ids = tracker.segment.ids if keyframes is None else list(keyframes)
@@ -78,7 +78,7 @@ def global_bundle(
     )
     lens = correct_lens(
         tracker, free_poses, free, GLOBAL_OPTIONS, ends,
-        readout=readout, lens_is_known=lens_is_known,
+        readout=readout, focal_deviation=focal_deviation,
     )  # fmt: skip
     if lens is not None and ends:
         images = BentImages.of(store)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, PRIOR, SHAPES, LensBend
+from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, SHAPES, LensBend, lens_prior
 from geogs.tracking.calibration.focal_uncertainty import STANDARD_ERRORS
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, in_parts
@@ -28,6 +28,9 @@ ROUNDS = 8
 """At most. Each is to first order and leaves a fifth to a half of what the one before it left."""
 CONVERGED = 0.2
 """Deviations by which the last round may have changed a size."""
+MOST_AT_ONCE = 0.3
+"""By which the logarithm of the focal length changes in a round, at most: to first order is no more
+than a guess farther away."""
 EVIDENCE = 81.0
 """Square of the sizes in their deviations from which on they are believed. Matches of different
 keyframes err alike, too: where the lens was known it is 1 to 10, where it was not, hundreds
@@ -48,7 +51,7 @@ def correct_lens(
     ends: bool = False,
     before: FoundLens | None = None,
     readout: float = 1.0,
-    lens_is_known: bool = True,
+    focal_deviation: float = 0.0,
 ) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
@@ -56,16 +59,17 @@ def correct_lens(
     only where tracking ``ends`` with it: what is matched afterwards would be of another; so is the
     readout, where it was found in the video: matches were corrected for rows that took so many
     times it. ``before`` was found already, and images are straight, so that what matches say is
-    believed however little it is; so is it at the end, and the focal length with it, where what the
-    images were taken for was but found in the video (not ``lens_is_known``), which the sizes are
-    then not expected to be far from (``PRIOR``). Not in the world of a saved map, whose keyframes
-    stay as its own adjustment left them.
+    believed however little it is; so is it at the end, and the focal length with it, where that was
+    but found in the video or guessed, to a relative ``focal_deviation``: the sizes are expected to
+    be about what the images were taken for then
+    (:func:`~geogs.bundle.uncertainty.lens_error.lens_prior`). Not in the world of a saved map,
+    whose keyframes stay as its own adjustment left them.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = graph.packed
     bend, said, focal, longer = LensBend(), None, 0.0, 0.0
     left = ROUNDS if measured and not tracker.segment.fixed else 0
-    is_open = ends and not lens_is_known
+    is_open = ends and focal_deviation > 0
     is_asked = before.focal != 1 if before else is_open
     rows = _rows_in_doubt(log, keyframes, readout) if ends and left else None
     while left:
@@ -76,13 +80,15 @@ def correct_lens(
             break
         said, left = asked.whole, left - 1
         if is_open:
-            for n, (taken, prior) in enumerate(zip((focal, bend.k1, bend.k2), PRIOR, strict=True)):
-                said = said.told(n, -taken, prior)
+            taken = focal, bend.k1, bend.k2
+            for n, prior in enumerate(lens_prior(focal_deviation)):
+                said = said.told(n, -taken[n], prior)
         if rows is not None:
             said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
         if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:
             is_asked, left = True, ROUNDS
         if is_asked:
+            said = said.shortened(0, MOST_AT_ONCE)
             focal += float(said.size[0])
             if before:  # cells stay where straight images show them
                 bend = replace(bend, focal=focal)

@@ -1,5 +1,6 @@
 """How well a tracker knows its keyframes, by what all its matches leave open."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -34,9 +35,12 @@ USUAL_RESIDUAL = 0.23
 videos (docs/uncertainty.md has the table)."""
 
 
-def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> Uncertainty:
+def keyframe_uncertainty(
+    tracker: Tracker, errors: RowErrors | None = None, focal_deviation: float = 0.0
+) -> Uncertainty:
     """Uncertainty of all keyframes of a tracker that has a map, from its present edges; ``errors``
-    are those of its frames' rows where they were solved already.
+    are those of its frames' rows where they were solved already. ``focal_deviation`` is the
+    relative one of the focal length that nobody gave, before all matches were asked.
 
     What it says of poses is what is left of their errors when the trajectory is laid over the truth
     by a similarity, for frame and unit of the map are anyone's
@@ -51,13 +55,14 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
-    propagated = np.zeros(2)
+    propagated, focal = np.zeros(2), 0.0
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
-        found = _marginals(tracker, ids[part], rows)
+        found = _marginals(tracker, ids[part], rows, focal_deviation)
         if found is None:
             continue
         depth[part] = found.depth_deviation.numpy()
+        focal = max(focal, found.focal_variance)
         if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
             T_cw = tracker.keyframes.poses(ids)
             position[:], rotation[:] = deviations_after_alignment(T_cw, found.covariance)
@@ -66,7 +71,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
         squares = squares + propagated
         position[part], rotation[part] = np.sqrt(squares).T
         propagated = squares[-1] if not tracker.segment.fixed else propagated
-    return Uncertainty(times, position, rotation, depth)
+    return Uncertainty(times, position, rotation, depth, math.sqrt(focal))
 
 
 def said_of_lens(
@@ -127,7 +132,9 @@ class _Matches:
         return rows.of_matches(i, j, T_ji, rays, depth, at.pixels).slope
 
 
-def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marginals | None:
+def _marginals(
+    tracker: Tracker, ids: list[int], rows: RowErrors | None, focal_deviation: float
+) -> Marginals | None:
     """Marginals of some keyframes, with what all their matches have wrong in common.
 
     They hold where the scene is not as modelled, too: matches are as many times as unsure as they
@@ -152,7 +159,9 @@ def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marg
     if said is not None:
         lens = tracker.keyframes.table.lens
         doubt = 0.0 if rows is None else rows.doubt
-        found = found.beside(said.considered(1.0 if lens is None else lens.focal, doubt))
+        corrected = 1.0 if lens is None else lens.focal
+        found = found.beside(said.considered(corrected, doubt, focal_deviation))
     free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[free[:, None], free]
-    return Marginals(covariance, found.relative_depth[own], found.normalised_residual[own])
+    depth, residual = found.relative_depth[own], found.normalised_residual[own]
+    return Marginals(covariance, depth, residual, found.focal_variance)

@@ -14,10 +14,10 @@ def walk(count: int, tracked: int) -> Trajectory:
     return Trajectory(np.arange(count) / 30, T, np.arange(count) < tracked)
 
 
-def known(position: float, depth: float) -> Uncertainty:
+def known(position: float, depth: float, focal: float = 0.01) -> Uncertainty:
     n = 5
     return Uncertainty(
-        np.arange(n) / 5, np.full(n, position), np.full(n, 0.01), np.full(n, depth)
+        np.arange(n) / 5, np.full(n, position), np.full(n, 0.01), np.full(n, depth), focal
     )  # fmt: skip
 
 
@@ -47,6 +47,13 @@ def test_a_bad_run_says_why(tracked, position, depth, reason):
     assert not found.is_reliable
     assert found.sentence.startswith("Not to be relied on: ")
     assert reason in found.sentence
+
+
+def test_a_focal_length_that_nobody_knows_is_no_shape_to_rely_on():
+    found = verdict(walk(30, 30), walk(5, 5), known(0.001, 0.01, 0.3))
+    assert not found.is_reliable
+    assert found.focal == 0.3
+    assert "tells it only to 30%: give --intrinsics" in found.sentence
 
 
 def test_a_run_without_motion_is_not_reliable():

@@ -19,6 +19,7 @@ from geogs.bundle.uncertainty.lens_error import (
     LensBend,
     LensEvidence,
     lens_evidence,
+    lens_prior,
     lens_shapes,
 )
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
@@ -168,30 +169,32 @@ def test_matches_that_are_corrected_are_those_of_a_pinhole():
     assert off < 0.03 * before
 
 
-@pytest.mark.parametrize("readout", [(), (0.4, 0.2)])
-def test_what_is_said_of_poses_is_the_mean_square_over_lenses(readout):
-    """Against lenses drawn by ``PRIOR``, each seen with noise, and what they do; and readouts drawn
-    by what is doubted of them."""
+@pytest.mark.parametrize(("readout", "guess"), [((), 0.0), ((0.4, 0.2), 0.0), ((), 0.35)])
+def test_what_is_said_of_poses_is_the_mean_square_over_lenses(readout, guess):
+    """Against lenses drawn by what is known of them, each seen with noise, and what they do; and
+    readouts drawn by what is doubted of them."""
     g = torch.Generator().manual_seed(0)
     k = 4 if readout else 3
     moves = torch.randn(12, k, generator=g, dtype=torch.float64)
-    prior = torch.tensor([*PRIOR, *readout[:1]]).double()
+    prior = torch.tensor([*lens_prior(guess), *readout[:1]]).double()
     noise = torch.tensor([0.02, 0.02, 0.2, *readout[1:]]).double()
     count = 40
     each = torch.diag(1 / noise.square())[None].expand(count, k, k) / count
-    said = torch.zeros(12, dtype=torch.float64)
+    said, focal = torch.zeros(12, dtype=torch.float64), 0.0
     true = torch.zeros_like(said)
     for _ in range(1000):
         lens = prior * torch.randn(k, generator=g, dtype=torch.float64)
         seen = torch.randn(count, k, generator=g, dtype=torch.float64) / noise / count**0.5
         found = LensEvidence(each, each @ lens + seen, moves, moves[None])
-        considered = found.considered(1.0, *readout[:1])
+        considered = found.considered(1.0, *(readout[:1] or (0.0,)), guess)
         torch.testing.assert_close(
             considered.covariance.diagonal(), considered.relative_depth[0].double()
         )
         said += considered.covariance.diagonal()
+        focal += considered.focal
         true += (moves @ lens).square()
     assert float((said / true).log().abs().max()) < 0.25
+    assert focal / 1000 == pytest.approx(float(prior[0] ** 2), rel=0.15)
 
 
 def test_no_size_is_said_to_be_known_better_than_least():

@@ -128,7 +128,7 @@ def test_errors_in_common_move_poses_and_depths_as_foretold(monkeypatch):
     monkeypatch.setattr(room, "PLACES", (2, 1))
     grid, truth = turning(0.05)
     known = marginals(grid, truth, EXACT)
-    found, depths = common_errors(grid, truth, EXACT, known)
+    found, depths, _ = common_errors(grid, truth, EXACT, known)
     left = (grid.pixels[:, 0] < CAMERA.width / 2).float()
     onward = (truth.target - truth.source).sign()[:, None].float()
     expected, expected_depths = torch.zeros_like(found), torch.zeros_like(depths)
@@ -177,7 +177,9 @@ def test_where_nothing_is_known_errors_in_common_add_nothing():
     grid, problem = turning(0.05)
     known = marginals(grid, problem, EXACT)
     unknown = replace(known, covariance=torch.full_like(known.covariance, torch.inf))
-    assert not any(m.any() for m in common_errors(grid, problem, EXACT, unknown))
+    errors = common_errors(grid, problem, EXACT, unknown)
+    assert not errors.covariance.any()
+    assert not errors.relative_depth.any()
 
 
 def test_what_nothing_measures_is_open():

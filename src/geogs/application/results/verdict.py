@@ -16,6 +16,8 @@ MAX_POSITION_DEVIATION = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MAX_DEPTH_DEVIATION = 0.2
 """Relative deviation of the best known depths."""
+MAX_FOCAL_DEVIATION = 0.2
+"""Relative deviation of the focal length, by which all that is seen is too wide or too narrow."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -38,6 +40,8 @@ class Verdict:
     """Median deviation of its orientation."""
     depth: float
     """Median relative deviation of depths, of the best known quarter of what each keyframe sees."""
+    focal: float = 0.0
+    """Relative deviation of the focal length."""
 
     @property
     def has_shape(self) -> bool:
@@ -74,6 +78,11 @@ def verdict(
         reasons.append(f"its place is known only to {_percent(position)} of the extent of its path")
     if not depth <= MAX_DEPTH_DEVIATION:
         reasons.append(f"even the best known depths are known only to {_percent(depth)}")
+    if not known.focal <= MAX_FOCAL_DEVIATION:
+        reasons.append(
+            "nobody said its focal length and the video tells it only to "
+            f"{_percent(known.focal)}: give --intrinsics"
+        )
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."
     else:
@@ -81,7 +90,9 @@ def verdict(
             "Trajectory and shape are reliable: the camera's place is known to "
             f"{_finely(position)} of the extent of its path, the best known depths to {depth:.1%}."
         )
-    return Verdict(not reasons, sentence, lost, orientation_only, position, rotation, depth)
+    return Verdict(
+        not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal
+    )
 
 
 def _median(values: np.ndarray) -> float:

@@ -49,6 +49,12 @@ FOCAL_LEFT = 0.2
 it in two rendered rooms, whatever matches say."""
 
 
+def lens_prior(focal_deviation: float = 0.0) -> tuple[float, float, float]:
+    """Deviations of the sizes before any match is asked, of a focal length that is known to a
+    relative ``focal_deviation``, which may be a guess."""
+    return max(focal_deviation, PRIOR[0]), PRIOR[1], PRIOR[2]
+
+
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "3 *b 2"]:
     """By how much a pinhole's pixel lies off what is seen, for each size of one, to first order."""
     centre = pixels.new_tensor([camera.cx, camera.cy])
@@ -135,18 +141,22 @@ class LensEvidence:
         least = (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
         return _estimate(self.information, self.gradient).floored(least)
 
-    def considered(self, corrected: float = 1.0, doubt: float = 0.0) -> Considered:
+    def considered(
+        self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
+    ) -> Considered:
         """The error that the lens has, and what it does to poses and depths.
 
-        By what matches say of it and ``PRIOR`` together: their estimate moves them as far as it
-        would if it were taken off, and what it leaves open does too; and by what is left of a focal
-        length that was ``corrected`` by a factor, which they do not tell of. Of a readout that was
+        By what matches say of it and what was known of it (:func:`lens_prior`) together: their
+        estimate moves them as far as it would if it were taken off, and what it leaves open does
+        too; and by what is left of a focal length that was ``corrected`` by a factor, which they do
+        not tell of. Of a readout that was
         asked for, too, ``doubt`` is the deviation as a part of it. Without ``LEAST``:
         what matches have wrong in common is taken for an error of the lens that hardly moves a
         pose, and three sizes that were each so unsure would move them two to five times as far.
         """
         said = _estimate(self.information, self.gradient)
-        prior = self.moves.new_tensor((*PRIOR, doubt)[: len(said.size)]).square()
+        expected = (*lens_prior(focal_deviation), doubt)
+        prior = self.moves.new_tensor(expected[: len(said.size)]).square()
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
@@ -154,7 +164,9 @@ class LensEvidence:
         square = left + size[:, None] * size
         depth = self.depth_moves.to(square)
         return Considered(
-            self.moves @ square @ self.moves.mT, ((depth @ square) * depth).sum(-1).float()
+            self.moves @ square @ self.moves.mT,
+            ((depth @ square) * depth).sum(-1).float(),
+            float(square[0, 0]),
         )
 
 
@@ -180,6 +192,11 @@ class LensEstimate(NamedTuple):
         gain = column / (column[size] + deviation**2)
         moved = self.size + gain * (value - self.size[size])
         return LensEstimate(moved, self.covariance - gain[:, None] * column)
+
+    def shortened(self, size: int, most: float) -> "LensEstimate":
+        """The sizes as far as one of them goes no farther than that."""
+        part = (most / self.size[size].abs()).clamp(max=1)
+        return LensEstimate(part * self.size, self.covariance)
 
     def floored(self, least: tuple[float, ...]) -> "LensEstimate":
         """With no size known better than so."""

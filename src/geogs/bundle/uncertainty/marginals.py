@@ -50,6 +50,9 @@ class Considered(NamedTuple):
     """Of all poses, as that of :class:`Marginals`."""
     relative_depth: Float[Tensor, "n c"]
     """Squares of the moves of its cells' inverse depths, as parts of these."""
+    focal: float = 0.0
+    """Square of the error of the focal length, as a part of it, which the width of things shares
+    and no depth does."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,8 @@ class Marginals:
     """Median residual of the matches from each frame, in their own standard deviations (two
     dimensions), each counted by what it says: 1.2 where errors are as expected, more where the
     scene is not as modelled."""
+    focal_variance: float = 0.0
+    """Of the focal length, as a part of it."""
 
     @property
     def pose(self) -> Float[Tensor, "n 6 6"]:
@@ -82,7 +87,8 @@ class Marginals:
     def beside(self, errors: Considered) -> "Marginals":
         """With errors that are independent of these."""
         relative = (self.relative_depth.square() + errors.relative_depth).sqrt()
-        return Marginals(self.covariance + errors.covariance, relative, self.normalised_residual)
+        covariance, focal = self.covariance + errors.covariance, self.focal_variance + errors.focal
+        return Marginals(covariance, relative, self.normalised_residual, focal)
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:

@@ -11,6 +11,9 @@ from geogs.types import FoundLens
 _LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0
 """Focal lengths by the longer side of the image: fields of view from 157 down to 0.6 degrees."""
 _LARGEST_DISTORTION = 1e5
+GUESS = 0.35
+"""Relative standard deviation of a focal length that is only assumed: cameras that people hold have
+fields of view of 40 to 100 degrees."""
 _LONGEST_EDGE = 1 << 20
 """Pixels."""
 
@@ -103,6 +106,16 @@ class Calibration:
         if said is None or said.failure is not None:
             return False
         return said.deviations is not None or not self.is_distorted
+
+    @property
+    def focal_deviation(self) -> float:
+        """Relative standard deviation of a focal length that was found in the video or guessed; 0
+        where somebody said it."""
+        if self.is_guess:
+            return GUESS
+        said = self.refinement
+        found = said.deviation if said is not None and self.is_found_lens else None
+        return 0.0 if found is None else found / self.fx
 
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
