@@ -12,6 +12,7 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
 from oracles import lens_reference
+from oracles.pinhole_flow import PinholeFlow
 
 HUBER = 2.0
 OPTIONS = BundleOptions(huber=HUBER, depth_damping=0.0)
@@ -42,8 +43,9 @@ def test_equations_are_those_of_plain_pytorch(distortion, shared):
     more = torch.randn(problem.pixels.shape, generator=g) if "more" in shared else None
     wanted = lens_reference.equations(problem, block, HUBER, more)
     chosen = [n for n in range(wanted.gradient.shape[1]) if n < 6 or n >= 9 or "lens" in shared]
-    flow = LensFlow(block, None if more is None else lambda part: more)
-    state = BundleState(problem.T_cw, problem.inverse_depth, block if "lens" in shared else None)
+    known = None if "lens" in shared else block
+    flow = LensFlow(known, None if more is None else lambda part: more)
+    state = BundleState(problem.T_cw, problem.inverse_depth, block)
     sources = list(flow.sources(problem, state, OPTIONS))
     for source, (frame, e) in zip(sources, sources_within(problem.source), strict=True):
         edges, at = source.edges, 6 * (e.stop - e.start)
@@ -72,3 +74,15 @@ def test_the_cost_is_that_of_plain_pytorch(distortion, huber):
     state = BundleState(problem.T_cw, problem.inverse_depth, block)
     found = LensFlow().cost(problem, state, huber)
     assert found == pytest.approx(lens_reference.cost(problem, block, huber), rel=1e-5)
+
+
+def test_depths_after_a_step_are_those_of_plain_pytorch():
+    problem, g = problem_of(RadialLens(CAMERA)), torch.Generator().manual_seed(3)
+    xi = 0.01 * torch.randn(len(problem.T_cw), 6, generator=g, dtype=torch.float64)
+    options = replace(OPTIONS, depth_damping=1e-3)
+    flows = LensFlow.of_pinhole(GRID), PinholeFlow(GRID.camera, GRID.rays)
+    both = (flow.depths_after(problem, problem.start, xi, options) for flow in flows)
+    for (frame, found), (source, wanted) in zip(*both, strict=True):
+        assert frame == source
+        assert close(found.gradient, wanted.gradient)
+        assert close(found.curvature, wanted.curvature)

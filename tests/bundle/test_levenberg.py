@@ -13,8 +13,8 @@ from bundle_scenes import CAMERA, disturbed, scene
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle, DenseSchur
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
-from geogs.bundle.flow_term import PinholeFlow
 from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.protocols import BundleOptions
@@ -85,7 +85,7 @@ def costs(grid: SampleGrid, problem: BundleProblem, device: torch.device) -> dic
     workspace = cuda_dense._Workspace(there, bundle._structure_of(there, device), bundle.kernels)
     steps = cuda_dense._DenseSteps(bundle, there, options, workspace)
     many = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
-    flow = PinholeFlow(grid.camera, grid.rays)
+    flow = LensFlow.of_pinhole(grid)
     state = problem.start
     return {
         "dense": DenseSchur(problem, flow, options).cost(state),
@@ -113,7 +113,7 @@ def test_cost_is_that_of_the_reference(behind, device, monkeypatch):
 def test_cost_falls_as_the_equations_say():
     """Along a step s the cost changes by -2 g s, g being the right-hand sides."""
     grid, problem = told(0.01, 0.02)
-    schur = DenseSchur(problem, PinholeFlow(grid.camera, grid.rays), LEVENBERG)
+    schur = DenseSchur(problem, LensFlow.of_pinhole(grid), LEVENBERG)
     state, small = problem.start, 2e-3
     linear = schur.linearise(state)
     step = schur.step(state, linear, 1e-4)
@@ -156,7 +156,7 @@ def solvers(grid: SampleGrid, problem: BundleProblem, device: torch.device):
 
 def cost_of(grid: SampleGrid, problem: BundleProblem, T: Tensor, d: Tensor) -> float:
     moved = replace(problem, T_cw=T, inverse_depth=d.cpu())
-    return DenseSchur(moved, PinholeFlow(grid.camera, grid.rays), LEVENBERG).cost(moved.start)
+    return DenseSchur(moved, LensFlow.of_pinhole(grid), LEVENBERG).cost(moved.start)
 
 
 def test_steps_from_afar_never_raise_the_cost(device):
@@ -217,7 +217,7 @@ class Indefinite:
 def test_what_has_no_solution_is_damped_until_it_has(device):
     grid, truth = scene()
     problem = disturbed(truth, 0.02, 0.05)
-    schur = DenseSchur(problem, PinholeFlow(grid.camera, grid.rays), LEVENBERG)
+    schur = DenseSchur(problem, LensFlow.of_pinhole(grid), LEVENBERG)
     size = float(schur.linearise(problem.start).system.hessian.diagonal().max())
     problem = replace(problem, pose_terms=(Indefinite(torch.tensor([2, 3]), 3e-3 * size),))
     before = cost_of(grid, problem, problem.T_cw, problem.inverse_depth)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.flow_term import PinholeFlow, linearised_sources
+from geogs.bundle.flow_term import linearised_sources
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.protocols import BundleOptions
@@ -15,6 +15,7 @@ from geogs.bundle.shared import OPTIONS, SharedSchur, solve_shared
 from geogs.bundle.terms import BundleState
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
 from oracles.calibration_reference import gauss_newton_step
+from oracles.pinhole_flow import PinholeFlow
 
 
 def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():

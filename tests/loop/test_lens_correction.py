@@ -230,6 +230,31 @@ def test_a_guess_that_is_far_off_is_found_by_all_matches():
     assert abs(lens.focal * 0.75 - 1) < lens.deviation_focal
 
 
+@pytest.mark.parametrize("is_found", [True, False])
+def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeypatch, is_found):
+    tracker, _ = tracker_of((0.02, -0.03), -0.03)
+    if not is_found:
+        monkeypatch.setattr("geogs.loop.lens_correction.said_of_lens", lambda *_: None)
+    matched: list[tuple[bool, bool]] = []
+    measure = tracker.map.operator.measure
+
+    def noted(*pairs, fine, memory):
+        matched.append((tracker.keyframes.table.lens is not None, fine))
+        return measure(*pairs, fine=fine, memory=memory)
+
+    monkeypatch.setattr(tracker.map.operator, "measure", noted)
+    global_bundle(tracker, ends=True, focal_deviation=0.01)
+    assert matched[0] == (False, False)
+    assert matched[-1] == (is_found, True)
+    assert all(fine == is_straight for is_straight, fine in matched) is is_found
+    matched.clear()
+    tracker, _ = tracker_of((0.02, -0.03), -0.03)
+    measure = tracker.map.operator.measure
+    monkeypatch.setattr(tracker.map.operator, "measure", noted)
+    global_bundle(tracker, ends=True)
+    assert all(fine for _, fine in matched)
+
+
 def test_while_tracking_goes_on_the_focal_length_stays():
     tracker, _ = tracker_of(BEND, -0.05)
     global_bundle(tracker)

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.camera_system import DenseCameraSystem
-from geogs.bundle.flow_term import FlowTerm, PinholeFlow, SourceFlow, linearised_sources
+from geogs.bundle.flow_term import FlowTerm, SourceFlow, linearised_sources
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem, source_chunks
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.schur import SchurBundle
@@ -28,7 +29,7 @@ class DenseBundle:
     """Solver for one grid on the CPU; holds no state between calls."""
 
     def __init__(self, grid: SampleGrid) -> None:
-        self.flow = PinholeFlow(grid.camera, grid.rays)
+        self.flow = LensFlow.of_pinhole(grid)
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         """As in the protocol."""

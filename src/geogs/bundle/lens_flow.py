@@ -1,7 +1,7 @@
-"""The term of dense flow seen through a lens, whose sizes may be unknowns that all edges share.
+"""The term of dense flow on the CPU, by compiled loops over the cells of each source.
 
-What is summed over the cells of an edge is summed here in another order than by the tracker's term
-(:class:`~geogs.bundle.flow_term.PinholeFlow`), by loops that are compiled; on the CPU.
+They are seen through a lens, whose sizes may be unknowns that all edges share; the tracker's is a
+pinhole that is known.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,12 +14,13 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import BEHIND, SourceFlow, damped_curvature
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
-from geogs.bundle.lens import LensBlock
+from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import MIN_Z, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.geometry.lie import se3_adjoint
+from geogs.world.grid import SampleGrid
 
 Further = Callable[[BundleProblem], Float[Tensor, "e p 2"]]
 """By how much one more unknown that all edges share, at size one, moves where cells fall."""
@@ -29,26 +30,31 @@ class LensFlow:
     """Dense flow of cells that are seen through the lens of a state, or one that is known."""
 
     def __init__(self, known: LensBlock | None = None, further: Further | None = None) -> None:
-        """The lens is no unknown where it is that which is ``known``: the state has none then."""
+        """A lens that is ``known`` is no unknown, whatever block the state has for other terms."""
         self._known, self._further = known, further
+
+    @staticmethod
+    def of_pinhole(grid: SampleGrid) -> "LensFlow":
+        """That of the cells of a grid, through its camera."""
+        return LensFlow(LensBlock(RadialLens(grid.camera), grid.pixels))
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """As in the protocol; each with the diagonal of its equations, its depths being fixed."""
+        """As in the protocol; each with its diagonal where the lens is unknown."""
         from geogs.bundle.lens_kernels import linearise_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         adjoint, edges = se3_adjoint(T_ji), _Edges(self._block(state), problem, T_ji)
         limits = _limits(options.huber)
-        slopes = edges.slopes if state.block is not None else edges.slopes[:0]
+        slopes = edges.slopes if self._known is None else edges.slopes[:0]
         further = np.zeros((0, 0, 2), np.float32)
         if self._further is not None:
             further = _float(self._further(problem))
         shared = len(slopes) + (self._further is not None)
         for frame, e in sources_within(problem.source):
             size = 6 * (e.stop - e.start) + shared
-            H, g = torch.zeros(size, size).double(), torch.zeros(size).double()
+            H, g = adjoint.new_zeros(size, size), adjoint.new_zeros(size)
             depth = state.inverse_depth[frame].contiguous()
             E, C, b = depth.new_zeros(size, len(depth)), *depth.new_zeros(2, len(depth))
             linearise_source(
@@ -59,7 +65,7 @@ class LensFlow:
             equations = DepthEquations(E, damped_curvature(C, options.depth_damping), b, C)
             poses = torch.cat([problem.target[e], problem.source[e][:1]])
             found = RelativeEdges(poses, H, g, shared, equations, adjoint=adjoint[e])
-            yield SourceFlow(frame, found, found.chained()[0].diagonal())
+            yield SourceFlow(frame, found, None if self._known else found.chained()[0].diagonal())
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
         """As in the protocol."""
@@ -76,10 +82,22 @@ class LensFlow:
             for frame, e in sources_within(problem.source)
         )  # fmt: skip
 
+    def depths_after(
+        self,
+        problem: BundleProblem,
+        state: BundleState,
+        xi: Float[Tensor, "n 6"],
+        options: BundleOptions,
+    ) -> Iterator[tuple[int, DepthEquations]]:
+        """Equations of the depths of each source after a step of the poses, the lens being known.
+
+        The matches are linearised once more.
+        """
+        for source in self.sources(problem, state, options):
+            yield source.frame, source.edges.depth_after(xi.reshape(-1), len(xi))
+
     def _block(self, state: BundleState) -> LensBlock:
-        block = cast(LensBlock | None, state.block) or self._known
-        assert block is not None
-        return block
+        return self._known or cast(LensBlock, state.block)
 
 
 class _Edges:

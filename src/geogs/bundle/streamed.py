@@ -15,7 +15,8 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import FLOOR
-from geogs.bundle.flow_term import PinholeFlow, SourceFlow, linearised_sources
+from geogs.bundle.flow_term import SourceFlow, linearised_sources
+from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import StreamedProblem, source_chunks
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.schur import SchurBundle
@@ -42,7 +43,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
 
     def __init__(self, problem: StreamedProblem, grid: SampleGrid, options: BundleOptions) -> None:
         super().__init__(problem, options)
-        self.flow = PinholeFlow(grid.camera, grid.rays)
+        self.flow = LensFlow.of_pinhole(grid)
         self.system = SparseCameraSystem(*problem.joined(), problem.free_pose)
         self.chunks: Sequence[slice] = source_chunks(problem.source, options.chunk)
 

@@ -57,8 +57,8 @@ def global_bundle(
     message. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking and a
     lens was found, everything is straightened by that, matched and adjusted once more, and what
     matches say of the lens then is taken off them and the images; so it is found in any case where
-    the focal length is only known to a ``focal_deviation``, relative. A tracker without a map is
-    left alone, and one whose images are straight already.
+    the focal length is only known to a ``focal_deviation``, relative, first by matches at half the
+    resolution. A tracker without a map is left alone, and one whose images are straight already.
     """
     config, segment, store = tracker.config, tracker.segment, tracker.keyframes
     ids = tracker.segment.ids if keyframes is None else list(keyframes)
@@ -72,7 +72,9 @@ def global_bundle(
     tracker.map.graph.edges.clear()
     tracker.map.odometry.update_scale_by_all()
     match = partial(_match, tracker, pairs, free_poses, free, progress)
-    match()
+    # What tells of the lens is matched anew on straight images: half the resolution is enough.
+    is_open = ends and focal_deviation > 0
+    match(config.fine_adjustment and not is_open)
     readout = correct_rows(
         tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment
     )
@@ -83,11 +85,15 @@ def global_bundle(
     if lens is not None and ends:
         images = BentImages.of(store)
         straighten(tracker, lens, images)
-        match()
+        match(config.fine_adjustment)
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
         rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=lens)
         if rest is not None:
             images.straighten(StraightView(store.camera, lens).followed_by(rest))
+    elif is_open and config.fine_adjustment:
+        tracker.map.graph.edges.clear()
+        match(True)
+        correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:
@@ -104,8 +110,12 @@ def _match(
     free_pose: Sequence[int],
     free_depth: Sequence[int],
     progress: Callable[[float, str], None] | None,
+    fine: bool,
 ) -> None:
-    """Measure pairs and adjust everything, from round to round those that have moved."""
+    """Measure pairs and adjust everything, from round to round those that have moved.
+
+    At full resolution where it is ``fine``, else at half of it; small images always at full.
+    """
     config, graph, odometry = tracker.config, tracker.map.graph, tracker.map.odometry
     batch = MATCHED_TOGETHER[tracker.keyframes.grid.on_gpu]
     for n in range(ROUNDS if pairs else 0):
@@ -115,7 +125,7 @@ def _match(
             break
         for start in range(0, len(stale), batch):
             part = stale[start : start + batch]
-            graph.measure(part, fine=config.fine_adjustment, packed=True)
+            graph.measure(part, fine=fine, packed=True)
             if progress is not None:
                 done = (n + start / len(stale)) / ROUNDS
                 progress(done, "matching all keyframes")

@@ -26,7 +26,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.world.grid import SampleGrid
 
 EXACT = BundleOptions(huber=50.0, depth_damping=0.0)
-SOLVED = BundleOptions(iterations=20, huber=50.0, damping=1e-9, depth_damping=1e-9)
+SOLVED = BundleOptions(iterations=20, huber=50.0, damping=1e-8, depth_damping=1e-9)
 
 
 def walk(bend: tuple[float, ...] = (0.0, 0.0, 0.0)) -> tuple[SampleGrid, BundleProblem]:
