@@ -4,6 +4,7 @@ import shutil
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from types import MethodType
 
@@ -158,8 +159,9 @@ def parts(a: object, b: object) -> Iterator[tuple[str, object, object]]:
 
 
 def names(a: object) -> set[str]:
-    """Of the attributes."""
-    return set(getattr(a, "__slots__", ()) or vars(a))
+    """Of the attributes that are not computed from others when they are asked for."""
+    held = set(getattr(a, "__slots__", ()) or vars(a))
+    return {n for n in held if not isinstance(getattr(type(a), n, None), cached_property)}
 
 
 def test_the_maps_in_memory_are_those_that_were(tracked, tmp_path):
