@@ -23,9 +23,6 @@ PRIOR = 0.1, 0.2
 EVIDENCE = 36.0
 """Square of k1 and k2 in their deviations from which on a lens is believed to bend: 1 to 21 where
 it does not or hardly does, 65 and more where it does (docs/calibration.md)."""
-UNRELIABLE = 0.1
-"""Relative deviation above which the focal length is not believed and the guess is kept, which may
-be as good."""
 DISTORTION_FRACTION = 0.5
 """Fraction of the change of the focal length when the lens may bend that counts as deviation where
 it is taken for a pinhole."""

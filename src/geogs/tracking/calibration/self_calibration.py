@@ -13,12 +13,7 @@ from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
-from geogs.tracking.calibration.focal_uncertainty import (
-    UNRELIABLE,
-    Estimate,
-    estimate,
-    joined,
-)
+from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer, distant_flows
 from geogs.tracking.calibration.view_graph import view_graph_estimate
@@ -33,6 +28,9 @@ STRETCHES = 4
 """Stretches of the video that are used, at most, each after the one before it: bounds the time."""
 CONFIDENT = 0.01
 """Relative deviation of the focal length from which no other stretch is used."""
+UNRELIABLE = 0.1
+"""Relative deviation above which the focal length is not believed and the guess is kept, which may
+be as good."""
 
 
 @dataclass(frozen=True)
