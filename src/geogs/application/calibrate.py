@@ -155,8 +155,9 @@ def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
     if failure is None:
         return f"Intrinsics: {calibration.origin}."
     return (
-        f"warning: the video does not tell its focal length: {failure}; {assumed} stays assumed. "
-        "Move sideways and turn while recording, or give --intrinsics fx,fy,cx,cy."
+        f"warning: the video does not tell its focal length: {failure}; {assumed} is assumed until "
+        "all matches are asked at the end. Move sideways and turn while recording, or give "
+        "--intrinsics fx,fy,cx,cy."
     )
 
 
