@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.flow_term import matched_cost, weighed_residuals
+from geogs.bundle.flow_term import BEHIND, weighed_residuals
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import (
@@ -14,6 +15,7 @@ from geogs.bundle.projection import (
     relative_motion,
     seen_from_targets,
 )
+from geogs.geometry.robust import huber_cost
 
 
 class Equations(NamedTuple):
@@ -81,3 +83,12 @@ def cost(problem: BundleProblem, block: LensBlock, huber: float) -> float:
     depth = problem.inverse_depth[problem.source]
     p = block.project(problem.T_cw, problem.source, problem.target, depth)
     return matched_cost(p, problem.pixels, problem.weight, huber)
+
+
+def matched_cost(
+    p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
+) -> float:
+    """Huber's cost of all matched cells; one behind its target is ``BEHIND`` hubers off."""
+    x, y = (weight * (pixels - p.pixels).square()).unbind(-1)
+    cost = huber_cost(torch.where(p.valid, x + y, (BEHIND * huber) ** 2), huber)
+    return float(torch.where(weight[..., 0] > 0, cost, 0.0).sum(dtype=torch.float64))

@@ -9,7 +9,6 @@ from torch import Tensor
 from geogs.bundle.flow_term import (
     SourceFlow,
     damped_curvature,
-    matched_cost,
     normal_equations,
     weighed_residuals,
 )
@@ -20,6 +19,7 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_adjoint
+from oracles.lens_reference import matched_cost
 
 
 class PinholeFlow:

@@ -18,7 +18,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import CellProjection
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
-from geogs.geometry.robust import huber_cost, huber_weight
+from geogs.geometry.robust import huber_weight
 
 BEHIND = 10.0
 """By how many of Huber's knees a cell counts as off whose target sees it from behind. No step is
@@ -53,7 +53,8 @@ class FlowTerm(Protocol):
         ...
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """Twice what is minimised: :func:`matched_cost` of all edges."""
+        """Twice what is minimised: Huber's cost of all matched cells; one behind its target is
+        ``BEHIND`` hubers off."""
         ...
 
 
@@ -110,12 +111,3 @@ def residual_norms(
 ) -> Float[Tensor, "e p"]:
     """Norm of each residual in its own standard deviations."""
     return (weight * (pixels - p.pixels).square()).sum(-1).sqrt()
-
-
-def matched_cost(
-    p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
-) -> float:
-    """Huber's cost of all matched cells; one behind its target is ``BEHIND`` hubers off."""
-    x, y = (weight * (pixels - p.pixels).square()).unbind(-1)
-    cost = huber_cost(torch.where(p.valid, x + y, (BEHIND * huber) ** 2), huber)
-    return float(torch.where(weight[..., 0] > 0, cost, 0.0).sum(dtype=torch.float64))

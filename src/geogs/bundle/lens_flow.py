@@ -82,20 +82,6 @@ class LensFlow:
             for frame, e in sources_within(problem.source)
         )  # fmt: skip
 
-    def depths_after(
-        self,
-        problem: BundleProblem,
-        state: BundleState,
-        xi: Float[Tensor, "n 6"],
-        options: BundleOptions,
-    ) -> Iterator[tuple[int, DepthEquations]]:
-        """Equations of the depths of each source after a step of the poses, the lens being known.
-
-        The matches are linearised once more.
-        """
-        for source in self.sources(problem, state, options):
-            yield source.frame, source.edges.depth_after(xi.reshape(-1), len(xi))
-
     def _block(self, state: BundleState) -> LensBlock:
         return self._known or cast(LensBlock, state.block)
 

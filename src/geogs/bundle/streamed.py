@@ -84,16 +84,17 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
     def depth_steps(
         self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """By matches that are linearised a second time, as far as depths need it."""
+        """By matches that are linearised a second time."""
 
         def work(chunk: slice) -> list[tuple[int, Tensor]]:
-            part, xi = self.problem.part(chunk), step.reshape(-1, 6)
-            found = []
-            for frame, depth in self.flow.depths_after(part, state, xi, self.options):
-                if bool(part.free_depth[frame]):
+            part, frames, found = self.problem.part(chunk), len(state.T_cw), []
+            for source in self.flow.sources(part, state, self.options):
+                if bool(part.free_depth[source.frame]):
+                    depth = source.edges.depth_after(step, frames)
                     for term in part.depth_terms:
-                        depth = depth.plus(term.of_frame(frame, state).depth_after(step, len(xi)))
-                    found.append((frame, depth.solution))
+                        own = term.of_frame(source.frame, state)
+                        depth = depth.plus(own.depth_after(step, frames))
+                    found.append((source.frame, depth.solution))
             return found
 
         delta = torch.zeros_like(state.inverse_depth)

@@ -75,7 +75,7 @@ def edge_costs(
     matches: tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]],
     huber: float,
 ) -> Float[Tensor, "e"]:
-    """Huber's cost of the matched cells of each edge, float64: ``flow_term.matched_cost``."""
+    """Huber's cost of the matched cells of each edge, float64: ``FlowTerm.cost``."""
     a, c, cells = arrays, grid.camera, depth.shape[1]
     cost = depth.new_empty(len(a.source), dtype=torch.float64)
     kernels["find_edge_costs"](

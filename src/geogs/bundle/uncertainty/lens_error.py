@@ -149,10 +149,10 @@ class LensEvidence:
         By what matches say of it and what was known of it (:func:`lens_prior`) together: their
         estimate moves them as far as it would if it were taken off, and what it leaves open does
         too; and by what is left of a focal length that was ``corrected`` by a factor, which they do
-        not tell of. Of a readout that was
-        asked for, too, ``doubt`` is the deviation as a part of it. Without ``LEAST``:
-        what matches have wrong in common is taken for an error of the lens that hardly moves a
-        pose, and three sizes that were each so unsure would move them two to five times as far.
+        not tell of. Of a readout that was asked for, too, ``doubt`` is the deviation as a part of
+        it. Without ``LEAST``: what matches have wrong in common is taken for an error of the lens
+        that hardly moves a pose, and three sizes that were each so unsure would move them two to
+        five times as far.
         """
         said = _estimate(self.information, self.gradient)
         expected = (*lens_prior(focal_deviation), doubt)
