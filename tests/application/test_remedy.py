@@ -22,11 +22,12 @@ LOST = replace(GOOD, is_reliable=False, lost=0.3)
 VIDEO = RunSettings((Path("my video.mp4"),))
 
 
-def source(is_live: bool = False, is_guess: bool = False) -> Source:
+def source(is_live: bool = False, focal_deviation: float = 0.0) -> Source:
     names = {"is_live": is_live, "uses_depth": False, "uses_poses": False}
     made = type("Some", (Source,), names)
     one = made.__new__(made)
-    one.length, one.fps, one.calibration = 150, 30.0, SimpleNamespace(is_guess=is_guess)
+    one.length, one.fps = 150, 30.0
+    one.calibration = SimpleNamespace(focal_deviation=focal_deviation)
     one.camera = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
     return one
 
@@ -54,17 +55,24 @@ def test_where_structure_from_motion_was_not_tried_it_is_named_with_its_time(pho
 
 
 @pytest.mark.parametrize(
-    ("settings", "is_guess", "said"),
+    ("settings", "focal_deviation", "said"),
     [
-        (VIDEO, True, " --intrinsics fx,fy,cx,cy takes the focal length that you know, in a"),
-        (VIDEO, False, RECORD_AGAIN),
-        (replace(VIDEO, offline=True), False, RECORD_AGAIN),
-        (replace(VIDEO, map=Path("old")), False, " makes a map of its own, in about 1 min 30"),
+        (VIDEO, 0.09, " --intrinsics fx,fy,cx,cy takes the focal length that you know, in a"),
+        (VIDEO, 0.0, RECORD_AGAIN),
+        (replace(VIDEO, offline=True), 0.0, RECORD_AGAIN),
+        (replace(VIDEO, map=Path("old")), 0.0, " makes a map of its own, in about 1 min 30"),
     ],
 )
-def test_where_it_was_tried_the_next_is(photos, settings, is_guess, said):
+def test_where_it_was_tried_the_next_is(photos, settings, focal_deviation, said):
     photos(True)
-    assert said in remedy(settings, source(is_guess=is_guess), LOST, 90.0)
+    assert said in remedy(settings, source(focal_deviation=focal_deviation), LOST, 90.0)
+
+
+def test_structure_from_motion_is_not_named_where_depths_are_what_is_not_known(photos):
+    photos(False)
+    flat = replace(GOOD, is_reliable=False, depth=0.29)
+    assert remedy(VIDEO, source(), flat, 90.0) == RECORD_AGAIN
+    assert " --intrinsics fx,fy,cx,cy takes" in remedy(VIDEO, source(False, 0.09), flat, 90.0)
 
 
 def test_of_a_camera_the_recording_helps(photos):

@@ -29,13 +29,14 @@ def remedy(
     Empty where the result needs none. ``judged`` is none where no frame was tracked; ``took`` are
     the seconds of this run, if it came to an end.
     """
-    if not is_wanted(judged) or isinstance(source, PosedSource):
+    is_placed_enough = not is_wanted(judged)
+    if isinstance(source, PosedSource) or (judged and judged.is_reliable and is_placed_enough):
         return ""
     if source.is_live:
         return "Record it: geogs run RECORDING waits for no camera, and tries more."
     command = f"geogs run {arguments(settings)}"
     again = f", in about {duration(took)}" if took else ""
-    if not _was_placed(settings, source):
+    if not (is_placed_enough or _was_placed(settings, source)):
         install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
         plan = offline_plan(settings.config, source, False, False, is_begun=True)
         return (
@@ -44,7 +45,7 @@ def remedy(
         )
     if settings.map is not None:
         return f"{command} makes a map of its own{again}."
-    if source.calibration.is_guess:
+    if source.calibration.focal_deviation:
         return f"{command} --intrinsics fx,fy,cx,cy takes the focal length that you know{again}."
     if settings.config.input.stride > 1:
         every = duration(settings.config.input.stride * took)

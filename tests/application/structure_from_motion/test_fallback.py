@@ -28,6 +28,7 @@ from posed_scene import SMALL
 
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
 LOST = replace(GOOD, is_reliable=False, lost=0.3)
+FLAT = replace(GOOD, is_reliable=False, depth=0.29)
 TURNED = Verdict(False, "Rotation only.", 0.0, 1.0, np.inf, np.inf, np.inf)
 FRAMES = 16
 
@@ -37,6 +38,8 @@ def test_another_way_is_wanted_where_frames_are_missing_or_nothing_is_to_be_reli
     assert not is_wanted(replace(GOOD, lost=0.08))
     for judged in (None, LOST, TURNED, replace(GOOD, lost=0.12), replace(GOOD, is_reliable=False)):
         assert is_wanted(judged)
+    assert not is_wanted(FLAT)  # all frames have a place, and fewer matches know no depth better
+    assert is_wanted(replace(FLAT, lost=0.06))
 
 
 @pytest.mark.parametrize(
@@ -48,6 +51,8 @@ def test_another_way_is_wanted_where_frames_are_missing_or_nothing_is_to_be_reli
         (GOOD, replace(GOOD, lost=0.12), True),
         (GOOD, replace(GOOD, lost=0.03), False),  # hardly more, and tracking is to be relied on
         (GOOD, replace(GOOD, is_reliable=False, position=0.1), True),  # as many, better known
+        (GOOD, FLAT, False),  # as many
+        (GOOD, replace(FLAT, lost=0.06), True),  # more
         (replace(GOOD, lost=0.4), LOST, False),  # fewer
         (replace(LOST, lost=0.28), LOST, False),  # hardly more
         (replace(GOOD, position=0.08), LOST, False),  # more, but nobody knows where

@@ -192,14 +192,18 @@ class TrackedOrPlaced(Work):
 
 def is_wanted(tracked: Verdict | None) -> bool:
     """Whether another way to place the frames is worth its time; none where nothing was tracked."""
-    return tracked is None or not tracked.is_reliable or _placed_part(tracked) < 1 - MAX_UNKNOWN
+    if tracked is None or tracked.is_reliable:
+        return _placed_part(tracked) < 1 - MAX_UNKNOWN
+    return _placed_part(tracked) <= 1 - CLEARLY_MORE or _is_shape_known(tracked)
 
 
 def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
     """Whether frames that were placed by structure from motion are to be taken.
 
     Their places and depths have to be well known, or no worse than those that were tracked, and
-    they clearly more, or as many and to be relied on where what was tracked is not.
+    they clearly more, or as many and to be relied on where what was tracked is not. Where tracking
+    does not know the depths, as many do not either: its matches are more, and what it says of
+    depths counts what is open of lens and rows, too.
     """
     position, depth = MAX_POSITION_DEVIATION, MAX_DEPTH_DEVIATION
     if tracked is not None:
@@ -207,8 +211,8 @@ def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
     if not (placed.position <= position and placed.depth <= depth and placed.has_shape):
         return False
     more = _placed_part(placed) - _placed_part(tracked)
-    is_relied_on = tracked is not None and tracked.is_reliable
-    return more >= (0.0 if placed.is_reliable and not is_relied_on else CLEARLY_MORE)
+    may_replace = tracked is None or (not tracked.is_reliable and _is_shape_known(tracked))
+    return more >= (0.0 if placed.is_reliable and may_replace else CLEARLY_MORE)
 
 
 def impossible(settings: RunSettings, source: Source) -> str:
@@ -220,6 +224,10 @@ def impossible(settings: RunSettings, source: Source) -> str:
     if settings.scale_from or source.uses_depth or source.uses_poses:
         return "it knows no metres; geogs run --offline without them does it."
     return ""
+
+
+def _is_shape_known(judged: Verdict) -> bool:
+    return judged.depth <= MAX_DEPTH_DEVIATION
 
 
 def _placed_part(judged: Verdict | None) -> float:
