@@ -75,7 +75,6 @@ class Slam(SlamOutput):
             DeviceError: there is no such device, or it cannot be used.
         """
         self.config = c = config or Config()
-        self.focal_deviation = focal_deviation
         maps_at_end = defers_map and not live and c.mapping.may_follow
         self.world = world or World(maps_at_end=maps_at_end)
         self.stopwatch = Stopwatch(self.world.times)
@@ -84,7 +83,9 @@ class Slam(SlamOutput):
         with torch.cuda.stream(stream):
             grid = SampleGrid(camera, where)
             operator = build_operator(c.tracking, grid, mask, black_is_masked)
-            keyframes = self.world.keyframes.attached(grid, operator.encode, c.resident_keyframes)
+            keyframes = self.world.keyframes.attached(
+                grid, operator.encode, c.resident_keyframes, focal_deviation
+            )
             check_world(self.world)
             self.segments = Segments(self.world.segments, keyframes, operator, c, prior, live)
             self.loops = LoopCloser(self.segments, c.loop, not live, mask, self.world.loops)
@@ -159,12 +160,11 @@ class Slam(SlamOutput):
             return
         with self.stopwatch("global bundle adjustment"):
             global_bundle(
-                main, lambda f, _: progress("bundle adjustment", f), None, self.world.is_ended,
-                self.focal_deviation,
-            )  # fmt: skip
+                main, lambda f, _: progress("bundle adjustment", f), ends=self.world.is_ended
+            )
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
-                self.world.uncertainty = frame_uncertainty(main, self.focal_deviation)
+                self.world.uncertainty = frame_uncertainty(main)
         self.loops.replaced_by_bundle()
         self.world.adjusted = len(main.segment.ids)
         self._update_map()

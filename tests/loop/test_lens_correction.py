@@ -214,7 +214,8 @@ def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypat
     global_bundle(tracker, ends=True)
     assert tracker.keyframes.table.lens is None
     tracker, _ = tracker_of((0.02, -0.03), -0.03)
-    global_bundle(tracker, ends=True, focal_deviation=0.01)
+    tracker.keyframes.table.focal_deviation = 0.01
+    global_bundle(tracker, ends=True)
     lens = tracker.keyframes.table.lens
     assert lens is not None
     assert lens.focal == pytest.approx(1 / 1.03, abs=0.01)
@@ -223,7 +224,8 @@ def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypat
 
 def test_a_guess_that_is_far_off_is_found_by_all_matches():
     tracker, _ = tracker_of((0.02, -0.03), 0.25)
-    global_bundle(tracker, ends=True, focal_deviation=0.35)
+    tracker.keyframes.table.focal_deviation = 0.35
+    global_bundle(tracker, ends=True)
     lens = tracker.keyframes.table.lens
     assert lens is not None
     assert lens.focal == pytest.approx(1 / 0.75, rel=0.05)
@@ -243,7 +245,8 @@ def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeyp
         return measure(*pairs, fine=fine, memory=memory)
 
     monkeypatch.setattr(tracker.map.operator, "measure", noted)
-    global_bundle(tracker, ends=True, focal_deviation=0.01)
+    tracker.keyframes.table.focal_deviation = 0.01
+    global_bundle(tracker, ends=True)
     assert matched[0] == (False, False)
     assert matched[-1] == (is_found, True)
     assert all(fine == is_straight for is_straight, fine in matched) is is_found

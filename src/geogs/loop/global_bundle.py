@@ -44,7 +44,6 @@ def global_bundle(
     progress: Callable[[float, str], None] | None = None,
     keyframes: Sequence[int] | None = None,
     ends: bool = False,
-    focal_deviation: float = 0.0,
 ) -> PoseCorrection:
     """Refine keyframes of a tracker on a fresh graph that also joins places seen again.
 
@@ -57,7 +56,7 @@ def global_bundle(
     message. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking and a
     lens was found, everything is straightened by that, matched and adjusted once more, and what
     matches say of the lens then is taken off them and the images; so it is found in any case where
-    the focal length is only known to a ``focal_deviation``, relative, first by matches at half the
+    nobody said the focal length (``KeyframeTable.focal_deviation``), first by matches at half the
     resolution. A tracker without a map is left alone, and one whose images are straight already.
     """
     config, segment, store = tracker.config, tracker.segment, tracker.keyframes
@@ -73,15 +72,12 @@ def global_bundle(
     tracker.map.odometry.update_scale_by_all()
     match = partial(_match, tracker, pairs, free_poses, free, progress)
     # What tells of the lens is matched anew on straight images: half the resolution is enough.
-    is_open = ends and focal_deviation > 0
+    is_open = ends and store.table.focal_deviation > 0
     match(config.fine_adjustment and not is_open)
     readout = correct_rows(
         tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment
     )
-    lens = correct_lens(
-        tracker, free_poses, free, GLOBAL_OPTIONS, ends,
-        readout=readout, focal_deviation=focal_deviation,
-    )  # fmt: skip
+    lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, readout=readout)
     if lens is not None and ends:
         images = BentImages.of(store)
         straighten(tracker, lens, images)

@@ -51,7 +51,6 @@ def correct_lens(
     ends: bool = False,
     before: FoundLens | None = None,
     readout: float = 1.0,
-    focal_deviation: float = 0.0,
 ) -> FoundLens | None:
     """Correct all matches for the lens and adjust again; nothing where they do not ask for it.
 
@@ -60,7 +59,7 @@ def correct_lens(
     readout, where it was found in the video: matches were corrected for rows that took so many
     times it. ``before`` was found already, and images are straight, so that what matches say is
     believed however little it is; so is it at the end, and the focal length with it, where that was
-    but found in the video or guessed, to a relative ``focal_deviation``: the sizes are expected to
+    but found in the video or guessed (``KeyframeTable.focal_deviation``): the sizes are expected to
     be about what the images were taken for then
     (:func:`~geogs.bundle.uncertainty.lens_error.lens_prior`). Not in the world of a saved map,
     whose keyframes stay as its own adjustment left them.
@@ -69,6 +68,7 @@ def correct_lens(
     measured = graph.packed
     bend, said, focal, longer = LensBend(), None, 0.0, 0.0
     left = ROUNDS if measured and not tracker.segment.fixed else 0
+    focal_deviation = keyframes.table.focal_deviation
     is_open = ends and focal_deviation > 0
     is_asked = before.focal != 1 if before else is_open
     rows = _rows_in_doubt(log, keyframes, readout) if ends and left else None

@@ -26,20 +26,19 @@ CAUTION = 4 / 3
 in common. Read off rendered videos (docs/uncertainty.md has the table)."""
 
 
-def frame_uncertainty(tracker: Tracker, focal_deviation: float = 0.0) -> Uncertainty:
+def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     """Deviations of all tracked frames of a tracker that has a map, by its present edges.
 
     A frame between keyframes is as far off as they are (their deviations, interpolated in
     time), and by what its own few matches leave open beside (:func:`own_deviations`); every frame
     by what is not known of the camera's motion while its rows were read (:func:`row_twists`); all
-    are independent. Depths are those of the keyframes around. ``focal_deviation`` is the
-    relative one of a focal length that nobody gave.
+    are independent. Depths are those of the keyframes around.
     """
     log, keyframes = tracker.map.recorder.log, tracker.keyframes
     tracked = sorted(tracked_on(log, keyframes), key=lambda r: r.index)
     times = np.array([r.timestamp for r in tracked], np.float64)
     errors, edges = row_errors(log, keyframes), tracker.map.graph.edges
-    around = keyframe_uncertainty(tracker, errors, focal_deviation).at(times)
+    around = keyframe_uncertainty(tracker, errors).at(times)
     none, unknown = PoseDeviation(0.0, 0.0), PoseDeviation(np.inf, np.inf)
     known = dict.fromkeys((k.frame_index for k in keyframes), none)
     known |= own_deviations(log, keyframes)

@@ -35,12 +35,9 @@ USUAL_RESIDUAL = 0.23
 videos (docs/uncertainty.md has the table)."""
 
 
-def keyframe_uncertainty(
-    tracker: Tracker, errors: RowErrors | None = None, focal_deviation: float = 0.0
-) -> Uncertainty:
+def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> Uncertainty:
     """Uncertainty of all keyframes of a tracker that has a map, from its present edges; ``errors``
-    are those of its frames' rows where they were solved already. ``focal_deviation`` is the
-    relative one of the focal length that nobody gave, before all matches were asked.
+    are those of its frames' rows where they were solved already.
 
     What it says of poses is what is left of their errors when the trajectory is laid over the truth
     by a similarity, for frame and unit of the map are anyone's
@@ -58,7 +55,7 @@ def keyframe_uncertainty(
     propagated, focal = np.zeros(2), 0.0
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
-        found = _marginals(tracker, ids[part], rows, focal_deviation)
+        found = _marginals(tracker, ids[part], rows)
         if found is None:
             continue
         depth[part] = found.depth_deviation.numpy()
@@ -132,9 +129,7 @@ class _Matches:
         return rows.of_matches(i, j, T_ji, rays, depth, at.pixels).slope
 
 
-def _marginals(
-    tracker: Tracker, ids: list[int], rows: RowErrors | None, focal_deviation: float
-) -> Marginals | None:
+def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marginals | None:
     """Marginals of some keyframes, with what all their matches have wrong in common.
 
     They hold where the scene is not as modelled, too: matches are as many times as unsure as they
@@ -157,10 +152,10 @@ def _marginals(
         relative_depth=longer[:, None] * found.relative_depth,
     )
     if said is not None:
-        lens = tracker.keyframes.table.lens
+        table = tracker.keyframes.table
         doubt = 0.0 if rows is None else rows.doubt
-        corrected = 1.0 if lens is None else lens.focal
-        found = found.beside(said.considered(corrected, doubt, focal_deviation))
+        corrected = 1.0 if table.lens is None else table.lens.focal
+        found = found.beside(said.considered(corrected, doubt, table.focal_deviation))
     free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[free[:, None], free]
     depth, residual = found.relative_depth[own], found.normalised_residual[own]

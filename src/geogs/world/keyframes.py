@@ -200,6 +200,9 @@ class KeyframeTable:
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
     """The pinhole that the images are of, or will be once they are straight. That of the grid is
     another only while the lens is being found."""
+    focal_deviation: float = field(default=0.0, init=False, repr=False, metadata=NOT_STORED)
+    """Relative standard deviation of their focal length where nobody said it, before all matches
+    are asked for it."""
     encode: Encode | None = field(init=False, repr=False, metadata=NOT_STORED)
     """The flow operator's; images are encoded again by it when needed."""
     set_of: dict[int, "KeyframeSet"] = field(init=False, repr=False, metadata=NOT_STORED)
@@ -215,11 +218,16 @@ class KeyframeTable:
         return KeyframeTable().attached(grid, encode, resident)
 
     def attached(
-        self, grid: SampleGrid, encode: Encode | None = None, resident: int = RESIDENT
+        self,
+        grid: SampleGrid,
+        encode: Encode | None = None,
+        resident: int = RESIDENT,
+        focal_deviation: float = 0.0,
     ) -> "KeyframeTable":
         """The table with what belongs to the process: where depth is kept, how images are encoded,
-        and how many of the large arrays of a name stay in memory."""
+        how many of the large arrays of a name stay in memory, and how well the lens was known."""
         self.grid, self.camera, self.encode, self.set_of = grid, grid.camera, encode, {}
+        self.focal_deviation = focal_deviation
         self.arrays.resident = resident
         for keyframe in self.keyframes.values():
             keyframe.table = self
