@@ -1,7 +1,6 @@
-"""Uncertainty of focal length and distortion by one stretch of a video, and by several together."""
+"""What one stretch of a video says of focal length and distortion, and how surely."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -28,13 +27,11 @@ DISTORTION_FRACTION = 0.5
 it is taken for a pinhole."""
 FIELDS_OF_VIEW = 15.0, 150.0
 """Degrees along the longer side; what lies outside is no pinhole camera's."""
-AGREEMENT = 3.0
-"""Deviations by which two stretches may differ and still agree."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one stretch says, or several together."""
+    """What one stretch says, or the pairs of a view graph."""
 
     lens: RadialLens
     covariance: Float64[Tensor, "3 3"]
@@ -45,12 +42,6 @@ class Estimate:
     def camera(self) -> Camera:
         """The lens' pinhole."""
         return self.lens.camera
-
-    @property
-    def sizes(self) -> Float64[Tensor, "3"]:
-        """Logarithm of the focal length, k1 and k2."""
-        lens = self.lens
-        return torch.tensor([math.log(lens.camera.fx), lens.k1, lens.k2], dtype=torch.float64)
 
     @property
     def deviations(self) -> tuple[float, float, float]:
@@ -67,7 +58,7 @@ class Estimate:
         """A pinhole where the matches do not tell that the lens bends: real ones that tell little
         of it err alike, too, and the focal length by as much as k1 and k2 lean on it."""
         bend, lean = self.covariance[1:, 1:], self.covariance[1:, 0]
-        k = self.sizes[1:]
+        k = torch.tensor([self.lens.k1, self.lens.k2], dtype=torch.float64)
         if not bool((bend.diagonal() > 0).all()) or k @ torch.linalg.solve(bend, k) >= EVIDENCE:
             return self
         follows = torch.linalg.solve(bend, lean)
@@ -77,19 +68,6 @@ class Estimate:
         covariance[0, 0] = max(left, LEAST_DEVIATION**2)
         pinhole = RadialLens(self.lens.camera).moved(shift)
         return Estimate(pinhole, covariance, self.keyframes)
-
-    def moved(
-        self, sizes: Float64[Tensor, "3"], covariance: Float64[Tensor, "3 3"], keyframes: int
-    ) -> "Estimate":
-        """Another, of a lens of these sizes."""
-        return Estimate(self.lens.moved(*(sizes - self.sizes).tolist()), covariance, keyframes)
-
-
-def relative_error(bundle: GrowingBundle) -> float:
-    """Deviation of the focal length by the matches alone, relative."""
-    assert bundle.result is not None
-    error = STANDARD_ERRORS * math.sqrt(float(bundle.result.covariance[0, 0]))
-    return math.hypot(error, LEAST_DEVIATION)
 
 
 def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
@@ -102,43 +80,15 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
         return f"it seems to have a field of view of {angle:.0f} degrees"
     if result.cost > MAX_COST:
         return Degeneracy.UNEXPLAINED.value
-    least = LEAST_DEVIATION**2 * torch.eye(3, dtype=torch.float64)
-    covariance = STANDARD_ERRORS**2 * result.covariance + least
-    if not radial:
-        covariance[1:] = covariance[:, 1:] = 0
-    return Estimate(lens, covariance, len(bundle))
+    asked = torch.tensor([1, radial, radial], dtype=torch.float64)
+    covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()
+    return with_prior(Estimate(lens, covariance, len(bundle)))
 
 
-def joined(estimates: Sequence[Estimate]) -> Estimate:
-    """What several stretches say together, and what is known of lenses (``PRIOR``): the mean, by
-    their covariances, of the logarithm of the focal length, k1 and k2.
-
-    Those that agree with each other decide. Where they are no majority all count, and what they
-    differ by makes the deviation as large as it has to be.
-    """
-    party = max(
-        ([b for b in estimates if _agree(a, b)] for a in estimates),
-        key=lambda p: (len(p), sum(e.deviation**-2 for e in p)),
-    )
-    if 2 * len(party) <= len(estimates):
-        party = list(estimates)
-    first = party[0]
-    free = first.covariance.diagonal() > 0
-    known = torch.tensor([0.0, *(sigma**-2 for sigma in PRIOR)], dtype=torch.float64).diag()
-    each = [torch.linalg.inv(e.covariance[free][:, free]) for e in party]
-    whole = torch.linalg.inv(sum(each, known[free][:, free]))
-    mean = first.sizes
-    mean[free] = whole @ sum(
-        (P @ e.sizes[free] for P, e in zip(each, party, strict=True)), 0 * mean[free]
-    )
-    squares = sum(float((e.sizes - mean)[0] / e.deviation) ** 2 for e in party)
-    excess = max(1.0, squares / (len(party) - 1)) if len(party) > 1 else 1.0
-    covariance = torch.zeros(3, 3, dtype=torch.float64)
-    covariance[free[:, None] & free] = (excess * whole).flatten()
-    covariance[0, 0] = covariance[0, 0].clamp(min=LEAST_DEVIATION**2)
-    return first.moved(mean, covariance, sum(e.keyframes for e in party))
-
-
-def _agree(a: Estimate, b: Estimate) -> bool:
-    off = abs(math.log(a.camera.fx / b.camera.fx))
-    return off <= AGREEMENT * math.hypot(a.deviation, b.deviation)
+def with_prior(said: Estimate) -> Estimate:
+    """With what is known of lenses before (``PRIOR``): k1 and k2 are about none."""
+    expected = torch.tensor(PRIOR, dtype=torch.float64).square().diag()
+    gain = said.covariance[:, 1:] @ torch.linalg.inv(said.covariance[1:, 1:] + expected)
+    k = torch.tensor([said.lens.k1, said.lens.k2], dtype=torch.float64)
+    lens = said.lens.moved(*(-gain @ k).tolist())
+    return Estimate(lens, said.covariance - gain @ said.covariance[1:], said.keyframes)

@@ -12,8 +12,7 @@ from jaxtyping import Bool
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.calibration.degeneracy import Degeneracy
-from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
+from geogs.tracking.calibration.focal_uncertainty import Estimate
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer, distant_flows
 from geogs.tracking.calibration.view_graph import view_graph_estimate
@@ -26,8 +25,8 @@ LONG_EDGE = 512
 parallax and of matched cells were chosen at (docs/calibration.md)."""
 STRETCHES = 4
 """Stretches of the video that are used, at most, each after the one before it: bounds the time."""
-CONFIDENT = 0.01
-"""Relative deviation of the focal length from which no other stretch is used."""
+CONFIDENT = 0.03
+"""Relative deviation of the focal length from which no other stretch is asked."""
 UNRELIABLE = 0.1
 """Relative deviation above which the focal length is not believed and the guess is kept, which may
 be as good."""
@@ -67,10 +66,10 @@ def self_calibrate(
 
     ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
     is only one of several to start from. Flow is measured by the operator without a network.
-    Stretch after stretch of the video is used until all together are confident; where none of them
-    tells, the epipolar geometry of distant pairs of their views is asked. ``report`` is called with
-    the fraction done; what it raises passes through. Outside a ``mask`` nothing is matched, nor
-    what is quite black where ``black_is_masked``.
+    Stretch after stretch of the video is asked until one is confident, and the surest counts; where
+    none tells, the epipolar geometry of distant pairs of their views is asked. ``report`` is called
+    with the fraction done; what it raises passes through. Outside a ``mask`` nothing is matched,
+    nor what is quite black where ``black_is_masked``.
     """
     small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
     size = small.width, small.height
@@ -80,17 +79,17 @@ def self_calibrate(
     operator = build_operator(TrackingConfig(operator="classical"), grid, mask, black_is_masked)
     images = (cv2.resize(f.image, size, interpolation=cv2.INTER_AREA) for f in frames)
     gatherer = ViewGatherer(images, grid, operator)
-    estimates: list[Estimate] = []
+    best: Estimate | None = None
     failure = ""
     for n in range(STRETCHES):
-        said = _ask(Stretch(grid, operator, gatherer, radial, _part_of(report, n)))
-        if isinstance(said, Estimate):
-            estimates.append(said)
-        else:
+        said = Stretch(grid, operator, gatherer, radial, _part_of(report, n)).ask()
+        if isinstance(said, str):
             failure = failure or said
-        if gatherer.is_over or (estimates and joined(estimates).deviation < CONFIDENT):
+        elif best is None or said.deviation < best.deviation:
+            best = said
+        if gatherer.is_over or (best is not None and best.deviation < CONFIDENT):
             break
-    found = joined(estimates).as_told() if estimates else None
+    found = None if best is None else best.as_told()
     if found is None or not found.deviation < UNRELIABLE:
         asked = _part_of(report, STRETCHES)
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
@@ -101,17 +100,6 @@ def self_calibrate(
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
     return _verdict(camera, small, found, gatherer.frames)
-
-
-def _ask(stretch: Stretch) -> Estimate | str:
-    """What the next stretch says, or why it says nothing."""
-    start = stretch.start()
-    if isinstance(start, Degeneracy):
-        return start.value
-    bundle = stretch.grow(start)
-    return (
-        "its motion could not be followed" if bundle is None else estimate(bundle, stretch.radial)
-    )
 
 
 def _part_of(report: Report, n: int) -> Report:
