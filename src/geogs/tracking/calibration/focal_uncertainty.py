@@ -25,6 +25,9 @@ it does not or hardly does, 65 and more where it does (docs/calibration.md)."""
 DISTORTION_FRACTION = 0.5
 """Fraction of the change of the focal length when the lens may bend that counts as deviation where
 it is taken for a pinhole."""
+UNRELIABLE = 0.1
+"""Relative deviation above which the focal length is not believed and the guess is kept, which may
+be as good."""
 FIELDS_OF_VIEW = 15.0, 150.0
 """Degrees along the longer side; what lies outside is no pinhole camera's."""
 
@@ -82,7 +85,10 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
         return Degeneracy.UNEXPLAINED.value
     asked = torch.tensor([1, radial, radial], dtype=torch.float64)
     covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()
-    return with_prior(Estimate(lens, covariance, len(bundle)))
+    said = with_prior(Estimate(lens, covariance, len(bundle))).as_told()
+    if said.deviation < UNRELIABLE:
+        return said
+    return f"its motion leaves the focal length unsure by {100 * said.deviation:.0f} %"
 
 
 def with_prior(said: Estimate) -> Estimate:
