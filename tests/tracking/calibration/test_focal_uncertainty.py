@@ -12,18 +12,6 @@ from geogs.tracking.calibration.focal_uncertainty import Estimate, with_prior
 CAMERA = Camera(300.0, 310.0, 159.5, 119.5, 320, 240)
 
 
-def test_a_lens_is_a_pinhole_where_matches_do_not_tell_that_it_bends():
-    root = torch.tensor([[0.03, 0.005, 0], [0.02, 0, 0.001], [0, 0.001, 0.02]]).double()
-    bent = Estimate(RadialLens(CAMERA, 0.04, -0.02), root @ root.mT, 12)
-    found = bent.as_told()
-    assert (found.lens.k1, found.lens.k2, found.deviations[1:]) == (0, 0, (0, 0))
-    shift = math.log(found.camera.fx / CAMERA.fx)
-    assert shift == pytest.approx(-0.06, rel=0.05)  # k1 of two deviations takes focal length along
-    assert found.deviation == pytest.approx(math.hypot(0.005, shift / 2), rel=0.1)
-    clear = Estimate(RadialLens(CAMERA, 0.12, -0.02), root @ root.mT, 12)
-    assert clear.as_told() is clear
-
-
 def test_what_is_known_of_lenses_tells_what_a_narrow_view_does_not():
     lens = RadialLens(CAMERA, 3.0, -40.0)
     root = torch.tensor([[0.05, 0.004, 0], [3.0, 0, 0.1], [-40.0, 0, 3.0]]).double()

@@ -19,12 +19,6 @@ LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
 PRIOR = 0.1, 0.2
 """Deviations of k1 and k2 before any match is asked. A narrow field of view does not tell them."""
-EVIDENCE = 36.0
-"""Square of k1 and k2 in their deviations from which on a lens is believed to bend: 1 to 21 where
-it does not or hardly does, 65 and more where it does (docs/calibration.md)."""
-DISTORTION_FRACTION = 0.5
-"""Fraction of the change of the focal length when the lens may bend that counts as deviation where
-it is taken for a pinhole."""
 UNRELIABLE = 0.1
 """Relative deviation above which the focal length is not believed and the guess is kept, which may
 be as good."""
@@ -57,21 +51,6 @@ class Estimate:
         """Standard deviation of the focal length, relative."""
         return self.deviations[0]
 
-    def as_told(self) -> "Estimate":
-        """A pinhole where the matches do not tell that the lens bends: real ones that tell little
-        of it err alike, too, and the focal length by as much as k1 and k2 lean on it."""
-        bend, lean = self.covariance[1:, 1:], self.covariance[1:, 0]
-        k = torch.tensor([self.lens.k1, self.lens.k2], dtype=torch.float64)
-        if not bool((bend.diagonal() > 0).all()) or k @ torch.linalg.solve(bend, k) >= EVIDENCE:
-            return self
-        follows = torch.linalg.solve(bend, lean)
-        shift = -float(follows @ k)
-        left = float(self.covariance[0, 0] - follows @ lean) + (DISTORTION_FRACTION * shift) ** 2
-        covariance = torch.zeros_like(self.covariance)
-        covariance[0, 0] = max(left, LEAST_DEVIATION**2)
-        pinhole = RadialLens(self.lens.camera).moved(shift)
-        return Estimate(pinhole, covariance, self.keyframes)
-
 
 def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     """What an adjusted stretch says, with k1 and k2 if ``radial``, or why it is not believed."""
@@ -85,7 +64,7 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
         return Degeneracy.UNEXPLAINED.value
     asked = torch.tensor([1, radial, radial], dtype=torch.float64)
     covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()
-    said = with_prior(Estimate(lens, covariance, len(bundle))).as_told()
+    said = with_prior(Estimate(lens, covariance, len(bundle)))
     if said.deviation < UNRELIABLE:
         return said
     return f"its motion leaves the focal length unsure by {100 * said.deviation:.0f} %"
