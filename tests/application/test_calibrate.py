@@ -13,7 +13,6 @@ from geogs.application.calibrate import lens_said, refined, self_calibrated
 from geogs.application.interrupt import Interruption
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
-from geogs.geometry.distortion import undistorted_rays
 from geogs.io.sources.calibration import GUESS, Calibration
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
@@ -75,7 +74,9 @@ def test_intrinsics_json_holds_the_deviation(video, tmp_path, capfd):
     assert of_source["self_calibration"]["failure"] is None
     assert document["fx"] == pytest.approx(of_source["fx"])
     said = f"refined from the video: {of_source['fx']:.1f} +- {deviation:.1f} pixels"
-    assert of_source["k1_deviation"] is of_source["k2_deviation"] is None  # a pinhole
+    for name, k in zip(("k1", "k2"), of_source["distortion"], strict=False):
+        assert abs(k) < 2.5 * of_source[f"{name}_deviation"]  # a pinhole
+        said += f", {name} {k:.4f} +- {of_source[f'{name}_deviation']:.4f}"
     assert of_source["origin"] == f"{said} (a field of view of 60 degrees was assumed)"
     assert source.intrinsics_origin == of_source["origin"]
     assert listener.said == [f"Intrinsics: {source.intrinsics_origin}."]
@@ -134,38 +135,19 @@ def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
         self_calibrated(source, Config())
 
 
-@pytest.mark.parametrize(("readout", "times"), [(0.03, 2), (0.0005, 1)])
-def test_rows_that_another_lens_puts_elsewhere_are_rectified_once_more(
-    video, monkeypatch, readout, times
-):
+def test_the_focal_length_is_asked_of_rectified_rows(video, monkeypatch):
     seen = []
 
     def calibrate(frames, camera, radial, device, report, *masks):
         seen.append(max(float(frame.rows.offset.float().abs().max()) for frame in frames))
-        factor, bend = (0.8, (0.1, -0.05)) if len(seen) == 1 else (1.02, None)
-        found = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
-        return SelfCalibration(found, bend, 0.01, bend and (0.004, 0.003), 12, 14)
+        return SelfCalibration(camera.with_focal(0.8 * camera.fx), None, 0.01, None, 12, 14)
 
     monkeypatch.setattr(self_calibration, "self_calibrate", calibrate)
-    before = open_source(video, InputConfig(readout=readout))
+    before = open_source(video, InputConfig(readout=0.03))
     after = self_calibrated(before, Config()).calibration
-    assert len(seen) == times
-    factor = 0.8 * (1.02 if times == 2 else 1.0)
-    assert after.fx == pytest.approx(factor * before.calibration.fx)
-    assert after.origin.endswith("(a field of view of 60 degrees was assumed)")
-    assert (
-        f"{after.fx:.1f} +- {0.01 * after.fx:.1f} pixels, k1 {after.distortion[0]:.4f} +- 0.0040"
-        in (after.origin)
-    )
-    assert after.refinement.deviations == (0.004, 0.003)
-    # The same lens: the rays of the first focal length are 1.02 times those of the second.
-    first = replace(
-        before.calibration, fx=0.8 * before.calibration.fx, fy=0.8 * before.calibration.fy
-    )
-    pixels = np.array([[10.0, 20.0], [100.0, 60.0], [180.0, 130.0]])
-    rays = undistorted_rays(pixels, first.camera(), (0.1, -0.05, 0.0, 0.0), "polynomial")
-    found = undistorted_rays(pixels, after.camera(), after.distortion, "polynomial")
-    np.testing.assert_allclose(found, rays * (0.8 / factor), atol=2e-3)
+    assert len(seen) == 1
+    assert seen[0] > 1  # pixels
+    assert after.fx == pytest.approx(0.8 * before.calibration.fx)
 
 
 def test_what_was_found_at_working_size_is_carried_to_the_source():

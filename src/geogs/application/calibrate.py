@@ -1,11 +1,9 @@
 """Before a run: focal length and shutter that nobody gave, from the video itself."""
 
 import math
-import statistics
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -13,20 +11,15 @@ import torch
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import Config
-from geogs.geometry.distortion import with_bend
 from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.frame_source import Source
 from geogs.shutter.shutter import Shutter
-from geogs.types import FoundLens, Frame
+from geogs.types import FoundLens
 
 if TYPE_CHECKING:
     from geogs.io.sources.reader import RawFrame
     from geogs.shutter.readout import FoundReadout
     from geogs.tracking.calibration.self_calibration import SelfCalibration
-
-PUT_ELSEWHERE = 0.25
-"""Pixels by which another lens puts rows elsewhere from which on the focal length is asked for once
-more: rows that were rectified through a lens far off look like a lens themselves."""
 
 T = TypeVar("T")
 F = TypeVar("F")
@@ -52,71 +45,33 @@ def self_calibrated(
                 "--intrinsics fx,fy,cx,cy for a better result."
             )
         return source
+    from geogs.tracking.calibration.self_calibration import self_calibrate
+
     radial = config.calibration.radial and not source.calibration.is_distorted
-    ask = partial(_asked, radial, torch.device(device), progress, stop)
-    told = ask(_with_rows_rectified(source, progress, stop))
-    if told is None:
+    rectified = _with_rows_rectified(source, progress, stop)
+    found = None if rectified is None else _found_in(
+        rectified.linked_frames(), "calibration", progress, stop,
+        lambda frames, report: self_calibrate(
+            frames, source.camera, radial, device, report, source.mask, source.black_is_masked
+        ),
+    )  # fmt: skip
+    if found is None:
         progress.write(
             f"Calibration stopped; going on with {source.intrinsics_origin}. "
             "Press Ctrl-C again to end."
         )
         return source
-    (found, offset), before = told, source.calibration
-    calibration = refined(before, source.camera.fx, found)
-    if offset * _change_of_rows(before, calibration) > PUT_ELSEWHERE:
-        known = source.with_calibration(calibration)
-        told = ask(_with_rows_rectified(known, progress, stop))
-        if told is not None and told[0].failure is None:
-            calibration = refined(calibration, known.camera.fx, told[0], before)
+    calibration = refined(source.calibration, source.camera.fx, found)
     progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
 
 
-def _asked(
-    radial: bool, device: torch.device, progress: RunProgress, stop: Stop, source: Source | None
-) -> "tuple[SelfCalibration, float] | None":
-    """What the frames of a source say of its camera, and by how many pixels a row of most of them
-    was put elsewhere, at most; none of no source, or after a request to stop."""
-    from geogs.tracking.calibration.self_calibration import self_calibrate
-
-    if source is None:
-        return None
-    offsets = [0.0]
-
-    def noted() -> Generator[Frame, None, None]:
-        with closing(source.linked_frames()) as frames:
-            for frame in frames:
-                if frame.rows is not None and frame.rows.is_rectified:
-                    offsets.append(float(frame.rows.offset.float().abs().max()))
-                yield frame
-
-    found = _found_in(
-        noted(), "calibration", progress, stop,
-        lambda frames, report: self_calibrate(
-            frames, source.camera, radial, device, report, source.mask, source.black_is_masked
-        ),
-    )  # fmt: skip
-    return None if found is None else (found, statistics.median(offsets))
-
-
-def _change_of_rows(before: Calibration, after: Calibration) -> float:
-    """Relative change of what a turn moves at the sides of images, where it is known in the middle:
-    a focal length f moves by f (1 + (x / f)^2) there."""
-    half = before.camera().long_edge / 2
-    first, second = (1 + (half / c.fx) ** 2 for c in (before, after))
-    return abs(second / first - 1)
-
-
 def refined(
-    calibration: Calibration,
-    working_focal: float,
-    found: "SelfCalibration",
-    assumed: Calibration | None = None,
+    calibration: Calibration, working_focal: float, found: "SelfCalibration"
 ) -> Calibration:
     """A calibration of the source's images after what was found on its working images.
 
-    ``working_focal`` is fx of the working images by ``calibration``, in their pixels; ``assumed``
-    is what was said of the camera before, where ``calibration`` was refined itself.
+    ``working_focal`` is fx of the working images by ``calibration``, in their pixels.
     """
     if found.failure is not None:
         said = FocalRefinement(
@@ -127,25 +82,20 @@ def refined(
     factor = found.camera.fx / working_focal
     focal = calibration.fx * factor
     deviation = found.deviation * focal
-    before = assumed or calibration
-    was = "was assumed" if before.is_guess else f"says {before.fx:.1f}"
+    was = "was assumed" if calibration.is_guess else f"says {calibration.fx:.1f}"
     origin = f"refined from the video: {focal:.1f} +- {deviation:.1f} pixels"
-    distortion, deviations = calibration.distortion, found.deviations
-    if assumed is not None:
-        bend, refinement = found.distortion or (0.0, 0.0), calibration.refinement
-        distortion = with_bend(calibration.camera(), distortion, calibration.lens, bend, factor)
-        deviations = deviations or (refinement.deviations if refinement else None)
-    elif found.distortion is not None:
+    distortion = calibration.distortion
+    if found.distortion is not None:
         distortion = (*found.distortion, 0.0, 0.0)
-    if deviations is not None:
-        for name, k, error in zip(("k1", "k2"), distortion, deviations, strict=False):
+    if found.deviations is not None:
+        for name, k, error in zip(("k1", "k2"), distortion, found.deviations, strict=False):
             origin += f", {name} {k:.4f} +- {error:.4f}"
-    said = FocalRefinement(deviation, deviations, found.keyframes, found.frames)
+    said = FocalRefinement(deviation, found.deviations, found.keyframes, found.frames)
     return replace(
         calibration,
         fx=focal, fy=calibration.fy * factor,
         distortion=distortion,
-        origin=f"{origin} ({before.origin} {was})",
+        origin=f"{origin} ({calibration.origin} {was})",
         is_guess=False, is_nominal=False, refinement=said,
     )  # fmt: skip
 

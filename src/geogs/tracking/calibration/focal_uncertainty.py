@@ -1,7 +1,6 @@
-"""Uncertainty of focal length and distortion by one stretch of a video, and by several together."""
+"""What one stretch of a video says of focal length and distortion, and how surely."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,21 +19,16 @@ LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
 PRIOR = 0.1, 0.2
 """Deviations of k1 and k2 before any match is asked. A narrow field of view does not tell them."""
-EVIDENCE = 36.0
-"""Square of k1 and k2 in their deviations from which on a lens is believed to bend: 1 to 21 where
-it does not or hardly does, 65 and more where it does (docs/calibration.md)."""
-DISTORTION_FRACTION = 0.5
-"""Fraction of the change of the focal length when the lens may bend that counts as deviation where
-it is taken for a pinhole."""
+UNRELIABLE = 0.1
+"""Relative deviation above which the focal length is not believed and the guess is kept, which may
+be as good."""
 FIELDS_OF_VIEW = 15.0, 150.0
 """Degrees along the longer side; what lies outside is no pinhole camera's."""
-AGREEMENT = 3.0
-"""Deviations by which two stretches may differ and still agree."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one stretch says, or several together."""
+    """What one stretch says, or the pairs of a view graph."""
 
     lens: RadialLens
     covariance: Float64[Tensor, "3 3"]
@@ -47,12 +41,6 @@ class Estimate:
         return self.lens.camera
 
     @property
-    def sizes(self) -> Float64[Tensor, "3"]:
-        """Logarithm of the focal length, k1 and k2."""
-        lens = self.lens
-        return torch.tensor([math.log(lens.camera.fx), lens.k1, lens.k2], dtype=torch.float64)
-
-    @property
     def deviations(self) -> tuple[float, float, float]:
         """Of each of the sizes."""
         focal, k1, k2 = self.covariance.diagonal().sqrt().tolist()
@@ -62,34 +50,6 @@ class Estimate:
     def deviation(self) -> float:
         """Standard deviation of the focal length, relative."""
         return self.deviations[0]
-
-    def as_told(self) -> "Estimate":
-        """A pinhole where the matches do not tell that the lens bends: real ones that tell little
-        of it err alike, too, and the focal length by as much as k1 and k2 lean on it."""
-        bend, lean = self.covariance[1:, 1:], self.covariance[1:, 0]
-        k = self.sizes[1:]
-        if not bool((bend.diagonal() > 0).all()) or k @ torch.linalg.solve(bend, k) >= EVIDENCE:
-            return self
-        follows = torch.linalg.solve(bend, lean)
-        shift = -float(follows @ k)
-        left = float(self.covariance[0, 0] - follows @ lean) + (DISTORTION_FRACTION * shift) ** 2
-        covariance = torch.zeros_like(self.covariance)
-        covariance[0, 0] = max(left, LEAST_DEVIATION**2)
-        pinhole = RadialLens(self.lens.camera).moved(shift)
-        return Estimate(pinhole, covariance, self.keyframes)
-
-    def moved(
-        self, sizes: Float64[Tensor, "3"], covariance: Float64[Tensor, "3 3"], keyframes: int
-    ) -> "Estimate":
-        """Another, of a lens of these sizes."""
-        return Estimate(self.lens.moved(*(sizes - self.sizes).tolist()), covariance, keyframes)
-
-
-def relative_error(bundle: GrowingBundle) -> float:
-    """Deviation of the focal length by the matches alone, relative."""
-    assert bundle.result is not None
-    error = STANDARD_ERRORS * math.sqrt(float(bundle.result.covariance[0, 0]))
-    return math.hypot(error, LEAST_DEVIATION)
 
 
 def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
@@ -102,43 +62,18 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
         return f"it seems to have a field of view of {angle:.0f} degrees"
     if result.cost > MAX_COST:
         return Degeneracy.UNEXPLAINED.value
-    least = LEAST_DEVIATION**2 * torch.eye(3, dtype=torch.float64)
-    covariance = STANDARD_ERRORS**2 * result.covariance + least
-    if not radial:
-        covariance[1:] = covariance[:, 1:] = 0
-    return Estimate(lens, covariance, len(bundle))
+    asked = torch.tensor([1, radial, radial], dtype=torch.float64)
+    covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()
+    said = with_prior(Estimate(lens, covariance, len(bundle)))
+    if said.deviation < UNRELIABLE:
+        return said
+    return f"its motion leaves the focal length unsure by {100 * said.deviation:.0f} %"
 
 
-def joined(estimates: Sequence[Estimate]) -> Estimate:
-    """What several stretches say together, and what is known of lenses (``PRIOR``): the mean, by
-    their covariances, of the logarithm of the focal length, k1 and k2.
-
-    Those that agree with each other decide. Where they are no majority all count, and what they
-    differ by makes the deviation as large as it has to be.
-    """
-    party = max(
-        ([b for b in estimates if _agree(a, b)] for a in estimates),
-        key=lambda p: (len(p), sum(e.deviation**-2 for e in p)),
-    )
-    if 2 * len(party) <= len(estimates):
-        party = list(estimates)
-    first = party[0]
-    free = first.covariance.diagonal() > 0
-    known = torch.tensor([0.0, *(sigma**-2 for sigma in PRIOR)], dtype=torch.float64).diag()
-    each = [torch.linalg.inv(e.covariance[free][:, free]) for e in party]
-    whole = torch.linalg.inv(sum(each, known[free][:, free]))
-    mean = first.sizes
-    mean[free] = whole @ sum(
-        (P @ e.sizes[free] for P, e in zip(each, party, strict=True)), 0 * mean[free]
-    )
-    squares = sum(float((e.sizes - mean)[0] / e.deviation) ** 2 for e in party)
-    excess = max(1.0, squares / (len(party) - 1)) if len(party) > 1 else 1.0
-    covariance = torch.zeros(3, 3, dtype=torch.float64)
-    covariance[free[:, None] & free] = (excess * whole).flatten()
-    covariance[0, 0] = covariance[0, 0].clamp(min=LEAST_DEVIATION**2)
-    return first.moved(mean, covariance, sum(e.keyframes for e in party))
-
-
-def _agree(a: Estimate, b: Estimate) -> bool:
-    off = abs(math.log(a.camera.fx / b.camera.fx))
-    return off <= AGREEMENT * math.hypot(a.deviation, b.deviation)
+def with_prior(said: Estimate) -> Estimate:
+    """With what is known of lenses before (``PRIOR``): k1 and k2 are about none."""
+    expected = torch.tensor(PRIOR, dtype=torch.float64).square().diag()
+    gain = said.covariance[:, 1:] @ torch.linalg.inv(said.covariance[1:, 1:] + expected)
+    k = torch.tensor([said.lens.k1, said.lens.k2], dtype=torch.float64)
+    lens = said.lens.moved(*(-gain @ k).tolist())
+    return Estimate(lens, said.covariance - gain @ said.covariance[1:], said.keyframes)

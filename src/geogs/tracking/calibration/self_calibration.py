@@ -12,8 +12,7 @@ from jaxtyping import Bool
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.calibration.degeneracy import Degeneracy
-from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
+from geogs.tracking.calibration.focal_uncertainty import UNRELIABLE, Estimate
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer, distant_flows
 from geogs.tracking.calibration.view_graph import view_graph_estimate
@@ -25,12 +24,7 @@ LONG_EDGE = 512
 """Pixels of the images that are matched, at most, whatever the run tracks on: what the limits of
 parallax and of matched cells were chosen at (docs/calibration.md)."""
 STRETCHES = 4
-"""Stretches of the video that are used, at most, each after the one before it: bounds the time."""
-CONFIDENT = 0.01
-"""Relative deviation of the focal length from which no other stretch is used."""
-UNRELIABLE = 0.1
-"""Relative deviation above which the focal length is not believed and the guess is kept, which may
-be as good."""
+"""Stretches of the video that are asked, at most, each after the one before it: bounds the time."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +61,10 @@ def self_calibrate(
 
     ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
     is only one of several to start from. Flow is measured by the operator without a network.
-    Stretch after stretch of the video is used until all together are confident; where none of them
-    tells, the epipolar geometry of distant pairs of their views is asked. ``report`` is called with
-    the fraction done; what it raises passes through. Outside a ``mask`` nothing is matched, nor
-    what is quite black where ``black_is_masked``.
+    Stretch after stretch of the video is asked until one tells; where none does, the epipolar
+    geometry of distant pairs of their views is asked. ``report`` is called with the fraction done;
+    what it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black
+    where ``black_is_masked``.
     """
     small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
     size = small.width, small.height
@@ -80,54 +74,29 @@ def self_calibrate(
     operator = build_operator(TrackingConfig(operator="classical"), grid, mask, black_is_masked)
     images = (cv2.resize(f.image, size, interpolation=cv2.INTER_AREA) for f in frames)
     gatherer = ViewGatherer(images, grid, operator)
-    estimates: list[Estimate] = []
-    failure = ""
-    for n in range(STRETCHES):
-        said = _ask(Stretch(grid, operator, gatherer, radial, _part_of(report, n)))
-        if isinstance(said, Estimate):
-            estimates.append(said)
+    failures: list[str] = []
+    found: Estimate | None = None
+    while found is None and len(failures) < STRETCHES and not (failures and gatherer.is_over):
+        said = Stretch(grid, operator, gatherer, radial, _part_of(report, len(failures))).ask()
+        if isinstance(said, str):
+            failures.append(said)
         else:
-            failure = failure or said
-        if gatherer.is_over or (estimates and joined(estimates).deviation < CONFIDENT):
-            break
-    found = joined(estimates).as_told() if estimates else None
-    if found is None or not found.deviation < UNRELIABLE:
+            found = said
+    if found is None:
         asked = _part_of(report, STRETCHES)
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
-        by_pairs = view_graph_estimate(small, flows)
-        if by_pairs is not None and by_pairs.deviation < UNRELIABLE:
-            found = by_pairs
-    if found is None:
-        return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
+        found = view_graph_estimate(small, flows)
+    if found is None or not found.deviation < UNRELIABLE:
+        return SelfCalibration(camera, frames=gatherer.frames, failure=failures[0])
     report(1.0)
-    return _verdict(camera, small, found, gatherer.frames)
-
-
-def _ask(stretch: Stretch) -> Estimate | str:
-    """What the next stretch says, or why it says nothing."""
-    start = stretch.start()
-    if isinstance(start, Degeneracy):
-        return start.value
-    bundle = stretch.grow(start)
-    return (
-        "its motion could not be followed" if bundle is None else estimate(bundle, stretch.radial)
-    )
+    k1, k2 = found.lens.k1, found.lens.k2
+    bends = k1 != 0 or k2 != 0
+    return SelfCalibration(
+        camera.with_focal(camera.fx * found.camera.fx / small.fx), (k1, k2) if bends else None,
+        found.deviation, found.deviations[1:] if bends else None, found.keyframes, gatherer.frames,
+    )  # fmt: skip
 
 
 def _part_of(report: Report, n: int) -> Report:
     """Report the n-th stretch as half of what is left, as nobody knows whether there is another."""
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
-
-
-def _verdict(guess: Camera, small: Camera, found: Estimate, frames: int) -> SelfCalibration:
-    """The estimate on images of ``small``, for those of the guess, or why it is not believed."""
-    if not found.deviation < UNRELIABLE:
-        failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
-        return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
-    k1, k2 = found.lens.k1, found.lens.k2
-    bends = k1 != 0 or k2 != 0
-    camera = guess.with_focal(guess.fx * found.camera.fx / small.fx)
-    return SelfCalibration(
-        camera, (k1, k2) if bends else None, found.deviation,
-        found.deviations[1:] if bends else None, found.keyframes, frames,
-    )  # fmt: skip

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from geogs.threads import thread_map
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
-from geogs.tracking.calibration.focal_uncertainty import relative_error
+from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
 from geogs.tracking.calibration.view_gatherer import View, ViewGatherer, flows_from_first
 from geogs.tracking.flow.flow_operator import FlowOperator
@@ -14,10 +14,11 @@ from geogs.world.grid import SampleGrid
 
 START_KEYFRAMES = 12
 """Keyframes of a stretch that are solved first, and by which it then grows."""
-KEYFRAMES = 36
+KEYFRAMES = 24
 """Most keyframes of a stretch; they are added until the focal length is known well enough."""
-ENOUGH = 0.0021
-"""Relative deviation of the focal length from which no more keyframes of a stretch are used."""
+ENOUGH = 0.01
+"""Relative deviation of the focal length from which no more keyframes of a stretch are used: all
+matches of the run are asked again at its end (docs/lens.md)."""
 MIN_PARALLAX = 0.02
 """Motion that rotation does not explain, needed between two keyframes, of the long edge: what the
 focal length is read off."""
@@ -54,7 +55,32 @@ class Stretch:
         self._views = self._gatherer.gather(self._views, count, self._tick)
         return len(self._views) > before
 
-    def start(self) -> Start | Degeneracy:
+    def ask(self) -> Estimate | str:
+        """Place and adjust views, more of them until the focal length is known; what they say of
+        it, or why they say nothing."""
+        start = self._start()
+        if isinstance(start, Degeneracy):
+            return start.value
+        bundle = GrowingBundle(self.grid, self.operator, self._views, start)
+        said: Estimate | str = "its motion could not be followed"
+        while True:
+            for view in self._views[len(bundle) :]:
+                self._tick()
+                if not bundle.place(view):
+                    return said
+            # Matches are searched again from where the first adjustment has them.
+            for _ in range(2):
+                bundle.measure(self._tick)
+                if not bundle.adjust(self.radial):
+                    return said
+            said = estimate(bundle, self.radial)
+            self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
+            if isinstance(said, Estimate) and said.deviation < ENOUGH:
+                return said
+            if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
+                return said
+
+    def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
         count = max(START_KEYFRAMES, 2 * LEAST_VIEWS)
         failure = Degeneracy.BLANK
@@ -84,23 +110,3 @@ class Stretch:
             return Degeneracy.TURNING
         best = min(found, key=lambda s: s.cost)
         return best if best.cost <= MAX_COST else Degeneracy.UNEXPLAINED
-
-    def grow(self, start: Start) -> GrowingBundle | None:
-        """Adjust, with more keyframes until the focal length is known; None if it fails at once."""
-        bundle = GrowingBundle(self.grid, self.operator, self._views, start)
-        best = None
-        while True:
-            for view in self._views[len(bundle) :]:
-                self._tick()
-                if not bundle.place(view):
-                    return best
-            for fine in (False, True):
-                bundle.measure(fine, self._tick)
-                if not bundle.adjust(self.radial):
-                    return best
-            best = bundle
-            self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
-            if relative_error(bundle) < ENOUGH or len(bundle) >= KEYFRAMES:
-                return best
-            if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
-                return best
