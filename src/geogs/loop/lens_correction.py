@@ -12,8 +12,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.uncertainty.lens_error import FOCAL_LEFT, SHAPES, LensBend, lens_prior
-from geogs.tracking.calibration.focal_uncertainty import STANDARD_ERRORS
+from geogs.bundle.uncertainty.lens_error import (
+    FOCAL_LEFT,
+    SHAPES,
+    STANDARD_ERRORS,
+    LensBend,
+    lens_prior,
+)
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, in_parts
 from geogs.tracking.graph.frame_graph import FrameGraph

@@ -44,9 +44,12 @@ LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001), 0.005
 error (docs/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Deviations of the sizes before any match is asked."""
-FOCAL_LEFT = 0.2
-"""What the focal length is off by after its correction, of the correction: a tenth and a quarter of
-it in two rendered rooms, whatever matches say."""
+STANDARD_ERRORS = 3.0
+"""Standard errors of the matches' own estimate that are taken for a deviation of the lens: matches
+of different keyframes err alike, too. Errors are 1 to 7 of them in rendered rooms."""
+FOCAL_LEFT = 0.05
+"""What the focal length is off by after its correction, of the correction, whatever matches say: 0
+to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
 
 
 def lens_prior(focal_deviation: float = 0.0) -> tuple[float, float, float]:
@@ -152,7 +155,9 @@ class LensEvidence:
         not tell of. Of a readout that was asked for, too, ``doubt`` is the deviation as a part of
         it. Without ``LEAST``: what matches have wrong in common is taken for an error of the lens
         that hardly moves a pose, and three sizes that were each so unsure would move them two to
-        five times as far.
+        five times as far. The focal length itself is as unsure as ``STANDARD_ERRORS`` of what
+        matches alone leave open of it where nobody said it: what it was taken for before was found
+        by matches of the same video.
         """
         said = _estimate(self.information, self.gradient)
         expected = (*lens_prior(focal_deviation), doubt)
@@ -160,13 +165,17 @@ class LensEvidence:
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
-        left[0, 0] += (FOCAL_LEFT * math.log(corrected)) ** 2
+        still = (FOCAL_LEFT * math.log(corrected)) ** 2
+        left[0, 0] += still
         square = left + size[:, None] * size
         depth = self.depth_moves.to(square)
+        open_ = said._replace(covariance=STANDARD_ERRORS**2 * said.covariance)
+        for n in range(1 if focal_deviation else 0, len(said.size)):
+            open_ = open_.told(n, 0.0, expected[n])
         return Considered(
             self.moves @ square @ self.moves.mT,
             ((depth @ square) * depth).sum(-1).float(),
-            float(square[0, 0]),
+            float(open_.covariance[0, 0]) + still,
         )
 
 

@@ -15,8 +15,9 @@ from geogs.geometry.camera import Camera
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
-MAX_COST = 6.0
-"""Mean cost of a match, in variances, above which no pinhole camera explains the flow."""
+MAX_COST = 1.5
+"""Mean cost of a match, in variances, above which no camera explains the flow: 0.1 to 1.0 where the
+lens comes out right, 2 and more where people who walk by decide it (docs/calibration.md)."""
 PLANAR_FRACTION = 0.9
 """Where one homography explains this fraction of the matches in all views, they show a plane."""
 _TOLERANCE = 1 / 400

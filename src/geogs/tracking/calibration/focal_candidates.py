@@ -1,9 +1,9 @@
-"""A first focal length: several fields of view tried on the same flows from one keyframe.
+"""A first focal length: several lenses tried on the same flows from one keyframe.
 
 Flow needs no focal length, so it is measured once. Every candidate places the keyframes by the
 essential matrix and PnP and is adjusted, the focal length with the rest, at last the distortion,
-too: of a lens that bends, pinholes of different focal lengths are all about as wrong. The least
-cost wins.
+too: of a lens that bends, pinholes of different focal lengths are all about as wrong, and from none
+of them the adjustment may come to a barrel, which is tried for itself. The least cost wins.
 """
 
 from dataclasses import dataclass, replace
@@ -24,6 +24,8 @@ from geogs.world.grid import SampleGrid
 
 FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
 """Degrees along the longer side, besides that of the guess."""
+BARREL, OF_BARREL = (-0.2, 0.03), 70.0
+"""k1 and k2 of a wide camera's lens, and a field of view of one."""
 _STAGES = (30.0, 10), (10.0, 10), (3.0, 30)
 """Huber's limit, and steps at most. Those of the last are many, as from a pinhole to the lens leads
 a long valley; whoever stops in it may take the wrong one for the best."""
@@ -41,17 +43,20 @@ class Start:
     cost: float
 
 
-def candidates(camera: Camera) -> list[Camera]:
-    """The guess and cameras of other fields of view."""
-    return [camera.with_focal(camera.fx), *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
+def candidates(camera: Camera, radial: bool) -> list[RadialLens]:
+    """The guess and pinholes of other fields of view, and barrels if lenses are ``radial``."""
+    guess = camera.with_focal(camera.fx)
+    pinholes = [guess, *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
+    wide = [guess, camera.with_field_of_view(OF_BARREL)] if radial else []
+    return [*map(RadialLens, pinholes), *(RadialLens(c, *BARREL) for c in wide)]
 
 
 def try_candidate(
-    camera: Camera, flows: list[FlowMatch], min_parallax: float, radial: bool
+    lens: RadialLens, flows: list[FlowMatch], min_parallax: float, radial: bool
 ) -> Start | None:
-    """Place and adjust the keyframes from one focal length, at last with k1 and k2 if ``radial``;
-    None where it shows no parallax."""
-    flows = [f.on_cpu() for f in flows]
+    """Place the keyframes by the pinhole of a lens and adjust them from there, at last with k1 and
+    k2 if ``radial``; None where it shows no parallax."""
+    camera, flows = lens.camera, [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view(camera, flows[1::2], min_parallax)
     if found is None:
@@ -74,7 +79,7 @@ def try_candidate(
         free, torch.ones(n, dtype=torch.bool),
         pixels=torch.cat([f.pixels for f in flows]), weight=torch.cat([f.weight for f in flows]),
     )  # fmt: skip
-    result = _adjusted(problem, LensBlock(RadialLens(camera), grid.pixels), radial)
+    result = _adjusted(problem, LensBlock(lens, grid.pixels), radial)
     if result is None:
         return None
     return Start(

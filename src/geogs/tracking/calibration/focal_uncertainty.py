@@ -8,13 +8,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.bundle.lens import RadialLens
+from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
 
-STANDARD_ERRORS = 3.0
-"""The adjustment's own standard error times this is taken for the deviation: matches of different
-keyframes err alike too. Measured on rendered rooms, where errors are 1 to 7 standard errors."""
 LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
 PRIOR = 0.1, 0.2

@@ -103,7 +103,8 @@ class Stretch:
         if wrong is not None:
             return wrong
         starts = thread_map(
-            lambda c: try_candidate(c, flows, self._min_parallax, self.radial), candidates(camera)
+            lambda lens: try_candidate(lens, flows, self._min_parallax, self.radial),
+            candidates(camera, self.radial),
         )
         found = [s for s in starts if s is not None]
         if not found:

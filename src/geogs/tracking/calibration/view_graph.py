@@ -18,6 +18,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.bundle.lens import RadialLens
+from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS
 from geogs.geometry.camera import Camera
 from geogs.geometry.least_squares import Policy, Solution, Step, minimise
 from geogs.tracking.calibration.epipolar_error import (
@@ -26,11 +27,7 @@ from geogs.tracking.calibration.epipolar_error import (
     errors,
     linearised,
 )
-from geogs.tracking.calibration.focal_uncertainty import (
-    FIELDS_OF_VIEW,
-    STANDARD_ERRORS,
-    Estimate,
-)
+from geogs.tracking.calibration.focal_uncertainty import FIELDS_OF_VIEW, Estimate
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
