@@ -11,6 +11,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.tracking import keyframe_uncertainty as room
 from geogs.tracking.keyframe_uncertainty import USUAL_RESIDUAL, keyframe_uncertainty
+from geogs.types import FoundLens
 from planted_walk import drift, planted_tracker
 
 EXACT = BundleOptions(iterations=10, huber=50.0)
@@ -92,6 +93,13 @@ def test_depths_are_as_unsure_as_lens_and_common_errors_leave_them(monkeypatch):
     monkeypatch.setattr(room, "USUAL_RESIDUAL", np.inf)
     own = keyframe_uncertainty(tracker).depth
     assert own == pytest.approx(matches_alone(tracker).depth_deviation.numpy())
+
+
+def test_the_focal_length_is_as_unsure_as_was_said_when_it_was_found():
+    tracker = measured(14)
+    known = keyframe_uncertainty(tracker).focal
+    tracker.keyframes.table.lens = FoundLens(0.0, 0.0, 0.01, 0.01, 1.1, 0.2)
+    assert keyframe_uncertainty(tracker).focal == 0.2 > known > 0
 
 
 def test_parts_of_a_long_walk_follow_each_other(monkeypatch):

@@ -52,7 +52,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
-    propagated, focal = np.zeros(2), 0.0
+    propagated, focal, lens = np.zeros(2), 0.0, tracker.keyframes.table.lens
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
         found = _marginals(tracker, ids[part], rows)
@@ -68,7 +68,10 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
         squares = squares + propagated
         position[part], rotation[part] = np.sqrt(squares).T
         propagated = squares[-1] if not tracker.segment.fixed else propagated
-    return Uncertainty(times, position, rotation, depth, math.sqrt(focal))
+    # Of a lens that was found, what was said when it was: matches on images that are straight by
+    # it agree with it.
+    open_ = lens.deviation_focal if lens is not None else 0.0
+    return Uncertainty(times, position, rotation, depth, max(open_, math.sqrt(focal)))
 
 
 def said_of_lens(

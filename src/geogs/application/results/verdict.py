@@ -16,8 +16,9 @@ MAX_POSITION_DEVIATION = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MAX_DEPTH_DEVIATION = 0.2
 """Relative deviation of the best known depths."""
-MAX_FOCAL_DEVIATION = 0.2
-"""Relative deviation of the focal length, by which all that is seen is too wide or too narrow."""
+MAX_FOCAL_DEVIATION = 0.15
+"""Relative deviation of the focal length, by which all that is seen is too wide or too narrow: 14 %
+and less in rendered videos where it was right (docs/lens.md)."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 

@@ -155,9 +155,7 @@ class LensEvidence:
         not tell of. Of a readout that was asked for, too, ``doubt`` is the deviation as a part of
         it. Without ``LEAST``: what matches have wrong in common is taken for an error of the lens
         that hardly moves a pose, and three sizes that were each so unsure would move them two to
-        five times as far. The focal length itself is as unsure as ``STANDARD_ERRORS`` of what
-        matches alone leave open of it where nobody said it: what it was taken for before was found
-        by matches of the same video.
+        five times as far.
         """
         said = _estimate(self.information, self.gradient)
         expected = (*lens_prior(focal_deviation), doubt)
@@ -165,17 +163,13 @@ class LensEvidence:
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
-        still = (FOCAL_LEFT * math.log(corrected)) ** 2
-        left[0, 0] += still
+        left[0, 0] += (FOCAL_LEFT * math.log(corrected)) ** 2
         square = left + size[:, None] * size
         depth = self.depth_moves.to(square)
-        open_ = said._replace(covariance=STANDARD_ERRORS**2 * said.covariance)
-        for n in range(1 if focal_deviation else 0, len(said.size)):
-            open_ = open_.told(n, 0.0, expected[n])
         return Considered(
             self.moves @ square @ self.moves.mT,
             ((depth @ square) * depth).sum(-1).float(),
-            float(open_.covariance[0, 0]) + still,
+            float(square[0, 0]),
         )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import UNRELIABLE, Estimate
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer, distant_flows
@@ -62,7 +63,8 @@ def self_calibrate(
     ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
     is only one of several to start from. Flow is measured by the operator without a network.
     Stretch after stretch of the video is asked until one tells; where none does, the epipolar
-    geometry of distant pairs of their views is asked. ``report`` is called with the fraction done;
+    geometry of distant pairs of their views is asked, but where no camera explains what is seen:
+    neither would a pinhole explain the pairs. ``report`` is called with the fraction done;
     what it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black
     where ``black_is_masked``.
     """
@@ -82,7 +84,7 @@ def self_calibrate(
             failures.append(said)
         else:
             found = said
-    if found is None:
+    if found is None and Degeneracy.UNEXPLAINED.value not in failures:
         asked = _part_of(report, STRETCHES)
         flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
         found = view_graph_estimate(small, flows)

@@ -92,7 +92,9 @@ class Stretch:
             if isinstance(found, Start):
                 self._done = 0.3
                 return found
-            failure = found
+            if found is failure is Degeneracy.UNEXPLAINED:
+                break
+            failure = failure if failure is Degeneracy.UNEXPLAINED else found
             # What comes later may show more.
             self._views = self._views[len(self._views) // 2 :]
         return failure

@@ -1,0 +1,58 @@
+"""Lenses that calibration begins with, and what the adjustment makes of a barrel's flow."""
+
+import math
+
+import pytest
+import torch
+
+from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import so3_exp
+from geogs.tracking.calibration.focal_candidates import candidates, try_candidate
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+
+GUESS = Camera(277.1, 277.1, 159.5, 119.5, 320, 240)
+BARREL = RadialLens(GUESS.with_focal(224.0), -0.185, 0.06)
+NOISE = 0.3
+"""Pixels."""
+
+
+def swung(views: int, degrees: float) -> list[FlowMatch]:
+    """Flow from the first view of a barrel lens that turns and moves sideways by a third of the
+    typical depth, with noise."""
+    g = torch.Generator().manual_seed(1)
+    grid = SampleGrid(GUESS)
+    x, y = ((grid.pixels - grid.pixels.mean(0)) / 160).double().unbind(-1)
+    depth = 1 + 0.3 * torch.sin(4 * x + 1) * torch.cos(5 * y) + 0.4 * (x > 0.2)
+    block, found = LensBlock(BARREL, grid.pixels), []
+    for n in range(1, views):
+        angle = math.radians(degrees) * n / (views - 1)
+        T = torch.eye(4, dtype=torch.float64)
+        T[:3, :3] = so3_exp(torch.tensor([0.1 * angle, angle, 0.05 * angle]).double())
+        T[:3, 3] = torch.tensor([-0.33, 0.1, 0.05]).double() * n / (views - 1)
+        both = torch.stack([torch.eye(4, dtype=torch.float64), T])
+        p = block.project(both, torch.tensor([0]), torch.tensor([1]), (1 / depth).float()[None])
+        q = p.pixels + NOISE * torch.randn(p.pixels.shape, generator=g)
+        inside = ((q > 0) & (q < torch.tensor([319.0, 239.0]))).all(-1) & p.valid
+        weight = (inside[..., None] / NOISE**2).expand_as(q)
+        found.append(FlowMatch(q.float(), weight.float()))
+    return found
+
+
+def test_a_barrel_is_found():
+    flows = swung(8, 20.0)
+    tried = candidates(GUESS, radial=True)
+    starts = [try_candidate(lens, flows, 3.0, radial=True) for lens in tried]
+    for lens, start in zip(tried, starts, strict=True):
+        if start is not None:
+            print(round(lens.camera.fx), lens.k1, "->", start.lens, round(start.cost, 3))
+    best = min((s for s in starts if s is not None), key=lambda s: s.cost)
+    assert best.lens.camera.fx == pytest.approx(224.0, rel=0.015)
+    assert best.lens.k1 == pytest.approx(-0.185, abs=0.02)
+    assert best.cost < 1.2  # of a residual in two dimensions: 1
+
+
+def test_of_a_known_distortion_only_pinholes_are_tried():
+    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False))
+    assert {lens.camera.fx for lens in candidates(GUESS, radial=False)} > {GUESS.fx}
