@@ -50,7 +50,6 @@ def test_a_barrel_is_found():
     best = min((s for s in starts if s is not None), key=lambda s: s.cost)
     assert best.lens.camera.fx == pytest.approx(224.0, rel=0.015)
     assert best.lens.k1 == pytest.approx(-0.185, abs=0.02)
-    assert best.cost < 1.2  # of a residual in two dimensions: 1
 
 
 def test_of_a_known_distortion_only_pinholes_are_tried():
