@@ -30,6 +30,7 @@ class _Edge:
     pixels: Tensor
     weight: Tensor
     reprojection: Tensor
+    fine: bool
 
 
 class GrowingBundle:
@@ -79,28 +80,30 @@ class GrowingBundle:
         self._information.append(i)
         return True
 
-    def measure(self, tick: Callable[[], None]) -> None:
-        """Match every pair that is new or whose reprojection moved."""
+    def measure(self, fine: bool, tick: Callable[[], None]) -> None:
+        """Match every pair that is new, was matched less finely, or whose reprojection moved."""
         n = len(self)
         pairs = [(j - k, j) for j in range(n) for k in OFFSETS if j >= k]
         both = pairs + [(j, i) for i, j in pairs]
         where = dict(zip(both, self._reprojections(both), strict=True))
-        stale = [p for p in pairs if any(self._moved(e, where) for e in (p, p[::-1]))]
+        stale = [p for p in pairs if any(self._moved(e, where, fine) for e in (p, p[::-1]))]
         for at in range(0, len(stale), _TOGETHER):
             tick()
             chunk = stale[at : at + _TOGETHER]
             first, second = ([self._views[p[k]].encoded for p in chunk] for k in (0, 1))
             forward = torch.stack([where[p] for p in chunk])
             backward = torch.stack([where[p[::-1]] for p in chunk])
-            matches = self._operator.measure(first, second, forward, backward)
+            matches = self._operator.measure(first, second, forward, backward, fine=fine)
             for m, match in enumerate(matches):
                 for k, p in enumerate(chunk):
                     edge = p if m == 0 else p[::-1]
-                    self._edges[edge] = _Edge(match.pixels[k], match.weight[k], where[edge])
+                    self._edges[edge] = _Edge(match.pixels[k], match.weight[k], where[edge], fine)
 
-    def _moved(self, edge: tuple[int, int], where: dict[tuple[int, int], Tensor]) -> bool:
+    def _moved(
+        self, edge: tuple[int, int], where: dict[tuple[int, int], Tensor], fine: bool
+    ) -> bool:
         known = self._edges.get(edge)
-        if known is None:
+        if known is None or (fine and not known.fine):
             return True
         used = known.weight[:, 0] > 0
         moved = (where[edge] - known.reprojection).norm(dim=-1)[used]

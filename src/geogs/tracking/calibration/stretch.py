@@ -19,6 +19,9 @@ KEYFRAMES = 24
 ENOUGH = 0.01
 """Relative deviation of the focal length from which no more keyframes of a stretch are used: all
 matches of the run are asked again at its end (docs/lens.md)."""
+SMALL = 400
+"""Pixels of the long edge of images that are matched at full resolution from the start, larger ones
+at half of it first."""
 MIN_PARALLAX = 0.02
 """Motion that rotation does not explain, needed between two keyframes, of the long edge: what the
 focal length is read off."""
@@ -69,8 +72,8 @@ class Stretch:
                 if not bundle.place(view):
                     return said
             # Matches are searched again from where the first adjustment has them.
-            for _ in range(2):
-                bundle.measure(self._tick)
+            for fine in (self.grid.camera.long_edge <= SMALL, True):
+                bundle.measure(fine, self._tick)
                 if not bundle.adjust(self.radial):
                     return said
             said = estimate(bundle, self.radial)
