@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.bundle.lens import RadialLens
-from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS
+from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
@@ -70,8 +70,10 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
 
 def with_prior(said: Estimate) -> Estimate:
     """With what is known of lenses before (``PRIOR``): k1 and k2 are about none."""
-    expected = torch.tensor(PRIOR, dtype=torch.float64).square().diag()
-    gain = said.covariance[:, 1:] @ torch.linalg.inv(said.covariance[1:, 1:] + expected)
-    k = torch.tensor([said.lens.k1, said.lens.k2], dtype=torch.float64)
-    lens = said.lens.moved(*(-gain @ k).tolist())
-    return Estimate(lens, said.covariance - gain @ said.covariance[1:], said.keyframes)
+    lens = said.lens
+    size = torch.tensor([0.0, lens.k1, lens.k2], dtype=torch.float64)
+    told = LensEstimate(size, said.covariance)
+    for n, deviation in enumerate(PRIOR, 1):
+        told = told.told(n, 0.0, deviation)
+    moved = lens.moved(*(told.size - size).tolist())
+    return Estimate(moved, told.covariance, said.keyframes)
