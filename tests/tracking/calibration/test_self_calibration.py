@@ -10,11 +10,9 @@ import torch
 import tracking_scenes
 from geogs.bundle.lens import RadialLens, lens_rays
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration import self_calibration, stretch
-from geogs.tracking.calibration.degeneracy import Degeneracy
+from geogs.tracking.calibration import stretch
 from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
 from geogs.tracking.calibration.self_calibration import self_calibrate
-from geogs.tracking.calibration.stretch import Stretch
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
 
@@ -110,15 +108,6 @@ def test_a_plane_is_said_to_be_one(monkeypatch):
     found = self_calibrate(frames(swinging(16)), guess)
     assert found.failure == "it shows a single plane"
     assert found.camera == guess
-
-
-def test_no_pinhole_is_asked_of_what_no_lens_explains(monkeypatch):
-    unexplained = Degeneracy.UNEXPLAINED.value
-    monkeypatch.setattr(Stretch, "ask", lambda stretch: unexplained)
-    monkeypatch.setattr(self_calibration, "view_graph_estimate", lambda *_: pytest.fail("asked"))
-    guess = CAMERA.with_focal(120.0)
-    found = self_calibrate(frames(swinging(4)), guess)
-    assert (found.failure, found.camera) == (unexplained, guess)
 
 
 def test_a_camera_that_stands_still_is_said_to():

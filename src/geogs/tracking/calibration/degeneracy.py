@@ -10,6 +10,7 @@ from enum import Enum
 import cv2
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import minimize_scalar
 
 from geogs.geometry.camera import Camera
 from geogs.types import FlowMatch
@@ -55,12 +56,21 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
     fits = [fit for fit in (_homography(camera, match) for match in flows) if fit is not None]
     if not fits:
         return Degeneracy.STILL
-    # What rotation leaves, in the view where that is most, at the angle for which it is least.
-    matrices = [camera.with_field_of_view(a).matrix().numpy() for a in _FIELDS_OF_VIEW]
-    if min(max(_unexplained(K, fit) for fit in fits) for K in matrices) < min_parallax:
-        return Degeneracy.TURNING
-    planar = min(fit.explained for fit in fits) > PLANAR_FRACTION
-    return Degeneracy.PLANAR if planar else None
+    if min(fit.explained for fit in fits) <= PLANAR_FRACTION:
+        return None
+    return Degeneracy.TURNING if _least_left(camera, fits) < min_parallax else Degeneracy.PLANAR
+
+
+def _least_left(camera: Camera, fits: list[_HomographyFit]) -> float:
+    """What rotation leaves, in the view where that is most, at the angle for which it is least."""
+
+    def left(angle: float) -> float:
+        K = camera.with_field_of_view(angle).matrix().numpy()
+        return max(_unexplained(K, fit) for fit in fits)
+
+    n = min(range(len(_FIELDS_OF_VIEW)), key=lambda n: left(_FIELDS_OF_VIEW[n]))
+    near = _FIELDS_OF_VIEW[max(n - 1, 0)], _FIELDS_OF_VIEW[min(n + 1, len(_FIELDS_OF_VIEW) - 1)]
+    return float(minimize_scalar(left, bounds=near, method="bounded").fun)
 
 
 def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:

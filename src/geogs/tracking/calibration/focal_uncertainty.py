@@ -26,7 +26,7 @@ FIELDS_OF_VIEW = 15.0, 150.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one stretch says, or the pairs of a view graph."""
+    """What one stretch says."""
 
     lens: RadialLens
     covariance: Float64[Tensor, "3 3"]

@@ -12,11 +12,9 @@ from jaxtyping import Bool
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.calibration.degeneracy import Degeneracy
-from geogs.tracking.calibration.focal_uncertainty import UNRELIABLE, Estimate
+from geogs.tracking.calibration.focal_uncertainty import Estimate
 from geogs.tracking.calibration.stretch import Report, Stretch
-from geogs.tracking.calibration.view_gatherer import ViewGatherer, distant_flows
-from geogs.tracking.calibration.view_graph import view_graph_estimate
+from geogs.tracking.calibration.view_gatherer import ViewGatherer
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
@@ -62,11 +60,9 @@ def self_calibrate(
 
     ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
     is only one of several to start from. Flow is measured by the operator without a network.
-    Stretch after stretch of the video is asked until one tells; where none does, the epipolar
-    geometry of distant pairs of their views is asked, but where no camera explains what is seen:
-    neither would a pinhole explain the pairs. ``report`` is called with the fraction done;
-    what it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black
-    where ``black_is_masked``.
+    Stretch after stretch of the video is asked until one tells. ``report`` is called with the
+    fraction done; what it raises passes through. Outside a ``mask`` nothing is matched, nor what is
+    quite black where ``black_is_masked``.
     """
     small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
     size = small.width, small.height
@@ -84,11 +80,7 @@ def self_calibrate(
             failures.append(said)
         else:
             found = said
-    if found is None and Degeneracy.UNEXPLAINED.value not in failures:
-        asked = _part_of(report, STRETCHES)
-        flows = distant_flows(grid, operator, gatherer.views, lambda: asked(0.0))
-        found = view_graph_estimate(small, flows)
-    if found is None or not found.deviation < UNRELIABLE:
+    if found is None:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failures[0])
     report(1.0)
     k1, k2 = found.lens.k1, found.lens.k2

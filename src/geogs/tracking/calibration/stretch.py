@@ -22,9 +22,10 @@ matches of the run are asked again at its end (docs/lens.md)."""
 SMALL = 400
 """Pixels of the long edge of images that are matched at full resolution from the start, larger ones
 at half of it first."""
-MIN_PARALLAX = 0.02
-"""Motion that rotation does not explain, needed between two keyframes, of the long edge: what the
-focal length is read off."""
+MIN_PARALLAX = 0.003
+"""Motion that rotation does not explain, needed between two keyframes, of the long edge: some
+deviations of a match, from which on views can be placed. Whether they tell the focal length their
+adjustment says (docs/calibration.md)."""
 LEAST_VIEWS = 4
 
 Report = Callable[[float], None]

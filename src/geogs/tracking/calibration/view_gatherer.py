@@ -20,10 +20,6 @@ from geogs.world.segments import ChainedPositions
 
 FRAMES = 600
 """Frames of the video that are used, at most: bounds the time."""
-STARTS = 20
-"""Views from which distant ones are matched, about: bounds the time."""
-REACH = 10
-"""Views after one that it is matched with, at most."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,6 @@ class ViewGatherer:
         self._images, self._grid, self._operator = images, grid, operator
         self._config = TrackingConfig()
         self._chain = ChainedPositions()
-        self.views: list[View] = []
-        """All that were taken so far; one without a step does not continue those before it."""
         self.frames = 0
         """Frames taken so far."""
         self._is_read = False
@@ -88,7 +82,6 @@ class ViewGatherer:
                     step = match.there
             self._chain.reset()
             views.append(View(encoded, step))
-            self.views.append(views[-1])
         return views
 
 
@@ -96,40 +89,8 @@ def flows_from_first(
     grid: SampleGrid, operator: FlowOperator, views: list[View]
 ) -> list[FlowMatch]:
     """Flow from the first view to each later one: chained over the steps and measured again."""
-    return _chained(grid, operator, views, _steps_back(grid, operator, views))
-
-
-def distant_flows(
-    grid: SampleGrid, operator: FlowOperator, views: list[View], tick: Callable[[], None]
-) -> list[tuple[int, FlowMatch]]:
-    """Flow from some of the views, evenly spread, to the farther half of those that each is matched
-    with, ``REACH`` at most; with the number of the view that it starts from."""
-    starts = [n for n in range(len(views) - 1) if views[n + 1].step is not None]
-    starts = starts[:: max(len(starts) // STARTS, 1)]
-    back: dict[int, FlowMatch] = {}
-    found = []
-    for n in starts:
-        tick()
-        end = n + 1
-        while end < len(views) and end <= n + REACH and views[end].step is not None:
-            end += 1
-        new = [k for k in range(n + 1, end) if k not in back]
-        if new:
-            back |= zip(new, _steps_back(grid, operator, views[new[0] - 1 : end]), strict=True)
-        flows = _chained(grid, operator, views[n:end], [back[k] for k in range(n + 1, end)])
-        found += [(n, match) for match in flows[len(flows) // 2 :]]
-    return found
-
-
-def _steps_back(grid: SampleGrid, operator: FlowOperator, views: list[View]) -> list[FlowMatch]:
-    """Flow from each view but the first to the one before it."""
     encoded = [v.encoded for v in views]
-    return [back for _, back in guided_flows(grid, operator, encoded[:-1], encoded[1:])]
-
-
-def _chained(
-    grid: SampleGrid, operator: FlowOperator, views: list[View], steps_back: list[FlowMatch]
-) -> list[FlowMatch]:
+    steps_back = [back for _, back in guided_flows(grid, operator, encoded[:-1], encoded[1:])]
     there: Float[Tensor, "p 2"] = grid.pixels
     back = grid.pixels
     flows = []
