@@ -57,10 +57,11 @@ def solve_shared(
 ) -> SharedResult:
     """Adjust all free poses, all inverse depths and the block; every frame's depth is free.
 
-    The covariance is cluster-robust (Liang and Zeger's sandwich):
-    ``S^-1 (sum_i g_i g_i^T) S^-1`` with the reduced gradient ``g_i`` of each source frame, since
-    the errors of neighbouring cells, and of one cell in several targets, are alike; no noise level
-    and no count of independent cells is needed. A step that is not finite ends the adjustment.
+    The covariance is ``S^-1``, as if matches erred independently, and beside it the cluster-robust
+    one (Liang and Zeger's sandwich), ``S^-1 (sum_i g_i g_i^T) S^-1`` with the reduced gradient
+    ``g_i`` of each source frame, since the errors of neighbouring cells, and of one cell in several
+    targets, are alike. Where hardly anything tells, as of a camera that never turns, the few
+    gradients agree by chance. A step that is not finite ends the adjustment.
     """
     shared = SharedSchur(problem, options)
     start = BundleState(problem.T_cw, problem.inverse_depth, block)
@@ -135,5 +136,6 @@ def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:
         pull[s.edges.rows(system.frames)].mT @ s.edges.chained()[1] for s in sources
     ])  # fmt: skip
     each = each - each.mean(0)
-    out[chosen[:, None], chosen] = len(sources) / (len(sources) - 1) * each.mT @ each
+    common = len(sources) / (len(sources) - 1) * each.mT @ each
+    out[chosen[:, None], chosen] = common + rows[-len(chosen) :]
     return out

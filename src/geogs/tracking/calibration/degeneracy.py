@@ -21,9 +21,10 @@ MAX_COST = 1.5
 lens comes out right, 2 and more where people who walk by decide it (docs/calibration.md)."""
 PLANAR_FRACTION = 0.9
 """Where one homography explains this fraction of the matches in all views, they show a plane."""
-_TOLERANCE = 1 / 400
+_TOLERANCE = 1 / 1000
 """Deviation, of the long edge, from a homography that is still explained by it."""
-_FIELDS_OF_VIEW = np.geomspace(25, 130, 15)
+FIELDS_OF_VIEW = 25.0, 130.0
+"""Degrees along the longer side, between which a turn is looked for."""
 
 
 class Degeneracy(Enum):
@@ -51,6 +52,7 @@ class _HomographyFit:
 def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Degeneracy | None:
     """What is wrong with the flow from one view to others; None if nothing is.
 
+    A turn that only one focal length explains tells it, however little else there is.
     ``min_parallax`` is in pixels; of the camera only size, aspect and principal point count.
     """
     fits = [fit for fit in (_homography(camera, match) for match in flows) if fit is not None]
@@ -58,19 +60,16 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
         return Degeneracy.STILL
     if min(fit.explained for fit in fits) <= PLANAR_FRACTION:
         return None
-    return Degeneracy.TURNING if _least_left(camera, fits) < min_parallax else Degeneracy.PLANAR
-
-
-def _least_left(camera: Camera, fits: list[_HomographyFit]) -> float:
-    """What rotation leaves, in the view where that is most, at the angle for which it is least."""
 
     def left(angle: float) -> float:
+        """What rotation leaves, in the view where that is most, in pixels."""
         K = camera.with_field_of_view(angle).matrix().numpy()
         return max(_unexplained(K, fit) for fit in fits)
 
-    n = min(range(len(_FIELDS_OF_VIEW)), key=lambda n: left(_FIELDS_OF_VIEW[n]))
-    near = _FIELDS_OF_VIEW[max(n - 1, 0)], _FIELDS_OF_VIEW[min(n + 1, len(_FIELDS_OF_VIEW) - 1)]
-    return float(minimize_scalar(left, bounds=near, method="bounded").fun)
+    if left(FIELDS_OF_VIEW[0]) < min_parallax:
+        return Degeneracy.TURNING
+    least = minimize_scalar(left, bounds=FIELDS_OF_VIEW, method="bounded").fun
+    return None if least < min_parallax else Degeneracy.PLANAR
 
 
 def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:
