@@ -88,7 +88,7 @@ class Stretch:
         """The first views that show parallax and depth, placed by the best candidate."""
         count = max(START_KEYFRAMES, 2 * LEAST_VIEWS)
         failure = Degeneracy.BLANK
-        while self._gather(count):
+        while failure is not Degeneracy.UNEXPLAINED and self._gather(count):
             if len(self._views) < LEAST_VIEWS:
                 return Degeneracy.STILL
             flows = flows_from_first(self.grid, self.operator, self._views)
@@ -96,9 +96,7 @@ class Stretch:
             if isinstance(found, Start):
                 self._done = 0.3
                 return found
-            if found is failure is Degeneracy.UNEXPLAINED:
-                break
-            failure = failure if failure is Degeneracy.UNEXPLAINED else found
+            failure = found
             # What comes later may show more.
             self._views = self._views[len(self._views) // 2 :]
         return failure

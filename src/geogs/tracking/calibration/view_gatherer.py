@@ -13,7 +13,6 @@ from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, follow_flow
-from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
@@ -29,6 +28,8 @@ class View:
     encoded: Any
     step: FlowMatch | None
     """From the keyframe before it; None for the first."""
+    back: FlowMatch | None
+    """To the keyframe before it; None for the first."""
 
 
 class ViewGatherer:
@@ -67,7 +68,7 @@ class ViewGatherer:
             encoded = self._operator.encode(image)
             if self._operator.texture(encoded) < MIN_TEXTURE:
                 continue
-            step = None
+            step = back = None
             if views:
                 match = follow_flow(
                     self._grid, self._operator, self._chain, views[-1].encoded, encoded
@@ -79,9 +80,9 @@ class ViewGatherer:
                 elif not calls_for_keyframe(self._config, edge, match.flow, match.matched):
                     continue
                 else:
-                    step = match.there
+                    step, back = match.there, match.back
             self._chain.reset()
-            views.append(View(encoded, step))
+            views.append(View(encoded, step, back))
         return views
 
 
@@ -89,15 +90,14 @@ def flows_from_first(
     grid: SampleGrid, operator: FlowOperator, views: list[View]
 ) -> list[FlowMatch]:
     """Flow from the first view to each later one: chained over the steps and measured again."""
-    encoded = [v.encoded for v in views]
-    steps_back = [back for _, back in guided_flows(grid, operator, encoded[:-1], encoded[1:])]
     there: Float[Tensor, "p 2"] = grid.pixels
     back = grid.pixels
     flows = []
-    for view, step_back in zip(views[1:], steps_back, strict=True):
+    for view in views[1:]:
         assert view.step is not None
+        assert view.back is not None
         there = there + grid.sample_field(filled_flow(grid, view.step), there)
-        back_step = filled_positions(grid, step_back)
+        back_step = filled_positions(grid, view.back)
         back = back_step + grid.sample_field(back - grid.pixels, back_step)
         match, reverse = operator.measure(
             [views[0].encoded], [view.encoded], there[None], back[None], fine=True

@@ -30,6 +30,8 @@ class ChainedMatch:
 
     there: FlowMatch
     """One edge, keyframe -> frame."""
+    back: FlowMatch
+    """One edge, frame -> keyframe."""
     flow: float
     """Median motion of the matched cells in pixels."""
     matched: float
@@ -56,4 +58,4 @@ def follow_flow(
     if matched > 0:
         chain.there = filled_positions(grid, there)[None]
         chain.back = filled_positions(grid, back)[None]
-    return ChainedMatch(there, flow if matched else 0.0, matched)
+    return ChainedMatch(there, back, flow if matched else 0.0, matched)
