@@ -78,18 +78,18 @@ def global_bundle(
         tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment
     )
     lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, readout=readout)
+    images = None
     if lens is not None and ends:
         images = BentImages.of(store)
         straighten(tracker, lens, images)
+    if images is not None or (is_open and config.fine_adjustment):
+        tracker.map.graph.edges.clear()
         match(config.fine_adjustment)
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
+    if images is not None and lens is not None:
         rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=lens)
         if rest is not None:
             images.straighten(StraightView(store.camera, lens).followed_by(rest))
-    elif is_open and config.fine_adjustment:
-        tracker.map.graph.edges.clear()
-        match(True)
-        correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:
