@@ -134,11 +134,11 @@ def test_results_do_not_depend_on_threads() -> None:
     runs = []
     for threads in (1, 2, 2, 3):
         maps, trace = rasterize_forward(disks, CAMERA, T_cw, 0.05, threads)
-        runs.append((maps, rasterize_backward(trace, *weights, threads)))
-    for maps, gradients in runs[1:]:
-        for record, first in ((maps, runs[0][0]), (gradients, runs[0][1])):
-            for field in record.__slots__:
-                assert np.array_equal(getattr(record, field), getattr(first, field)), field
+        of_disks, of_pose = rasterize_backward(trace, *weights, threads)
+        runs.append((*maps, *of_disks, of_pose))
+    for arrays in runs[1:]:
+        for array, first in zip(arrays, runs[0], strict=True):
+            assert np.array_equal(array, first)
 
 
 def test_renderings_can_wait_for_their_backward_pass() -> None:

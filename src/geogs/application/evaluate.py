@@ -12,10 +12,9 @@ from geogs.application.evaluate_surface import (
     photoconsistency,
 )
 from geogs.application.result_settings import EvalSettings
-from geogs.application.results.output_folder import claimed
+from geogs.application.results.output_folder import claimed, read_summary
 from geogs.application.results.result_page import shown_model, shown_views
 from geogs.application.results.saved_result import load_result
-from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.doubts import doubts
 from geogs.evaluation.model_view.shown_model import Colouring, Legend, Lengths, ShownModel
@@ -108,10 +107,9 @@ def _evaluated(settings: EvalSettings, new: Path) -> Evaluation:
 def _summary(output: Path) -> dict[str, object]:
     """What the run said of itself; nothing if it left no summary that can be read."""
     try:
-        content = read_json(output / "summary.json")
+        return read_summary(output)
     except InputError:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _alignment(settings: EvalSettings, summary: dict[str, object]) -> Alignment:

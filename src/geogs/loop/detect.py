@@ -4,6 +4,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -208,7 +209,8 @@ class LoopDetector:
                 continue
             found.append(loop)
             # Of a long video the flows of all loops would fill the memory.
-            self.table.loops.append(loop if self.config.matches else loop.without_flows())
+            kept = loop if self.config.matches else replace(loop, there=None, back=None)
+            self.table.loops.append(kept)
             if len(found) == MAX_LOOPS:
                 break
         return found

@@ -42,13 +42,12 @@ before it is gone (docs/adjustment.md)."""
 def global_bundle(
     tracker: Tracker,
     progress: Callable[[float, str], None] | None = None,
-    keyframes: Sequence[int] | None = None,
     ends: bool = False,
 ) -> PoseCorrection:
-    """Refine keyframes of a tracker on a fresh graph that also joins places seen again.
+    """Refine all keyframes of a tracker on a fresh graph that also joins places seen again.
 
-    ``keyframes`` (all where None) are ids, earliest first; the pose of the first of them stays, or,
-    in the world of a saved map, all that is of those it holds.
+    The pose of the first of them stays, or, in the world of a saved map, all that is of those it
+    holds.
     Each round measures the pairs whose reprojection has moved and adjusts everything; every round
     sharpens the next. Poses, inverse depth and information of the tracker are updated, and its
     graph holds the fresh edges alone: one that goes on tracking needs only those that
@@ -60,14 +59,14 @@ def global_bundle(
     resolution. A tracker without a map is left alone, and one whose images are straight already.
     """
     config, segment, store = tracker.config, tracker.segment, tracker.keyframes
-    ids = tracker.segment.ids if keyframes is None else list(keyframes)
+    ids = tracker.segment.ids
     before = {k: store[k].T_cw for k in ids}
     if not ids or store.table.lens is not None:
         return PoseCorrection({}, {}, {})
     fixed = set(segment.fixed)
     free = [k for k in ids if k not in fixed]
     free_poses = free if fixed else ids[1:]
-    pairs = global_pairs(tracker, ids)
+    pairs = global_pairs(tracker)
     tracker.map.graph.edges.clear()
     tracker.map.odometry.update_scale_by_all()
     match = partial(_match, tracker, pairs, free_poses, free, progress)
@@ -78,18 +77,18 @@ def global_bundle(
         tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment
     )
     lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, readout=readout)
+    images = None
     if lens is not None and ends:
         images = BentImages.of(store)
         straighten(tracker, lens, images)
+    if images is not None or (is_open and config.fine_adjustment):
+        tracker.map.graph.edges.clear()
         match(config.fine_adjustment)
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
+    if images is not None and lens is not None:
         rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=lens)
         if rest is not None:
             images.straighten(StraightView(store.camera, lens).followed_by(rest))
-    elif is_open and config.fine_adjustment:
-        tracker.map.graph.edges.clear()
-        match(True)
-        correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:
@@ -130,10 +129,9 @@ def _match(
         odometry.update_scale_by_all()
 
 
-def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:
+def global_pairs(tracker: Tracker) -> list[Pair]:
     """Neighbours in time and all places seen again, thinned evenly; not within a saved map."""
-    grid = tracker.keyframes.grid
-    ids = tracker.segment.ids if keyframes is None else list(keyframes)
+    grid, ids = tracker.keyframes.grid, tracker.segment.ids
     pairs = proximity_pairs(
         tracker.keyframes,
         ids,

@@ -1,7 +1,7 @@
 """Loops: what keyframes are recognised by, candidates, verified loops, and relative poses kept."""
 
 from collections.abc import Container
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -119,10 +119,6 @@ class Loop:
         assert self.there is not None
         assert self.back is not None
         return self.there, self.back
-
-    def without_flows(self) -> "Loop":
-        """The same without what is as large as the grid."""
-        return replace(self, there=None, back=None)
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from geogs.documents import read_json
-from geogs.errors import InputError
+from geogs.application.results.output_folder import read_summary
 from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.io.pose_files import read_frame_poses, read_tum_trajectory
@@ -29,11 +28,7 @@ class ResultFolder:
     @cached_property
     def summary(self) -> dict[str, Any]:
         """``summary.json``. Raises InputError if it is missing or damaged."""
-        file = self.path / "summary.json"
-        summary = read_json(file)
-        if not isinstance(summary, dict):
-            raise InputError(f"{file} is damaged; it holds no summary of a run.")
-        return summary
+        return read_summary(self.path)
 
     @cached_property
     def camera(self) -> Camera:

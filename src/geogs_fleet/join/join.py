@@ -1,5 +1,6 @@
 """Parts to one place, from the first look at them to the files."""
 
+import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import state_spans
 from geogs.config import Config
 from geogs.errors import InputError
-from geogs.io.writers.atomic import prepare_output_folder
+from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.map_file import load_map_file
 from geogs.io.writers.ply_writer import write_splats
 from geogs.io.writers.replacement import replaced
@@ -27,13 +28,7 @@ from geogs.version import __version__
 from geogs_fleet.join.adjust import adjusted
 from geogs_fleet.join.gauge import Gauge, common_gauge
 from geogs_fleet.join.joined_disks import joined_disks, kept, merge_disks, move_disks
-from geogs_fleet.join.joined_files import (
-    JoinedPart,
-    fingerprint,
-    write_map,
-    write_poses,
-    write_summary,
-)
+from geogs_fleet.join.joined_files import JoinedPart, fingerprint, write_map, write_poses
 from geogs_fleet.join.joined_surface import SpacePlan, coloured, joint_mesh, plan_space
 from geogs_fleet.join.joined_trajectory import spans_of
 from geogs_fleet.join.links import Link, candidates, links_of
@@ -227,7 +222,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         "peak_memory_bytes": peak_memory(),
         **device_summary(torch.device(join.device)),
     }
-    write_summary(join.output, summary)
+    write_text(join.output / "summary.json", json.dumps(summary, indent=2))
     written = load_result(join.output, join.device)
     report, renders = join.output / "report", written.keyframes
     write_pictures(report, trajectory, renders)

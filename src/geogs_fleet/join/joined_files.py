@@ -1,8 +1,7 @@
 """The files of a joint result: those of a run."""
 
 import hashlib
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.documents import read_bytes
 from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
 from geogs.io.sources.frame_source import RecordingSpan
 from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.intrinsics_file import write_intrinsics
@@ -23,11 +23,7 @@ from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mapping.map_frame import WORLD
 from geogs.types import MapSnapshot, SeenRows, Trajectory
-from geogs_fleet.join.joined_trajectory import (
-    joined_trajectory,
-    keyframe_poses,
-    moved_trajectory,
-)
+from geogs_fleet.join.joined_trajectory import joined_trajectory, moved_trajectory
 from geogs_fleet.join.part import PartViews, image_of
 from geogs_fleet.join.part_graph import Placement
 
@@ -56,7 +52,7 @@ def write_poses(output: Path, parts: Sequence[JoinedPart]) -> Trajectory:
     trajectory = joined_trajectory([part.trajectory for part in parts], spans)
     keyframes = Trajectory(
         _times(parts),
-        np.concatenate([keyframe_poses(part.placement) for part in parts]),
+        np.concatenate([se3_inverse(part.placement.T_cw).numpy() for part in parts]),
         np.ones(sum(len(part.views.timestamp) for part in parts), bool),
     )
     write_trajectories(output, trajectory, keyframes)
@@ -112,11 +108,6 @@ def write_map(
     save_map_with_views(output / "map.safetensors", disks, views, metadata)
     write_intrinsics(output / "intrinsics.json", camera)
     write_config(output / "config.yaml", config)
-
-
-def write_summary(output: Path, summary: Mapping[str, object]) -> None:
-    """``summary.json``. Raises OutputError if it cannot be written."""
-    write_text(output / "summary.json", json.dumps(summary, indent=2))
 
 
 def fingerprint(parts: Sequence[SavedResult]) -> str:

@@ -84,7 +84,7 @@ def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers
         1 + len(blocks) // (_BOXES_PER_WORKER * workers.at_once if workers.at_once > 1 else 1),
     )
     boxes = boxes_of(blocks, most)
-    seen = (tuple(v for v in views if _sees(v, volume, box)) for box in boxes)
+    seen = (tuple(v for v in views if sees_box(v.camera, v.pose, volume, box)) for box in boxes)
     return SpacePlan(volume, tuple(boxes), tuple(seen))
 
 
@@ -123,7 +123,3 @@ def coloured(
     for n, made in zip(some, workers.map("colouring", colours_of, jobs), strict=True):
         colours[inside[n]] = made
     return colours
-
-
-def _sees(view: StoredView, plan: VolumePlan, box: BlockBox) -> bool:
-    return sees_box(view.camera, view.pose, plan, box)

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from geogs.geometry.lie import se3_inverse, sim3_scale, so3_exp, so3_log
+from geogs.geometry.lie import sim3_scale, so3_exp, so3_log
 from geogs.io.sources.frame_source import PAUSE, RecordingSpan
 from geogs.types import Trajectory
 from geogs_fleet.join.part import PartViews
@@ -56,8 +56,3 @@ def joined_trajectory(parts: list[Trajectory], spans: list[RecordingSpan]) -> Tr
         np.concatenate([t.T_wc for t in parts]),
         np.concatenate([t.tracked for t in parts]),
     )
-
-
-def keyframe_poses(placement: Placement) -> Float64[np.ndarray, "n 4 4"]:
-    """Camera to world."""
-    return np.asarray(se3_inverse(placement.T_cw).numpy())

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from geogs.documents import expanded, read_json
 from geogs.errors import InputError, OutputError
@@ -90,6 +91,15 @@ def free_folder(wanted: Path, fingerprint: str) -> Path:
         if not _is_of_another(folder, fingerprint):
             return folder
     raise AssertionError("count never ends")
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """What ``summary.json`` in a folder holds. Raises InputError if it is missing or damaged."""
+    path = folder / "summary.json"
+    summary = read_json(path)
+    if not isinstance(summary, dict):
+        raise InputError(f"{path} is damaged; it holds no summary of a run.")
+    return summary
 
 
 def _is_of_another(folder: Path, fingerprint: str) -> bool:

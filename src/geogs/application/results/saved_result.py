@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
 
-from geogs.application.results.output_folder import claimed
-from geogs.documents import expanded, read_json
+from geogs.application.results.output_folder import claimed, read_summary
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import GivenPose
@@ -94,11 +94,7 @@ class SavedResult:
     @cached_property
     def summary(self) -> dict[str, Any]:
         """What ``summary.json`` holds. Raises InputError if it is missing or damaged."""
-        path = self.folder / "summary.json"
-        summary = read_json(path)
-        if not isinstance(summary, dict):
-            raise InputError(f"{path} is damaged; it holds no summary of a run.")
-        return summary
+        return read_summary(self.folder)
 
     @cached_property
     def mesh(self) -> Mesh | None:

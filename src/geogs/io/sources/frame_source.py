@@ -124,6 +124,20 @@ class Source:
         lengths = [images.length for images in recordings]
         self.length = None if None in lengths else sum(n for n in lengths if n is not None)
         """Frames to expect, unreadable ones included; none where it is not known beforehand."""
+        self.black_is_masked = first.black_is_masked
+        """Whether pixels of frames that are quite black are masked out."""
+        self.uses_depth = any(images.uses_depth for images in recordings)
+        """Whether frames of any recording come with the depth that a sensor measured."""
+        self.depths_found = [images.depth_found for images in recordings]
+        """What there is of the depth of a sensor, a sentence for each recording."""
+        self.uses_poses = any(images.poses.is_used for images in recordings)
+        """Whether frames of any recording come with poses of another tracker, as priors."""
+        self.is_live = first.is_live
+        """Whether frames do not wait until they are asked for; such a recording is read alone."""
+        self.is_calibration_open = any(images.is_calibration_open for images in recordings)
+        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        self.is_shutter_open = first.is_shutter_open
+        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
 
@@ -143,31 +157,6 @@ class Source:
         return f"Source({self.name!r}: {self.kind}, {frames} frames of {size})"
 
     @property
-    def black_is_masked(self) -> bool:
-        """Whether pixels of frames that are quite black are masked out."""
-        return self._recordings[0].black_is_masked
-
-    @property
-    def uses_depth(self) -> bool:
-        """Whether frames of any recording come with the depth that a sensor measured."""
-        return any(images.uses_depth for images in self._recordings)
-
-    @property
-    def depths_found(self) -> list[str]:
-        """What there is of the depth of a sensor, a sentence for each recording."""
-        return [images.depth_found for images in self._recordings]
-
-    @property
-    def uses_poses(self) -> bool:
-        """Whether frames of any recording come with poses of another tracker, as priors."""
-        return any(images.poses.is_used for images in self._recordings)
-
-    @property
-    def is_live(self) -> bool:
-        """Whether frames do not wait until they are asked for; such a recording is read alone."""
-        return self._recordings[0].is_live
-
-    @property
     def dropped(self) -> int:
         """Frames of a live source that came too fast to be used, so far in this iteration."""
         reader = self._recordings[0].reader
@@ -185,14 +174,9 @@ class Source:
         """Where the intrinsics come from."""
         return self.calibration.origin
 
-    @property
-    def is_calibration_open(self) -> bool:
-        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
-        return any(images.is_calibration_open for images in self._recordings)
-
     def with_calibration(self, calibration: Calibration) -> "Source":
         """The same frames, undistorted by another calibration of the images as they came."""
-        return Source([images.with_calibration(calibration) for images in self._recordings])
+        return Source([images.known_better(calibration) for images in self._recordings])
 
     def with_lens(self, found: FoundLens) -> "Source":
         """The same frames, as they are, of images whose lens is known better by now."""
@@ -200,18 +184,13 @@ class Source:
         same.calibration = self.calibration.with_lens(found)
         return same
 
-    @property
-    def is_shutter_open(self) -> bool:
-        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
-        return self._recordings[0].is_shutter_open
-
     def with_shutter(self, shutter: Shutter) -> "Source":
         """The same frames, with their rows rectified by another readout."""
-        return Source([images.with_shutter(shutter) for images in self._recordings])
+        return Source([images.known_better(shutter=shutter) for images in self._recordings])
 
     def with_focal(self, focal: float) -> "Source":
         """The same frames, as a pinhole of that focal length sees them."""
-        return Source([images.with_focal(focal) for images in self._recordings])
+        return Source([images.known_better(focal=focal) for images in self._recordings])
 
     @property
     def rolling_camera(self) -> RollingCamera:

@@ -6,7 +6,6 @@ common: the selection, the calibration, the shutter, the working resolution and 
 
 from collections.abc import Generator, Iterator
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -85,8 +84,9 @@ class WorkingImages:
             config.intrinsics, info.calibration, info.width, info.height, info.quarter_turns
         )
         """The camera of the images as they came, upright, with its distortion."""
-        self.shutter = shutter or shutter_of(config.readout)
-        """By which rows are rectified."""
+        given = Shutter() if config.readout == "auto" else Shutter(config.readout, "as given")
+        self.shutter = shutter or given
+        """By which rows are rectified; a global one until it is found."""
         self._focal = focal
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
         self.camera = self._rectifier.camera
@@ -98,21 +98,17 @@ class WorkingImages:
         """Pixels of every frame that may show the scene; none where all do."""
         if masks is not None and self._masks is None:
             self.mask = self._straight(read_mask(masks, (info.height, info.width)))
-
-    @property
-    def black_is_masked(self) -> bool:
+        self.black_is_masked = self._masks is not None
         """Whether pixels of frames that are quite black are masked out."""
-        return self._masks is not None
+        self.is_live = isinstance(reader, LiveReader)
+        """Whether frames do not wait until they are asked for."""
+        self.uses_depth = config.depth != "none" and info.has_depth
+        """Whether images come with the depth that a sensor measured."""
 
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
         """A mask of an image as it came, straightened as that is."""
         grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
         return self._rectifier(grey)[..., 0] > 127
-
-    @property
-    def uses_depth(self) -> bool:
-        """Whether images come with the depth that a sensor measured."""
-        return self._config.depth != "none" and self.reader.info.has_depth
 
     @property
     def depth_found(self) -> str:
@@ -130,30 +126,25 @@ class WorkingImages:
         asked = self._config.intrinsics.strip().lower() == "auto"
         return asked and (self.calibration.is_guess or self.calibration.is_nominal)
 
-    def with_calibration(self, calibration: Calibration) -> "WorkingImages":
-        """The same images, undistorted by another calibration of the images as they came."""
-        fitted = calibration.fit(self.reader.info.width, self.reader.info.height)
-        return WorkingImages(self.reader, self._config, fitted, self.shutter, self._focal)
-
-    @property
-    def is_live(self) -> bool:
-        """Whether frames do not wait until they are asked for."""
-        return isinstance(self.reader, LiveReader)
+    def known_better(
+        self,
+        calibration: Calibration | None = None,
+        shutter: Shutter | None = None,
+        focal: float | None = None,
+    ) -> "WorkingImages":
+        """The same images with what is given instead of what was known: undistorted by another
+        calibration, rectified by another readout, as a pinhole of another focal length sees them.
+        """
+        info = self.reader.info
+        known = calibration.fit(info.width, info.height) if calibration else self.calibration
+        return WorkingImages(
+            self.reader, self._config, known, shutter or self.shutter, focal or self._focal
+        )
 
     @property
     def is_shutter_open(self) -> bool:
         """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
-        if self.is_live:
-            return False
-        return self._config.readout == "auto" and self.shutter == Shutter()
-
-    def with_shutter(self, shutter: Shutter) -> "WorkingImages":
-        """The same images, with their rows rectified by another readout."""
-        return WorkingImages(self.reader, self._config, self.calibration, shutter, self._focal)
-
-    def with_focal(self, focal: float) -> "WorkingImages":
-        """The same images, as a pinhole of that focal length sees them."""
-        return WorkingImages(self.reader, self._config, self.calibration, self.shutter, focal)
+        return not self.is_live and self._config.readout == "auto" and self.shutter == Shutter()
 
     @property
     def rolling_camera(self) -> RollingCamera:
@@ -178,11 +169,9 @@ class WorkingImages:
     def length(self) -> int | None:
         """Images to expect, unreadable ones included; none where it is not known beforehand."""
         config, length = self._config, self.reader.info.length
-        return (
-            None
-            if length is None
-            else len(range(length)[config.start : config.stop : config.stride])
-        )
+        if length is None:
+            return None
+        return len(range(length)[config.start : config.stop : config.stride])
 
     def read(self, first: int) -> Iterator[RawFrame]:
         """Read the selection from its ``first`` image on; unless it is live, the next one is read
@@ -290,11 +279,6 @@ class WorkingImages:
         if skipped:
             return f"{self.name}: none of its {skipped} images can be used."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."
-
-
-def shutter_of(readout: float | Literal["auto"]) -> Shutter:
-    """The shutter that the settings ask for; a global one until it is found."""
-    return Shutter() if readout == "auto" else Shutter(readout, "as given")
 
 
 def _check_selection(config: InputConfig, length: int | None) -> None:

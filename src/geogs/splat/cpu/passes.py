@@ -28,7 +28,7 @@ def rendered(
     x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
     pose, threads = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy(), worker_count()
     maps, trace = rasterize_forward((x, q, scale, logit), camera, pose, near, threads, with_trace)
-    shown = tuple(torch.from_numpy(getattr(maps, name)) for name in maps.__slots__)
+    shown = tuple(map(torch.from_numpy, maps))
     shapes = [m.shape for m in shown[:4]]  # not the maps, which belong to the graph
 
     def back(
@@ -38,10 +38,9 @@ def rendered(
             (torch.zeros(shape) if g is None else g).to(torch.float32).contiguous().numpy()
             for g, shape in zip(gradients, shapes, strict=True)
         )
-        found = rasterize_backward(trace, depth, normal, alpha, distortion, threads)
+        d_disks, rows = rasterize_backward(trace, depth, normal, alpha, distortion, threads)
         d_T = torch.zeros(4, 4, dtype=torch.float64)
-        d_T[:3] = torch.from_numpy(found.T_cw)
-        d_disks = (found.position, found.quaternion, found.log_scale, found.opacity_logit)
+        d_T[:3] = torch.from_numpy(rows)
         return DiskParameters(*map(torch.from_numpy, d_disks)), d_T
 
     return shown, back

@@ -31,18 +31,8 @@ _DISK_CHUNKS = 8
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """position (n, 3), quaternion (n, 4), log_scale (n, 2), opacity_logit (n): float32, contiguous."""
-
-
-@dataclass(slots=True)
-class Maps:
-    """A rendering: float32 (h, w) arrays, (h, w, 3) for the normal, and bool (n,) visibility."""
-
-    depth: np.ndarray
-    normal: np.ndarray
-    alpha: np.ndarray
-    distortion: np.ndarray
-    median_depth: np.ndarray
-    visible: np.ndarray
+Maps = tuple[np.ndarray, ...]
+"""Depth, normal (h, w, 3), alpha, distortion, median depth: float32 (h, w); visible: bool (n)."""
 
 
 @dataclass(slots=True)
@@ -75,17 +65,6 @@ class Trace:
     saved: np.ndarray
 
 
-@dataclass(slots=True)
-class Gradients:
-    """Gradients of the four parameter arrays, float32, and of T_cw's upper three rows, float64."""
-
-    position: np.ndarray
-    quaternion: np.ndarray
-    log_scale: np.ndarray
-    opacity_logit: np.ndarray
-    T_cw: np.ndarray
-
-
 def rasterize_forward(
     parameters: Arrays,
     camera: Camera,
@@ -112,22 +91,15 @@ def rasterize_forward(
     )  # fmt: skip
     lists = list_tiles(records, outlines, boxes, pairs, width, height, threads)
     shape, tiles = (height, width), len(lists.offsets) - 1
-    maps = Maps(
-        depth=np.empty(shape, np.float32),
-        normal=np.empty((*shape, 3), np.float32),
-        alpha=np.empty(shape, np.float32),
-        distortion=np.empty(shape, np.float32),
-        median_depth=np.empty(shape, np.float32),
-        visible=np.zeros(n, np.bool_),
-    )
+    planes = shape, (*shape, 3), shape, shape, shape
+    maps = (*(np.empty(plane, np.float32) for plane in planes), np.zeros(n, np.bool_))
     saved = np.empty((tiles if with_trace else 0, SAVED, TILE_PIXELS), np.float32)
     inverse_near = np.float32(1 / near)
     chunks = _tile_chunks(threads)
     run_chunks(
         lambda c: blend_tiles(
             *_span(tiles, c, chunks), records, lists.offsets, lists.disks, lists.runs, inverse_near,
-            maps.depth, maps.normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible,
-            saved, _cache_aligned(BLEND_PLANES * PLANE),
+            *maps, saved, _cache_aligned(BLEND_PLANES * PLANE),
         ),
         chunks, threads,
     )  # fmt: skip
@@ -141,8 +113,9 @@ def rasterize_backward(
     d_alpha: np.ndarray,
     d_distortion: np.ndarray,
     threads: int,
-) -> Gradients:
-    """Gradients of a loss, given its contiguous float32 gradients with respect to the maps."""
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Gradients of a loss, given its contiguous float32 gradients with respect to the maps: of the
+    four arrays of the disks, float32, and of the upper three rows of the pose, float64."""
     lists, n, tiles = trace.lists, len(trace.parameters[0]), len(trace.lists.offsets) - 1
     gradients = np.empty((len(lists.disks) + 1, GRADIENT), np.float32)
     gradients[-1] = 0
@@ -155,8 +128,7 @@ def rasterize_backward(
         ),
         chunks, threads,
     )  # fmt: skip
-    p, q, s, o = (np.empty_like(array) for array in trace.parameters)
-    out = Gradients(p, q, s, o, T_cw=np.zeros((3, 4)))
+    out = tuple(np.empty_like(array) for array in trace.parameters)
     sums, d_T = np.empty((n, GRADIENT), np.float32), np.zeros((_DISK_CHUNKS, 3, 4))
 
     def finish(chunk: int) -> None:
@@ -165,13 +137,11 @@ def rasterize_backward(
         position, quaternion, log_scale, _ = trace.parameters
         project_disks_backward(
             position, quaternion, log_scale, trace.T_cw, trace.intrinsics, trace.records,
-            lists.slots, sums, *span, out.position, out.quaternion, out.log_scale,
-            out.opacity_logit, d_T[chunk],
+            lists.slots, sums, *span, *out, d_T[chunk],
         )  # fmt: skip
 
     run_chunks(finish, _DISK_CHUNKS, threads)
-    d_T.sum(0, out=out.T_cw)
-    return out
+    return out, d_T.sum(0)
 
 
 def list_tiles(

@@ -120,7 +120,7 @@ class Matcher:
     def _of(self, index: int) -> tuple[Float64[np.ndarray, "n 2"], np.ndarray]:
         if index not in self._features:
             view = self._source[index]
-            grey = self._grey(view.image)
+            grey = self._scaled(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY))
             mask = None if view.mask is None else self._scaled(view.mask.astype(np.uint8) * 255)
             points, descriptors = self._sift.detectAndCompute(grey, mask)
             pixels = np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2)
@@ -128,9 +128,6 @@ class Matcher:
                 descriptors = np.zeros((0, 128), dtype=np.float32)
             self._features[index] = (pixels, descriptors)
         return self._features[index]
-
-    def _grey(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
-        return self._scaled(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
     def _scaled(self, image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
         size = (self.camera.width, self.camera.height)
