@@ -17,6 +17,7 @@ from geogs.io.sources.calibration import GUESS, Calibration
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.tracking.calibration import self_calibration, stretch
+from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.self_calibration import SelfCalibration
 from geogs.types import FoundLens
 from tracking_scenes import CAMERA, pose, render
@@ -179,6 +180,17 @@ def test_a_lens_is_found_where_the_video_told_its_focal_length_and_nobody_how_it
     assert not refined(nominal, 600.0, nothing).is_found_lens
     assert not refined(bent, 600.0, pinhole).is_found_lens
     assert not nominal.is_found_lens
+
+
+def test_what_no_camera_explained_is_known_when_all_matches_found_a_lens():
+    guess = Calibration(600.0, 600.0, 319.5, 239.5, width=640, height=480, is_guess=True)
+    said = SelfCalibration(guess.camera(), failure=Degeneracy.UNEXPLAINED.value)
+    turning = replace(said, failure=Degeneracy.TURNING.value)
+    for found, is_explained in ((said, False), (turning, True)):
+        before = refined(guess, 600.0, found)
+        after = before.with_lens(FoundLens(-0.1, 0.02, 0.01, 0.01, 0.9, 0.05))
+        assert after.refinement.failure is None
+        assert before.refinement.is_explained == after.refinement.is_explained == is_explained
 
 
 def test_a_focal_length_is_as_unsure_as_who_said_it():

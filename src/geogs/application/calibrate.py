@@ -74,9 +74,12 @@ def refined(
     ``working_focal`` is fx of the working images by ``calibration``, in their pixels.
     """
     if found.failure is not None:
+        from geogs.tracking.calibration.degeneracy import Degeneracy
+
         said = FocalRefinement(
-            keyframes=found.keyframes, frames=found.frames, failure=found.failure
-        )
+            keyframes=found.keyframes, frames=found.frames, failure=found.failure,
+            is_explained=found.failure != Degeneracy.UNEXPLAINED.value,
+        )  # fmt: skip
         origin = f"{calibration.origin}; the video does not tell: {found.failure}"
         return replace(calibration, origin=origin, refinement=said)
     factor = found.camera.fx / working_focal

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.dense import DenseSchur, LinearBundle
+from geogs.bundle.flow_term import residual_norms
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
@@ -43,6 +44,8 @@ class SharedResult:
     """Sum over a frame's edges of w |dp/dd|^2."""
     cost: float
     """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
+    residual: float
+    """Median residual of a match, in its own deviations."""
     covariance: Float[Tensor, "m m"]
     """Covariance of the block's unknowns, zero for those that are no variables; see
     :func:`solve_shared`."""
@@ -81,6 +84,7 @@ def solve_shared(
         state.inverse_depth,
         shared.information,
         found.cost,
+        _usual_residual(problem, state),
         covariance,
         found.finite and bool(torch.isfinite(covariance).all()),
     )
@@ -114,6 +118,15 @@ class SharedSchur(DenseSchur):
         """Mean over the matched cells; infinite where nothing is matched."""
         matched = int((self.problem.weight[..., 0] > 0).sum())
         return super().cost(state) / matched if matched else math.inf
+
+
+def _usual_residual(problem: BundleProblem, state: BundleState) -> float:
+    """Median residual of the matches in front of their targets, in their own deviations."""
+    source, target = problem.source, problem.target
+    block = cast(LensBlock, state.block)
+    at = block.project(state.T_cw, source, target, state.inverse_depth[source])
+    found = residual_norms(at, problem.pixels, problem.weight)
+    return float(found[at.valid & (problem.weight[..., 0] > 0)].median())
 
 
 def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:

@@ -56,6 +56,12 @@ def test_a_focal_length_that_nobody_knows_is_no_shape_to_rely_on():
     assert "tells it only to 30%: give --intrinsics" in found.sentence
 
 
+def test_what_no_camera_explains_is_not_relied_on():
+    found = verdict(walk(30, 30), walk(5, 5), known(0.001, 0.01, 0.05), is_explained=False)
+    assert not found.is_reliable
+    assert "no camera explains how its first views move" in found.sentence
+
+
 def test_a_run_without_motion_is_not_reliable():
     still = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)), np.ones(5, bool))
     assert not verdict(still, still, known(0.001, 0.01)).is_reliable

@@ -72,8 +72,12 @@ class Result:
         """Whether trajectory and shape are to be relied on; none where the poses were given."""
         if self.uncertainty is None:
             return None
-        why_not = self.why_no_map or ""
-        return verdict(self.trajectory, self.keyframes, self.uncertainty, why_not)
+        source = self.source
+        said = source.calibration.refinement if isinstance(source, Source) else None
+        return verdict(
+            self.trajectory, self.keyframes, self.uncertainty, self.why_no_map or "",
+            said is None or said.is_explained,
+        )  # fmt: skip
 
     @property
     def why_no_map(self) -> str | None:

@@ -51,7 +51,11 @@ class Verdict:
 
 
 def verdict(
-    trajectory: Trajectory, keyframes: Trajectory, known: Uncertainty, why_not: str = ""
+    trajectory: Trajectory,
+    keyframes: Trajectory,
+    known: Uncertainty,
+    why_not: str = "",
+    is_explained: bool = True,
 ) -> Verdict:
     """Whether trajectory and shape are to be relied on.
 
@@ -60,6 +64,8 @@ def verdict(
         keyframes: of the keyframes alone.
         known: how well frames are known.
         why_not: why no map could be started, if so.
+        is_explained: whether a camera was found before the run that explains how its views move,
+            where nobody said the focal length.
     """
     extent = extent_of(keyframes.T_wc)
     states = trajectory.states
@@ -83,6 +89,11 @@ def verdict(
         reasons.append(
             "nobody said its focal length and the video tells it only to "
             f"{_percent(known.focal)}: give --intrinsics"
+        )
+    elif not is_explained:
+        reasons.append(
+            "no camera explains how its first views move, as if much of what they show moves "
+            "itself, and nobody said its focal length: give --intrinsics"
         )
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."

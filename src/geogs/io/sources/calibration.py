@@ -31,6 +31,9 @@ class FocalRefinement:
     """Looked at."""
     failure: str | None = None
     """Why the video does not tell it."""
+    is_explained: bool = True
+    """Whether any camera explains how its first views move; else what moves in them may decide what
+    all matches say later, too."""
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,15 @@ from torch import Tensor
 from geogs.bundle.lens import RadialLens
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy
+from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
 
 LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
 PRIOR = 0.1, 0.2
 """Deviations of k1 and k2 before any match is asked. A narrow field of view does not tell them."""
+MOST_BEND = 4.0
+"""Such deviations of k1 and k2 beyond which matches tell of no lens, but of nothing at all."""
 UNRELIABLE = 0.1
 """Relative deviation above which the focal length is not believed and the guess is kept, which may
 be as good."""
@@ -58,7 +60,9 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     angle = 2 * math.degrees(math.atan(lens.camera.long_edge / 2 / lens.camera.fx))
     if not FIELDS_OF_VIEW[0] < angle < FIELDS_OF_VIEW[1]:
         return f"it seems to have a field of view of {angle:.0f} degrees"
-    if result.cost > MAX_COST:
+    if any(abs(k) > MOST_BEND * usual for k, usual in zip((lens.k1, lens.k2), PRIOR, strict=True)):
+        return "its lens seems to bend as none does"
+    if result.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
     asked = torch.tensor([1, radial, radial], dtype=torch.float64)
     covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()
