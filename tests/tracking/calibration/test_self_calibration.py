@@ -10,7 +10,8 @@ import torch
 import tracking_scenes
 from geogs.bundle.lens import RadialLens, lens_rays
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration import stretch
+from geogs.tracking.calibration import self_calibration, stretch
+from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
 from geogs.tracking.calibration.self_calibration import self_calibrate
 from geogs.types import Frame
@@ -118,6 +119,15 @@ def test_a_plane_is_said_to_be_one(monkeypatch):
     found = self_calibrate(frames(swinging(16)), guess)
     assert found.failure == "it shows a single plane"
     assert found.camera == guess
+
+
+def test_that_nothing_explains_a_stretch_is_what_is_said(monkeypatch):
+    said = iter(["its motion could not be followed", Degeneracy.UNEXPLAINED.value])
+    monkeypatch.setattr(self_calibration, "STRETCHES", 2)
+    monkeypatch.setattr(stretch, "START_KEYFRAMES", 2)
+    monkeypatch.setattr(stretch.Stretch, "ask", lambda self: next(said))
+    found = self_calibrate(frames(swinging(4)), CAMERA.with_focal(120.0))
+    assert found.failure == Degeneracy.UNEXPLAINED.value
 
 
 def test_a_camera_that_stands_still_is_said_to():

@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import Estimate
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer
@@ -81,7 +82,9 @@ def self_calibrate(
         else:
             found = said
     if found is None:
-        return SelfCalibration(camera, frames=gatherer.frames, failure=failures[0])
+        # That nothing explains a stretch weighs more than what the others lack.
+        failure = min(failures, key=lambda said: said != Degeneracy.UNEXPLAINED.value)
+        return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
     k1, k2 = found.lens.k1, found.lens.k2
     bends = k1 != 0 or k2 != 0
