@@ -44,8 +44,6 @@ class SharedResult:
     """Sum over a frame's edges of w |dp/dd|^2."""
     cost: float
     """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
-    residual: float
-    """Median residual of a match, in its own deviations."""
     covariance: Float[Tensor, "m m"]
     """Covariance of the block's unknowns, zero for those that are no variables; see
     :func:`solve_shared`."""
@@ -84,7 +82,6 @@ def solve_shared(
         state.inverse_depth,
         shared.information,
         found.cost,
-        _usual_residual(problem, state),
         covariance,
         found.finite and bool(torch.isfinite(covariance).all()),
     )
@@ -120,11 +117,11 @@ class SharedSchur(DenseSchur):
         return super().cost(state) / matched if matched else math.inf
 
 
-def _usual_residual(problem: BundleProblem, state: BundleState) -> float:
-    """Median residual of the matches in front of their targets, in their own deviations."""
-    source, target = problem.source, problem.target
-    block = cast(LensBlock, state.block)
-    at = block.project(state.T_cw, source, target, state.inverse_depth[source])
+def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
+    """Median residual of the matches in front of their targets, in their own deviations, where a
+    problem was adjusted."""
+    source, depth = problem.source, result.inverse_depth[problem.source]
+    at = result.block.project(result.T_cw, source, problem.target, depth)
     found = residual_norms(at, problem.pixels, problem.weight)
     return float(found[at.valid & (problem.weight[..., 0] > 0)].median())
 

@@ -27,7 +27,7 @@ PLANAR_FRACTION = 0.9
 """Where one homography explains this fraction of the matches in all views, they show a plane."""
 _TOLERANCE = 1 / 1000
 """Deviation, of the long edge, from a homography that is still explained by it."""
-FIELDS_OF_VIEW = 25.0, 130.0
+_FIELDS_OF_VIEW = 25.0, 130.0
 """Degrees along the longer side, between which a turn is looked for."""
 
 
@@ -70,9 +70,9 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
         K = camera.with_field_of_view(angle).matrix().numpy()
         return max(_unexplained(K, fit) for fit in fits)
 
-    if left(FIELDS_OF_VIEW[0]) < min_parallax:
+    if left(_FIELDS_OF_VIEW[0]) < min_parallax:
         return Degeneracy.TURNING
-    least = minimize_scalar(left, bounds=FIELDS_OF_VIEW, method="bounded").fun
+    least = minimize_scalar(left, bounds=_FIELDS_OF_VIEW, method="bounded").fun
     return None if least < min_parallax else Degeneracy.PLANAR
 
 

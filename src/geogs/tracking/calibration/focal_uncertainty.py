@@ -62,7 +62,7 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
         return f"it seems to have a field of view of {angle:.0f} degrees"
     if any(abs(k) > MOST_BEND * usual for k, usual in zip((lens.k1, lens.k2), PRIOR, strict=True)):
         return "its lens seems to bend as none does"
-    if result.residual > MAX_RESIDUAL:
+    if bundle.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
     asked = torch.tensor([1, radial, radial], dtype=torch.float64)
     covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()

@@ -1,5 +1,6 @@
 """Keyframes with poses, inverse depths and flow around a lens that still changes."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ from torch import Tensor
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.shared import SharedResult, solve_shared
+from geogs.bundle.shared import SharedResult, solve_shared, usual_residual
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View
@@ -55,6 +56,8 @@ class GrowingBundle:
             self._information.append(i)
         self._edges: dict[tuple[int, int], _Edge] = {}
         self.result: SharedResult | None = None
+        self.residual = math.inf
+        """Median residual of the matches, in their own deviations, as last adjusted."""
 
     def __len__(self) -> int:
         return len(self._views)
@@ -67,7 +70,7 @@ class GrowingBundle:
     def place(self, view: View) -> bool:
         """Append the next view by PnP on the last one's depth; False if that fails."""
         assert view.step is not None
-        grid, step = self._pinhole, view.step.on_cpu()
+        grid, step = self._pinhole, view.step.there.on_cpu()
         plain, depth = SampleGrid(self.lens.camera), self._depth[-1].cpu()
         good = step.sure()[0] & (self._information[-1].cpu() > 0)
         T = pnp(plain, depth, step.pixels[0], good)
@@ -135,10 +138,12 @@ class GrowingBundle:
     def adjust(self, radial: bool) -> bool:
         """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
         block = LensBlock(self.lens, self.grid.pixels.cpu(), radial=radial)
-        result = solve_shared(self.problem(), block)
+        problem = self.problem()
+        result = solve_shared(problem, block)
         if not result.finite:
             return False
         self.result, self.lens = result, result.block.lens
+        self.residual = usual_residual(problem, result)
         self._T = list(result.T_cw)
         information = result.information.to(self.grid.device)
         self._information = list(information)

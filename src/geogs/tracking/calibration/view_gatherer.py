@@ -12,7 +12,12 @@ from geogs.config import TrackingConfig
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
-from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, follow_flow
+from geogs.tracking.matching.flow_chain import (
+    MIN_MATCHED,
+    MIN_TEXTURE,
+    ChainedMatch,
+    follow_flow,
+)
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
@@ -26,10 +31,8 @@ class View:
     """A keyframe without a pose."""
 
     encoded: Any
-    step: FlowMatch | None
-    """From the keyframe before it; None for the first."""
-    back: FlowMatch | None
-    """To the keyframe before it; None for the first."""
+    step: ChainedMatch | None
+    """Flow between the keyframe before it and this one; None for the first."""
 
 
 class ViewGatherer:
@@ -68,7 +71,7 @@ class ViewGatherer:
             encoded = self._operator.encode(image)
             if self._operator.texture(encoded) < MIN_TEXTURE:
                 continue
-            step = back = None
+            step = None
             if views:
                 match = follow_flow(
                     self._grid, self._operator, self._chain, views[-1].encoded, encoded
@@ -80,9 +83,9 @@ class ViewGatherer:
                 elif not calls_for_keyframe(self._config, edge, match.flow, match.matched):
                     continue
                 else:
-                    step, back = match.there, match.back
+                    step = match
             self._chain.reset()
-            views.append(View(encoded, step, back))
+            views.append(View(encoded, step))
         return views
 
 
@@ -95,9 +98,8 @@ def flows_from_first(
     flows = []
     for view in views[1:]:
         assert view.step is not None
-        assert view.back is not None
-        there = there + grid.sample_field(filled_flow(grid, view.step), there)
-        back_step = filled_positions(grid, view.back)
+        there = there + grid.sample_field(filled_flow(grid, view.step.there), there)
+        back_step = filled_positions(grid, view.step.back)
         back = back_step + grid.sample_field(back - grid.pixels, back_step)
         match, reverse = operator.measure(
             [views[0].encoded], [view.encoded], there[None], back[None], fine=True
