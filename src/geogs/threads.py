@@ -10,6 +10,7 @@ import functools
 import itertools
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -44,24 +45,23 @@ def thread_map(
 ) -> list[R]:
     """``list(map(function, items))`` over the workers; results in the order of the items.
 
-    After an exception, which ``progress`` may raise, too, items that nobody has begun are left.
+    The caller's thread takes part, and tells the ``progress``, which may raise an exception as any
+    item may: those that nobody has begun are left.
     """
-    results: list[R] = []
+    results: dict[int, R] = {}
+    caller, told = threading.get_ident(), 0
 
-    def gather(found: Iterable[R]) -> list[R]:
-        for result in found:
-            results.append(result)
-            progress(len(results) / len(items))
-        return results
+    def one(n: int) -> None:
+        nonlocal told
+        results[n] = function(items[n])
+        if threading.get_ident() == caller:
+            told = len(results)
+            progress(told / len(items))
 
-    if min(len(items), worker_count()) == 1:
-        return gather(map(function, items))
-    with ThreadPoolExecutor(worker_count()) as pool:
-        try:
-            return gather(pool.map(function, items))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    run_chunks(one, len(items), worker_count())
+    if told < len(items):
+        progress(1.0)
+    return [results[n] for n in range(len(items))]
 
 
 @runtime_checkable
@@ -96,13 +96,19 @@ def ordered_map(
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:
     """Call ``function(chunk)`` for every chunk; threads take the next one as they become free.
 
-    The caller's thread takes part. The first exception is raised once all threads are done.
+    The caller's thread takes part. After an exception chunks that nobody has begun are left, and it
+    is raised once all threads are done. Calls within calls share the threads.
     """
-    counter = itertools.count()
+    counter, failed = itertools.count(), False
 
     def work() -> None:
-        while (chunk := next(counter)) < chunks:
-            function(chunk)
+        nonlocal failed
+        try:
+            while not failed and (chunk := next(counter)) < chunks:
+                function(chunk)
+        except BaseException:
+            failed = True
+            raise
 
     helpers = min(threads, chunks) - 1
     if helpers < 1:
@@ -128,8 +134,13 @@ def over_rows(kernel: Callable[[int, int], object], height: int) -> None:
 
 @functools.cache
 def _executor(threads: int, process: int) -> ThreadPoolExecutor:
-    """One pool per process: threads do not survive a fork."""
-    return ThreadPoolExecutor(threads - 1, thread_name_prefix="geogs")
+    """One pool per process: threads do not survive a fork. Made anew for each call, they took five
+    times as long on 16 cores as what was to be done, where calls are short and within each other.
+    """
+    return ThreadPoolExecutor(
+        threads - 1, thread_name_prefix="geogs",
+        initializer=torch.set_num_threads, initargs=(1,),
+    )  # fmt: skip
 
 
 def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:

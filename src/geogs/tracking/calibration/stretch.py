@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from geogs.threads import thread_map
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate
@@ -106,9 +105,10 @@ class Stretch:
         wrong = degeneracy(camera, flows, self._min_parallax)
         if wrong is not None:
             return wrong
-        starts = thread_map(
-            lambda lens: try_candidate(lens, flows, self._min_parallax, self.radial),
-            candidates(camera, self.radial),
+        # One after the other: beside each other their many small operations wait for Python.
+        starts = (
+            try_candidate(lens, flows, self._min_parallax, self.radial)
+            for lens in candidates(camera, self.radial)
         )
         found = [s for s in starts if s is not None]
         if not found:
