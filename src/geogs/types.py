@@ -1,6 +1,6 @@
 """What flows between the parts: frozen records, no behaviour."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -224,15 +224,19 @@ class Uncertainty(ShortRepr):
     the best known quarter of what it sees, as bare walls tell nothing."""
     focal: AtLeast0 = 0.0
     """That of the focal length, as a part of it: of the width of things over their depth."""
+    misfit: AtLeast0 = 0.0
+    """How many times as long as the usual keyframe's are the residuals of the tenth whose matches
+    fit least; 0 where that is not known."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""
         if not len(self.timestamps):
             nothing = np.full(len(timestamps), np.inf)
-            return Uncertainty(timestamps, nothing, nothing, nothing, self.focal)
+            return self._of_frames(timestamps, nothing, nothing, nothing)
         known = (self.position, self.rotation, self.depth)
-        position, rotation, depth = (np.interp(timestamps, self.timestamps, c) for c in known)
-        return Uncertainty(timestamps, position, rotation, depth, self.focal)
+        return self._of_frames(
+            timestamps, *(np.interp(timestamps, self.timestamps, c) for c in known)
+        )
 
     def with_found(self, found: FoundFrames) -> "Uncertainty":
         """With frames that were found beside these: each is as far off as those around it, and by
@@ -245,8 +249,19 @@ class Uncertainty(ShortRepr):
             (self.rotation, np.hypot(around.rotation, found.rotation)),
             (self.depth, around.depth),
         )
-        times, position, rotation, depth = (np.concatenate(pair)[order] for pair in columns)
-        return Uncertainty(times, position, rotation, depth, self.focal)
+        return self._of_frames(*(np.concatenate(pair)[order] for pair in columns))
+
+    def _of_frames(
+        self,
+        timestamps: Float[np.ndarray, "m"],
+        position: Float[np.ndarray, "m"],
+        rotation: Float[np.ndarray, "m"],
+        depth: Float[np.ndarray, "m"],
+    ) -> "Uncertainty":
+        """That of other frames of the same video."""
+        return replace(
+            self, timestamps=timestamps, position=position, rotation=rotation, depth=depth
+        )
 
 
 @dataclass(frozen=True, slots=True, repr=False)

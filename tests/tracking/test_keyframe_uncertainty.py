@@ -10,7 +10,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.tracking import keyframe_uncertainty as room
-from geogs.tracking.keyframe_uncertainty import USUAL_RESIDUAL, keyframe_uncertainty
+from geogs.tracking.keyframe_uncertainty import USUAL_RESIDUAL, keyframe_uncertainty, misfit
 from geogs.types import FoundLens
 from planted_walk import drift, planted_tracker
 
@@ -138,3 +138,24 @@ def test_without_matches_nothing_is_known():
     found = keyframe_uncertainty(tracker)
     assert (found.position == np.inf).all()
     assert (found.depth == np.inf).all()
+
+
+def test_misfit_is_that_of_a_tenth_of_the_keyframes():
+    rng = np.random.default_rng(0)
+    even = rng.uniform(0.38, 0.46, 60)  # noisy all over
+    assert misfit(even) < 1.12
+    jerked = np.where(np.arange(60) < 8, 2 * even, even)
+    assert 1.7 < misfit(jerked) < 2.2
+    assert misfit(np.where(np.arange(60) < 3, 9 * even, even)) < 1.12  # a few are no tenth
+    assert misfit(jerked / 4) < 1  # whatever fits as well as without flaws does
+    assert misfit(np.append(even, np.inf)) == misfit(even)
+    assert misfit(np.full(3, np.inf)) == 0
+
+
+def test_frames_share_the_misfit_of_their_keyframes():
+    tracker = measured(14)
+    found = keyframe_uncertainty(tracker)
+    residual = matches_alone(tracker).normalised_residual.numpy()
+    assert found.misfit == pytest.approx(misfit(residual), rel=1e-4)
+    assert found.misfit > 1
+    assert found.at(np.array([0.0, 1.0])).misfit == found.misfit

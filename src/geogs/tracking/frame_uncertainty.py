@@ -1,6 +1,7 @@
 """How well a tracker knows its frames: the keyframes around them, and each by its own matches."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -47,12 +48,10 @@ def frame_uncertainty(tracker: Tracker) -> Uncertainty:
     own = [(known.get(r.index, unknown), read.get(r.index, none)) for r in tracked]
     position = np.array([math.hypot(*(d.position for d in both)) for both in own], np.float64)
     rotation = np.array([math.hypot(*(d.rotation for d in both)) for both in own], np.float64)
-    return Uncertainty(
-        times,
-        np.hypot(around.position, position),
-        np.hypot(around.rotation, rotation),
-        around.depth,
-        around.focal,
+    return replace(
+        around,
+        position=np.hypot(around.position, position),
+        rotation=np.hypot(around.rotation, rotation),
     )
 
 

@@ -33,6 +33,10 @@ TOGETHER = 300
 USUAL_RESIDUAL = 0.23
 """Median residual, in deviations of a match, where the scene is as modelled: read off rendered
 videos (docs/uncertainty.md has the table)."""
+FLAWLESS_RESIDUAL = 0.26
+"""The same where nothing is wrong, at most: 0.21 to 0.26."""
+LEAST_FITTING = 0.9
+"""Quantile of the keyframes' residuals that stands for those whose matches fit least."""
 
 
 def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> Uncertainty:
@@ -52,6 +56,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
+    residual = np.full(len(ids), np.inf)
     propagated, focal, lens = np.zeros(2), 0.0, tracker.keyframes.table.lens
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
@@ -59,6 +64,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
         if found is None:
             continue
         depth[part] = found.depth_deviation.numpy()
+        residual[part] = found.normalised_residual.numpy()
         focal = max(focal, found.focal_variance)
         if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
             T_cw = tracker.keyframes.poses(ids)
@@ -71,7 +77,21 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     # Of a lens that was found, what was said when it was: matches on images that are straight by
     # it agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
-    return Uncertainty(times, position, rotation, depth, max(open_, math.sqrt(focal)))
+    focal = max(open_, math.sqrt(focal))
+    return Uncertainty(times, position, rotation, depth, focal, misfit(residual))
+
+
+def misfit(residuals: Float[np.ndarray, "n"]) -> float:
+    """How much longer than the median keyframe's residual, or one without flaws, is that of the
+    tenth of the keyframes whose matches fit least; 0 where no matches are known.
+
+    Of keyframes that are placed rightly it is below 1.25: noise, blur and bare walls are in all of
+    a video, and matches say how sure they are. Above it are those where tracking has failed.
+    """
+    known = residuals[np.isfinite(residuals)]
+    if not len(known):
+        return 0.0
+    return float(np.quantile(known, LEAST_FITTING) / max(np.median(known), FLAWLESS_RESIDUAL))
 
 
 def said_of_lens(

@@ -1,5 +1,7 @@
 """What a run says of itself in one line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,14 @@ def test_what_no_camera_explains_is_not_relied_on():
     found = verdict(walk(30, 30), walk(5, 5), known(0.001, 0.01, 0.05), is_explained=False)
     assert not found.is_reliable
     assert "no camera explains how its first views move" in found.sentence
+
+
+def test_keyframes_that_fit_less_well_than_the_others_are_not_relied_on():
+    good = known(0.001, 0.01)
+    assert verdict(walk(30, 30), walk(5, 5), replace(good, misfit=1.25)).is_reliable
+    found = verdict(walk(30, 30), walk(5, 5), replace(good, misfit=1.75))
+    assert not found.is_reliable
+    assert "a tenth of its keyframes fit 1.8 times less well" in found.sentence
 
 
 def test_a_run_without_motion_is_not_reliable():

@@ -19,6 +19,9 @@ MAX_DEPTH_DEVIATION = 0.2
 MAX_FOCAL_DEVIATION = 0.15
 """Relative deviation of the focal length, by which all that is seen is too wide or too narrow: 14 %
 and less in rendered videos where it was right (docs/lens.md)."""
+MAX_MISFIT = 1.35
+"""Residual of a tenth of the keyframes over that of the others: up to 1.22 in rendered videos that
+were followed rightly, from 1.41 on where tracking had failed (docs/uncertainty.md)."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -94,6 +97,11 @@ def verdict(
         reasons.append(
             "no camera explains how its first views move, as if much of what they show moves "
             "itself, and nobody said its focal length: give --intrinsics"
+        )
+    if known.misfit > MAX_MISFIT:
+        reasons.append(
+            f"the matches of a tenth of its keyframes fit {known.misfit:.1f} times less well than "
+            "the others', as where tracking fails"
         )
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."
