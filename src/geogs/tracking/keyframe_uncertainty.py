@@ -85,7 +85,7 @@ def misfit(residuals: Float[np.ndarray, "n"]) -> float:
     """How much longer than the median keyframe's residual, or one without flaws, is that of the
     tenth of the keyframes whose matches fit least; 0 where no matches are known.
 
-    Of keyframes that are placed rightly it is below 1.25: noise, blur and bare walls are in all of
+    Of keyframes that are placed rightly it is below 1.3: noise, blur and bare walls are in all of
     a video, and matches say how sure they are. Above it are those where tracking has failed.
     """
     known = residuals[np.isfinite(residuals)]

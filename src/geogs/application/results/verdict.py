@@ -20,7 +20,7 @@ MAX_FOCAL_DEVIATION = 0.15
 """Relative deviation of the focal length, by which all that is seen is too wide or too narrow: 14 %
 and less in rendered videos where it was right (docs/lens.md)."""
 MAX_MISFIT = 1.35
-"""Residual of a tenth of the keyframes over that of the others: up to 1.22 in rendered videos that
+"""Residual of a tenth of the keyframes over that of the others: up to 1.29 in rendered videos that
 were followed rightly, from 1.41 on where tracking had failed (docs/uncertainty.md)."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
