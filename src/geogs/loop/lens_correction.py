@@ -13,10 +13,10 @@ from dataclasses import replace
 
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import (
+    FOCAL_LEFT,
     SHAPES,
     STANDARD_ERRORS,
     LensBend,
-    focal_left,
     lens_prior,
 )
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
@@ -120,7 +120,7 @@ def correct_lens(
     found = FoundLens(bend.k1, bend.k2, k1, k2)
     if not is_asked:
         return found
-    open_focal = math.hypot(*of_focal, focal_left(focal, focal_deviation))
+    open_focal = math.hypot(*of_focal, FOCAL_LEFT * focal)
     return replace(found, focal=math.exp(focal), deviation_focal=open_focal)
 
 

@@ -47,24 +47,15 @@ PRIOR = 0.03, 0.05, 0.1
 STANDARD_ERRORS = 3.0
 """Standard errors of the matches' own estimate that are taken for a deviation of the lens: matches
 of different keyframes err alike, too. Errors are 1 to 7 of them in rendered rooms."""
-FOCAL_LEFT, CONTRADICTED = 0.05, 0.3
+FOCAL_LEFT = 0.05
 """What the focal length is off by after its correction, of the correction, whatever matches say: 0
-to 9 % where it was corrected by a fifth to a half from a guess; where it was corrected by more than
-two of its deviations, so that something is wrong that neither knows of, 5 to 90 % (docs/lens.md).
-"""
+to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
 
 
 def lens_prior(focal_deviation: float = 0.0) -> tuple[float, float, float]:
     """Deviations of the sizes before any match is asked, of a focal length that is known to a
     relative ``focal_deviation``, which may be a guess."""
     return max(focal_deviation, PRIOR[0]), PRIOR[1], PRIOR[2]
-
-
-def focal_left(correction: float, focal_deviation: float) -> float:
-    """Deviation that a focal length keeps when its logarithm was corrected, beside what matches
-    leave open, if it was known to a relative ``focal_deviation`` before."""
-    is_contradicted = abs(correction) > 2 * lens_prior(focal_deviation)[0]
-    return (CONTRADICTED if is_contradicted else FOCAL_LEFT) * abs(correction)
 
 
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "3 *b 2"]:
@@ -172,7 +163,7 @@ class LensEvidence:
         gain = torch.diag(prior) @ torch.linalg.inv(torch.diag(prior) + said.covariance)
         size = gain @ said.size
         left = torch.diag(prior) - gain @ torch.diag(prior)
-        left[0, 0] += focal_left(math.log(corrected), focal_deviation) ** 2
+        left[0, 0] += (FOCAL_LEFT * math.log(corrected)) ** 2
         square = left + size[:, None] * size
         depth = self.depth_moves.to(square)
         return Considered(
