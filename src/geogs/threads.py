@@ -134,9 +134,7 @@ def over_rows(kernel: Callable[[int, int], object], height: int) -> None:
 
 @functools.cache
 def _executor(threads: int, process: int) -> ThreadPoolExecutor:
-    """One pool per process: threads do not survive a fork. Made anew for each call, they took five
-    times as long on 16 cores as what was to be done, where calls are short and within each other.
-    """
+    """One pool per process: threads do not survive a fork. PyTorch has one thread in each."""
     return ThreadPoolExecutor(
         threads - 1, thread_name_prefix="geogs",
         initializer=torch.set_num_threads, initargs=(1,),
