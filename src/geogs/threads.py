@@ -51,16 +51,19 @@ def thread_map(
     results: dict[int, R] = {}
     caller, told = threading.get_ident(), 0
 
-    def one(n: int) -> None:
+    def tell() -> None:
         nonlocal told
-        results[n] = function(items[n])
-        if threading.get_ident() == caller:
-            told = len(results)
+        while told < len(results):
+            told += 1
             progress(told / len(items))
 
+    def one(n: int) -> None:
+        results[n] = function(items[n])
+        if threading.get_ident() == caller:
+            tell()
+
     run_chunks(one, len(items), worker_count())
-    if told < len(items):
-        progress(1.0)
+    tell()
     return [results[n] for n in range(len(items))]
 
 

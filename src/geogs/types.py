@@ -230,12 +230,13 @@ class Uncertainty(ShortRepr):
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""
-        if not len(self.timestamps):
-            nothing = np.full(len(timestamps), np.inf)
-            return self._of_frames(timestamps, nothing, nothing, nothing)
         known = (self.position, self.rotation, self.depth)
-        return self._of_frames(
-            timestamps, *(np.interp(timestamps, self.timestamps, c) for c in known)
+        if not len(self.timestamps):
+            position, rotation, depth = (np.full(len(timestamps), np.inf) for _ in known)
+        else:
+            position, rotation, depth = (np.interp(timestamps, self.timestamps, c) for c in known)
+        return replace(
+            self, timestamps=timestamps, position=position, rotation=rotation, depth=depth
         )
 
     def with_found(self, found: FoundFrames) -> "Uncertainty":
@@ -249,19 +250,8 @@ class Uncertainty(ShortRepr):
             (self.rotation, np.hypot(around.rotation, found.rotation)),
             (self.depth, around.depth),
         )
-        return self._of_frames(*(np.concatenate(pair)[order] for pair in columns))
-
-    def _of_frames(
-        self,
-        timestamps: Float[np.ndarray, "m"],
-        position: Float[np.ndarray, "m"],
-        rotation: Float[np.ndarray, "m"],
-        depth: Float[np.ndarray, "m"],
-    ) -> "Uncertainty":
-        """That of other frames of the same video."""
-        return replace(
-            self, timestamps=timestamps, position=position, rotation=rotation, depth=depth
-        )
+        times, position, rotation, depth = (np.concatenate(pair)[order] for pair in columns)
+        return replace(self, timestamps=times, position=position, rotation=rotation, depth=depth)
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -54,9 +54,8 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     """
     ids = tracker.segment.free
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
-    position, rotation, depth = (np.full(len(ids), np.inf) for _ in range(3))
+    position, rotation, depth, residual = (np.full(len(ids), np.inf) for _ in range(4))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
-    residual = np.full(len(ids), np.inf)
     propagated, focal, lens = np.zeros(2), 0.0, tracker.keyframes.table.lens
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
