@@ -42,7 +42,7 @@ def folder(tmp_path) -> Path:
 
 
 def finding(monkeypatch, found: FoundReadout) -> None:
-    monkeypatch.setattr(readout, "find_readout", lambda clips, camera, report, lens_is_known: found)
+    monkeypatch.setattr(readout, "find_readout", lambda clips, camera, report, lens: found)
 
 
 def test_a_readout_that_is_found_is_said_and_written(folder, tmp_path, monkeypatch):

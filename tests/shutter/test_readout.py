@@ -9,10 +9,12 @@ import pytest
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.readout import (
     CLIP,
+    LENS,
     LONGEST,
     SHORTEST,
     FoundReadout,
     _Adjusted,
+    _adjusted,
     _verdict,
     find_readout,
 )
@@ -36,8 +38,12 @@ def clips_of_points(readout: float, motion=shaken, rate: float = RATE) -> list[_
     return [_Adjusted(clip, start) for clip, start in starts if start is not None]
 
 
+def verdict(clips: list[_Adjusted], lens: tuple[float, ...] = ()) -> FoundReadout:
+    return _verdict(_adjusted(clips, FOCAL, lens), FOCAL)
+
+
 def test_points_seen_row_by_row_tell_the_readout():
-    found = _verdict(clips_of_points(TRUE), FOCAL)
+    found = verdict(clips_of_points(TRUE))
     assert found.is_believed
     assert found.readout == found.best == pytest.approx(TRUE, rel=0.05)
     assert found.error < 0.002
@@ -45,7 +51,7 @@ def test_points_seen_row_by_row_tell_the_readout():
 
 
 def test_points_seen_at_once_tell_a_global_shutter():
-    found = _verdict(clips_of_points(0.0), FOCAL)
+    found = verdict(clips_of_points(0.0))
     assert not found.is_believed
     assert found.readout == 0.0
     assert abs(found.best) < 0.001
@@ -59,7 +65,7 @@ def slowly(seed: int):
 
 @pytest.mark.parametrize("readout", [0.0, TRUE])
 def test_few_images_a_second_tell_it_where_the_motion_is_slow(readout):
-    found = _verdict(clips_of_points(readout, slowly, 5.0), FOCAL)
+    found = verdict(clips_of_points(readout, slowly, 5.0))
     print(found)
     assert found.is_believed == (readout > 0)
     assert found.best == pytest.approx(readout, abs=max(2 * found.error, 0.0005))
@@ -69,11 +75,11 @@ def test_few_images_a_second_tell_it_where_the_motion_is_slow(readout):
 @pytest.mark.parametrize(("rate", "least_error"), [(5.0, 0.003), (4.0, 0.006)])
 def test_images_too_far_apart_for_the_motion_have_a_larger_error(rate, least_error):
     """Of waves of up to 2.2 Hz they tell another velocity, in all clips alike."""
-    found = _verdict(clips_of_points(TRUE, shaken, rate), FOCAL)
+    found = verdict(clips_of_points(TRUE, shaken, rate))
     print(found)
     assert found.error > least_error
     assert abs(found.best - TRUE) < 2 * found.error
-    assert not _verdict(clips_of_points(0.0, shaken, rate), FOCAL).is_believed
+    assert not verdict(clips_of_points(0.0, shaken, rate)).is_believed
 
 
 def test_a_lens_that_nobody_told_is_not_taken_for_rows():
@@ -84,7 +90,7 @@ def test_a_lens_that_nobody_told_is_not_taken_for_rows():
     clips = [bent(a.tracks) for a in clips_of_points(TRUE)]
     starts = [first_reconstruction(clip, 1.2 / FOCAL) for clip in clips]
     seen = [_Adjusted(c, s) for c, s in zip(clips, starts, strict=True) if s is not None]
-    found, taken = (_verdict(seen, FOCAL, is_known) for is_known in (False, True))
+    found, taken = verdict(seen, (1e-4, *LENS)), verdict(seen)
     print(found, taken)
     assert found.readout == pytest.approx(TRUE, rel=0.06)
     assert abs(found.best - TRUE) < 0.5 * abs(taken.best - TRUE)
@@ -92,14 +98,14 @@ def test_a_lens_that_nobody_told_is_not_taken_for_rows():
 
 def test_a_steady_motion_tells_nothing():
     """A camera that goes by at a constant speed shears all it sees, in all images alike."""
-    found = _verdict(clips_of_points(TRUE, steady), FOCAL)
+    found = verdict(clips_of_points(TRUE, steady))
     assert not found.is_believed
     assert found.error > 0.004
 
 
 def test_few_clips_tell_nothing():
-    assert _verdict(clips_of_points(TRUE)[:2], FOCAL) == FoundReadout(clips=2)
-    assert _verdict([], FOCAL) == FoundReadout()
+    assert verdict(clips_of_points(TRUE)[:2]) == FoundReadout(clips=2)
+    assert verdict([]) == FoundReadout()
 
 
 @pytest.mark.parametrize(
@@ -126,9 +132,9 @@ def test_little_is_left_open_where_it_is_found_or_seen_to_be_none():
 def test_clips_that_disagree_are_not_believed():
     """One half has a rolling shutter, the other reads its rows the other way round."""
     both = clips_of_points(TRUE)[:2] + clips_of_points(-TRUE)[2:]
-    found = _verdict(both, FOCAL)
+    found = verdict(both)
     assert not found.is_believed
-    assert found.error > 3 * _verdict(clips_of_points(TRUE), FOCAL).error
+    assert found.error > 3 * verdict(clips_of_points(TRUE)).error
 
 
 def test_a_video_without_texture_or_images_tells_nothing():

@@ -176,10 +176,12 @@ def _with_rows_rectified(source: Source, progress: RunProgress, stop: Stop) -> S
 def _readout(
     source: Source, clips: "Iterator[list[RawFrame]]", report: Callable[[float], None]
 ) -> "FoundReadout":
-    from geogs.shutter.readout import find_readout
+    from geogs.shutter.readout import LENS, find_readout
 
-    known = not source.calibration.is_unknown_lens
-    return find_readout(clips, source.rolling_camera, report, known)
+    calibration = source.calibration
+    focal = max(calibration.focal_deviation, 1e-4)
+    lens = (focal, *LENS) if calibration.is_unknown_lens else ()
+    return find_readout(clips, source.rolling_camera, report, lens)
 
 
 def _evidence(found: "FoundReadout") -> str:

@@ -21,6 +21,9 @@ WINDOW, LEVELS = 15, 3
 """Pixels that are compared around a point; halvings at which it is looked for first."""
 RETURN = 0.3
 """Pixels by which a point may miss its place on the way back."""
+NEAR, AROUND, CONTRAST, FAINT = 8.0, 24.0, 40.0, 4.0
+"""Pixels over which the mean of the grey values is taken, and their contrast; what that becomes,
+and grey levels below which it is not raised as much."""
 _STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.003)
 _Images = Sequence[UInt8[np.ndarray, "h w"]]
 
@@ -54,7 +57,7 @@ def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | No
     images = [cv2.cvtColor(i.image, cv2.COLOR_RGB2GRAY) for i in clip if i.image is not None]
     if len(images) < len(clip):
         return None
-    pixels = followed_points(images)
+    pixels = followed_points([even(image) for image in images])
     count = np.isfinite(pixels[..., 0]).sum(axis=0)
     longest = np.sort(np.argsort(-count, kind="stable")[:MOST_POINTS])
     pixels = pixels[:, longest[count[longest] >= LEAST_IMAGES]]
@@ -118,6 +121,18 @@ def _followed(
             left, motion, here = left[kept], (there - here)[kept], there[kept]
             places[left] = here[:, 0]
         yield places
+
+
+def even(image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """The image with the same mean and contrast all over.
+
+    Light that falls off towards the corners, or changes, moves a point towards the brighter side of
+    its window: of a camera that turns, all of them with the way that they went, as rows do.
+    """
+    left = image - cv2.GaussianBlur(image.astype(np.float32), (0, 0), NEAR)
+    contrast = np.sqrt(cv2.GaussianBlur(left**2, (0, 0), AROUND))
+    evened = 128 + CONTRAST * left / (contrast + FAINT)
+    return np.clip(np.rint(evened), 0, 255).astype(np.uint8)
 
 
 def _inside(

@@ -9,7 +9,7 @@ stays the same. Errors of the matches change slowly and are hardly taken for it.
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -40,13 +40,17 @@ EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
 """Pixels of error at which a measurement counts for a quarter: of each step of the fit of a clip
 alone, as if its shutter were global, and of the stages of the fit of all together with the readout,
 with the number of their steps."""
+FOCALS: tuple[float, ...] = 1.0, 0.78
+ASSUMED = 0.2
+"""Focal lengths, times what it is taken to be, from which the adjustment begins where that leaves
+open more than such a fraction; from a wrong one, rows and lens come to explain each other."""
 LENS = 0.1, 0.2
-"""Deviations of the k1 and k2 of a lens of which nothing is known."""
+"""Standard deviations of the k1 and k2 of a lens of which nothing is known."""
 LARGEST_STEP = 0.015
 """Seconds."""
 CONVERGED = 5e-5
 """Seconds of a step at the last tolerance after which there are no more."""
-MISFIT = 1.5
+MISFIT = 2.0
 """A clip whose error is so many times the median's is left out."""
 COMMON = 0.03
 """Fraction of the error of the matches that they have in common, and that no number of them makes
@@ -119,14 +123,25 @@ class _AdjustedClips:
 
     clips: list[_Adjusted]
     shared: Float[np.ndarray, "s"]
-    """Seconds of the readout; then k1 and k2, where they are not known."""
+    """Seconds of the readout; then what is not known of the lens."""
+    lens: tuple[float, ...]
+    """Standard deviations of that before any clip is asked."""
     equations: list[ReadoutEquation] = field(default_factory=list)
-    """One of each of these clips, where it was linearised last."""
+    """One of each clip, where it was linearised last."""
 
     @property
-    def finite(self) -> list[_Adjusted]:
-        """The clips that have not diverged."""
-        return [c for c in self.clips if c.reconstruction.is_finite]
+    def fitting(self) -> list[ReadoutEquation]:
+        """Of those clips that a rigid scene explains about as well as it explains most."""
+        if not self.equations:
+            return []
+        errors = np.array([np.sqrt(p.square / max(p.weight, 1e-12)) for p in self.equations])
+        keep = np.flatnonzero(errors <= MISFIT * np.median(errors))
+        return [self.equations[k] for k in keep]
+
+    @property
+    def cost(self) -> float:
+        """Of all that was measured."""
+        return sum(part.cost for part in self.equations)
 
 
 @dataclass(frozen=True)
@@ -139,13 +154,10 @@ class _CommonReadout:
     """Images whose poses say where a point is between them."""
 
     def linearise(self, state: _AdjustedClips) -> _AdjustedClips:
-        """The clips that one readout may explain, with their equations; none if too few."""
-        clips = state.finite
-        if len(clips) < LEAST_CLIPS:
-            return _AdjustedClips([], state.shared)
+        """The clips that have not diverged, with their equations."""
+        clips = [c for c in state.clips if c.reconstruction.is_finite]
         equations = thread_map(functools.partial(self._equation, state.shared), clips)
-        clips, equations = _fitting(clips, equations)
-        return _AdjustedClips(clips, state.shared, equations)
+        return replace(state, clips=clips, equations=equations)
 
     def _equation(self, shared: Float[np.ndarray, "s"], clip: _Adjusted) -> ReadoutEquation:
         return readout_equation(
@@ -156,26 +168,27 @@ class _CommonReadout:
         self, state: _AdjustedClips, linear: _AdjustedClips, damping: float
     ) -> Step[_AdjustedClips] | None:
         """All clips after the step of the readout, which is limited."""
-        if not linear.clips:
+        parts, shared = linear.fitting, state.shared
+        if not parts:
             return None
-        parts, shared = linear.equations, state.shared
-        known = _known_of_lens(shared)
+        known = _known_of_lens(state.lens)
         gradient = sum(p.gradient for p in parts) - known @ shared
         step = np.linalg.solve(_curvature(parts) + known, gradient)
         readout = float(np.clip(step[0], -LARGEST_STEP, LARGEST_STEP)) + shared[0]
         step[0] = float(np.clip(readout, -1.5 * LONGEST, 1.5 * LONGEST)) - shared[0]
         moved = [
             _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
-            for c, part in zip(linear.clips, parts, strict=True)
+            for c, part in zip(linear.clips, linear.equations, strict=True)
         ]
-        return Step(_AdjustedClips(moved, shared + step, parts), abs(float(step[0])))
+        after = replace(linear, clips=moved, shared=shared + step)
+        return Step(after, abs(float(step[0])))
 
 
 def find_readout(
     clips: Iterable[Sequence[Image]],
     camera: RollingCamera,
     report: Report = lambda fraction: None,
-    lens_is_known: bool = True,
+    lens: tuple[float, ...] = (),
 ) -> FoundReadout:
     """Find the readout with which clips of a video fit best; 0 unless it is clearly better.
 
@@ -184,24 +197,30 @@ def find_readout(
             the points of several are followed at a time.
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
-        lens_is_known: else its k1 and k2 are estimated, too; they would be taken for rows.
+        lens: standard deviations of a lens that is not known: of the relative focal length, k1 and
+            k2, which are estimated, too. They would be taken for rows, and rows for them.
     """
-    adjusted, found = list[_Adjusted](), FoundReadout()
+    found = FoundReadout()
+    begun = {factor: list[_Adjusted]() for factor in FOCALS if _is_assumed(lens) or factor == 1}
     focal, left, seen = camera.camera.fx, iter(clips), 0
     for enough in (*ENOUGH_CLIPS, CLIPS):
         group = list(itertools.islice(left, enough - seen))
         done = functools.partial(_reported, report, seen, len(group))
-        starts = thread_map(functools.partial(_started, camera=camera), group, done)
-        adjusted += [start for start in starts if start is not None]
+        followed = thread_map(functools.partial(_followed, camera=camera), group, done)
+        tracks = [clip for clip in followed if clip is not None]
         seen += len(group)
-        if seen < enough:
+        if seen < enough and not group:
             break
-        if enough in ENOUGH_CLIPS:
-            found = _verdict(adjusted, focal, lens_is_known)
-            if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
-                break
+        for factor, starts in begun.items():
+            of_clip = functools.partial(_started, focal=focal, factor=factor)
+            starts += [start for start in thread_map(of_clip, tracks) if start is not None]
+        ends = {factor: _adjusted(starts, focal, lens, factor) for factor, starts in begun.items()}
+        best = min(ends, key=lambda factor: ends[factor].cost)
+        begun, found = {best: begun[best]}, _verdict(ends[best], focal)
+        if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
+            break
     report(1.0)
-    return found if found.clips == len(adjusted) else _verdict(adjusted, focal, lens_is_known)
+    return found
 
 
 def _reported(report: Report, before: int, group: int, fraction: float) -> None:
@@ -209,23 +228,25 @@ def _reported(report: Report, before: int, group: int, fraction: float) -> None:
     report(min(1.0, (before + fraction * group) / CLIPS))
 
 
-def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
-    """A clip whose points are followed and whose poses are known roughly."""
+def _followed(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | None:
+    """The points of a clip; none where its images are too few or too far apart."""
     intervals = np.diff([image.timestamp for image in clip])
     if len(clip) < LEAST_IMAGES or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
         return None
-    tracks = clip_tracks(clip, camera)
-    if tracks is None:
-        return None
-    focal = camera.camera.fx
-    start = first_reconstruction(tracks, FIRST_TOLERANCE / focal)
+    return clip_tracks(clip, camera)
+
+
+def _started(tracks: ClipTracks, focal: float, factor: float) -> _Adjusted | None:
+    """A clip whose poses are known roughly, by so many times the focal length."""
+    scaled = replace(tracks, plane=tracks.plane / factor)
+    start = first_reconstruction(scaled, FIRST_TOLERANCE / (factor * focal))
     if start is None:
         return None
     for tolerance in EARLY_TOLERANCES:
         if not start.is_finite:
             return None
         equation = functools.partial(
-            readout_equation, tracks, shared=np.zeros(1), tolerance=tolerance / focal
+            readout_equation, scaled, shared=np.zeros(1), tolerance=tolerance / (factor * focal)
         )
         start = minimise(start, equation, _global_shutter_step, Policy(1)).state
     return _Adjusted(tracks, start)
@@ -237,36 +258,37 @@ def _global_shutter_step(
     return Step(equation.stepped(at, np.zeros(1)))
 
 
-def _verdict(clips: list[_Adjusted], focal: float, lens_is_known: bool = True) -> FoundReadout:
-    """The readout that fits all clips best, and whether it is believed."""
-    state = _AdjustedClips(clips, np.zeros(1 if lens_is_known else 1 + len(LENS)))
+def _is_assumed(lens: tuple[float, ...]) -> bool:
+    return bool(lens) and lens[0] > ASSUMED
+
+
+def _adjusted(
+    starts: list[_Adjusted], focal: float, lens: tuple[float, ...], factor: float = 1.0
+) -> _AdjustedClips:
+    """All clips with the readout that fits them best, begun by so many times the focal length."""
+    shared = np.zeros(1 + len(lens))
+    shared[1:2] = factor - 1
+    state = _AdjustedClips(starts, shared, lens)
     for tolerance, steps in TOLERANCES:
         is_last = tolerance == TOLERANCES[-1][0]
         policy = Policy(steps, tolerance=CONVERGED if is_last else 0.0)
         common = _CommonReadout(tolerance / focal)
-        solution = minimise(state, common.linearise, common.step, policy)
-        state = solution.state
-        if not solution.finite:
-            return FoundReadout(clips=len(state.finite))
-    readout, parts = float(state.shared[0]), state.equations
+        state = minimise(state, common.linearise, common.step, policy).state
+    return state
+
+
+def _verdict(state: _AdjustedClips, focal: float) -> FoundReadout:
+    """The readout by which clips fit best, and whether it is believed."""
+    readout, parts, lens = float(state.shared[0]), state.fitting, state.lens
     fewer = _CommonReadout(TOLERANCES[-1][0] / focal, FEWER)
     by_fewer = fewer.step(state, fewer.linearise(state), 0.0)
     if len(parts) < LEAST_CLIPS or by_fewer is None:
         return FoundReadout(clips=len(parts))
-    error = float(np.hypot(_standard_error(parts, state.shared), TREMOR * readout))
+    error = float(np.hypot(_standard_error(parts, lens), TREMOR * readout))
     error = float(np.hypot(error, BETWEEN * by_fewer.size**2 / max(abs(readout), error)))
     confident = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = confident and SHORTEST <= readout <= LONGEST
-    return FoundReadout(readout if believed else 0.0, readout, error, len(state.clips))
-
-
-def _fitting(
-    clips: list[_Adjusted], parts: list[ReadoutEquation]
-) -> tuple[list[_Adjusted], list[ReadoutEquation]]:
-    """Those clips that a rigid scene explains about as well as it explains most."""
-    errors = np.array([np.sqrt(part.square / max(part.weight, 1e-12)) for part in parts])
-    keep = np.flatnonzero(errors <= MISFIT * np.median(errors)).tolist()
-    return [clips[k] for k in keep], [parts[k] for k in keep]
+    return FoundReadout(readout if believed else 0.0, readout, error, len(parts))
 
 
 def _curvature(parts: Sequence[ReadoutEquation]) -> Float[np.ndarray, "s s"]:
@@ -275,17 +297,19 @@ def _curvature(parts: Sequence[ReadoutEquation]) -> Float[np.ndarray, "s s"]:
     return total + 1e-12 * np.eye(len(total))
 
 
-def _known_of_lens(shared: Float[np.ndarray, "s"]) -> Float[np.ndarray, "s s"]:
-    """Information on its k1 and k2 before any clip is asked."""
-    return np.diag([0.0, *(1 / np.square(LENS[: len(shared) - 1]))])
+def _known_of_lens(lens: tuple[float, ...]) -> Float[np.ndarray, "s s"]:
+    """Information on it before any clip is asked."""
+    return np.diag([0.0, *(1 / np.square(lens))])
 
 
-def _standard_error(parts: Sequence[ReadoutEquation], shared: Float[np.ndarray, "s"]) -> float:
-    """Seconds of the readout by what clips disagree, and what their matches have in common."""
-    of_readout = np.linalg.inv(_curvature(parts) + _known_of_lens(shared))[0]
+def _standard_error(parts: Sequence[ReadoutEquation], lens: tuple[float, ...]) -> float:
+    """Seconds of the readout by what clips disagree, what their matches have in common, and what
+    the lens may be beside what they say of it."""
+    known = _known_of_lens(lens)
+    of_readout = np.linalg.inv(_curvature(parts) + known)[0]
     moves = np.array([part.gradient @ of_readout for part in parts])
     count = len(parts)
     spread = np.sqrt((moves**2).sum() * count / (count - 1))
     # A readout's effect on a match against the error of one, root mean squares.
     common = COMMON * np.sqrt(sum(part.square for part in parts) * of_readout[0])
-    return float(np.hypot(spread, common))
+    return float(np.sqrt(spread**2 + common**2 + of_readout @ known @ of_readout))

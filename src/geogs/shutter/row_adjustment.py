@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from geogs.geometry.robust import geman_mcclure_weight
+from geogs.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
 from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import ClipTracks
 
-POWERS = 2, 4
-"""Of the distance from the axis, times which a point seems off it by OpenCV's k1 and k2."""
+POWERS = 0, 2, 4
+"""Of the distance from the axis, times which a point seems off it by a longer focal length, and by
+OpenCV's k1 and k2."""
 NODES = 5
 """Images whose poses say where a point is between them. Fewer make little of quick tremor and the
 readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
@@ -29,7 +30,8 @@ DAMPING = 1e-6
 class ReadoutEquation:
     """What a clip says of the readout, whatever its poses and points.
 
-    Of the readout in seconds and, where they are not known, k1 and k2 of the lens.
+    Of the readout in seconds and, where they are not known, the relative change of the focal
+    length, k1 and k2.
     """
 
     curvature: Float[np.ndarray, "s s"]
@@ -40,6 +42,8 @@ class ReadoutEquation:
     """Sum over all that was measured, in the unit of the curvature's error^2."""
     square: float
     """Weighted sum of squared errors."""
+    cost: float
+    """Geman and McClure's: measurements, of each the less the better it fits."""
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
     """Steps of poses and points, the readout and the lens being fixed."""
     by_shared: list[tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]]
@@ -67,7 +71,8 @@ def readout_equation(
     Args:
         tracks: what is seen.
         at: poses and points.
-        shared: the readout, seconds; then k1 and k2, where they are not known.
+        shared: the readout, seconds; then, where they are not known, by which fraction the focal
+            length is longer than it is taken to be, k1 and k2.
         tolerance: error at which a measurement counts for a quarter, fraction of the focal length.
         around: images whose poses say where a point is between them.
     """
@@ -83,7 +88,8 @@ def readout_equation(
     for size, shape in zip(sizes, shapes, strict=True):
         error = error - size * shape
     square = (error**2).sum(axis=-1)
-    weight = tracks.seen * geman_mcclure_weight(square / tolerance**2) / tolerance**2
+    relative = tracks.seen * square / tolerance**2
+    weight = tracks.seen * geman_mcclure_weight(relative) / tolerance**2
     root = np.sqrt(weight)
     by_own_pose, by_own_point = at.derivatives()
     by_poses = np.empty((*tracks.seen.shape, 2, around, 6))
@@ -96,7 +102,11 @@ def readout_equation(
     joined = np.concatenate([by_poses.reshape(*tracks.seen.shape, 2, -1), other], axis=-1)
     # The middle pose stays where it is.
     free = np.arange(count) != tracks.middle
-    total = float(weight.sum()), float((weight * square).sum())
+    total = (
+        float(weight.sum()),
+        float((weight * square).sum()),
+        float(geman_mcclure_cost(relative).sum()),
+    )
     return _eliminated(joined, by_point, free, nodes, *total)
 
 
@@ -107,6 +117,7 @@ def _eliminated(
     around: Int[np.ndarray, "k j"],
     weight: float,
     square: float,
+    cost: float,
 ) -> ReadoutEquation:
     """The equation that is left without points, which each see only their own, and poses.
 
@@ -118,6 +129,7 @@ def _eliminated(
         around: the nodes of each image.
         weight: of the result.
         square: of the result.
+        cost: of the result.
     """
     count, n = joined.shape[:2]
     each = np.swapaxes(by_point, 0, 1).reshape(n, -1, 3)
@@ -151,7 +163,7 @@ def _eliminated(
         steps.append((all_poses, points))
     left = H[own:, own:] - H[own:, :own] @ following
     by_shared = [(-poses, -points) for poses, points in steps[1:]]
-    return ReadoutEquation(left[1:, 1:], left[0, 1:], weight, square, steps[0], by_shared)
+    return ReadoutEquation(left[1:, 1:], left[0, 1:], weight, square, cost, steps[0], by_shared)
 
 
 def _blended(
