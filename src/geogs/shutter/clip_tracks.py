@@ -15,6 +15,8 @@ MOST_POINTS = 160
 LEAST_POINTS = 30
 LEAST_IMAGES = 8
 """That a point is followed through."""
+LEAST_SEEN = 24
+"""Points of an image that counts."""
 POINTS, QUALITY, APART = 250, 0.005, 8
 """Corners, at most; the least strength of one against the strongest; pixels between two."""
 WINDOW, LEVELS = 15, 3
@@ -44,7 +46,7 @@ class ClipTracks:
     @property
     def middle(self) -> int:
         """Position of the image that all points are seen in."""
-        return len(self.times) // 2
+        return int(np.abs(self.times).argmin())
 
 
 def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | None:
@@ -63,12 +65,17 @@ def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | No
     pixels = pixels[:, longest[count[longest] >= LEAST_IMAGES]]
     if pixels.shape[1] < LEAST_POINTS:
         return None
+    # Where a fast turn leaves few of them, they do not tell a pose.
+    enough = np.isfinite(pixels[..., 0]).sum(axis=1) >= LEAST_SEEN
+    pixels, kept = pixels[enough], [i for i, e in zip(clip, enough, strict=True) if e]
+    if len(kept) < LEAST_IMAGES:
+        return None
     seen = np.isfinite(pixels[..., 0])
     plane, line_times = np.zeros_like(pixels), np.zeros(seen.shape)
     rays = camera.rays(pixels[seen])
     plane[seen], line_times[seen] = rays[:, :2] / rays[:, 2:], camera.line_times(pixels[seen])
-    times = np.array([image.timestamp for image in clip])
-    return ClipTracks(plane, line_times, seen, times - times[len(times) // 2])
+    times = np.array([image.timestamp for image in kept])
+    return ClipTracks(plane, line_times, seen, times - clip[len(clip) // 2].timestamp)
 
 
 def followed_points(images: _Images) -> Float[np.ndarray, "k n 2"]:

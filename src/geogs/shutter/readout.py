@@ -50,8 +50,9 @@ LARGEST_STEP = 0.015
 """Seconds."""
 CONVERGED = 5e-5
 """Seconds of a step at the last tolerance after which there are no more."""
-MISFIT = 2.0
-"""A clip whose error is so many times the median's is left out."""
+MISFIT, UNEXPLAINED = 3.0, 0.5
+"""A clip whose cost is so many times the median's is left out, and in the end one with a larger one
+than this: no readout explains it."""
 COMMON = 0.03
 """Fraction of the error of the matches that they have in common, and that no number of them makes
 less."""
@@ -134,9 +135,8 @@ class _AdjustedClips:
         """Of those clips that a rigid scene explains about as well as it explains most."""
         if not self.equations:
             return []
-        errors = np.array([np.sqrt(p.square / max(p.weight, 1e-12)) for p in self.equations])
-        keep = np.flatnonzero(errors <= MISFIT * np.median(errors))
-        return [self.equations[k] for k in keep]
+        most = MISFIT * np.median([part.cost for part in self.equations])
+        return [part for part in self.equations if part.cost <= most]
 
     @property
     def cost(self) -> float:
@@ -279,7 +279,8 @@ def _adjusted(
 
 def _verdict(state: _AdjustedClips, focal: float) -> FoundReadout:
     """The readout by which clips fit best, and whether it is believed."""
-    readout, parts, lens = float(state.shared[0]), state.fitting, state.lens
+    readout, lens = float(state.shared[0]), state.lens
+    parts = [part for part in state.fitting if part.cost <= UNEXPLAINED]
     fewer = _CommonReadout(TOLERANCES[-1][0] / focal, FEWER)
     by_fewer = fewer.step(state, fewer.linearise(state), 0.0)
     if len(parts) < LEAST_CLIPS or by_fewer is None:

@@ -22,6 +22,9 @@ NODES = 5
 """Images whose poses say where a point is between them. Fewer make little of quick tremor and the
 readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
 the poses' own errors, which say that nothing is sheared, where the true motion is steady."""
+AHEAD = 0.2
+"""Depth, in that of the middle image, below which a point that is seen tells nothing: it cannot be
+there, and where it is thought to be next to the camera it would outweigh all others."""
 DAMPING = 1e-6
 """Fraction that is added to the curvatures of poses and points."""
 
@@ -43,7 +46,7 @@ class ReadoutEquation:
     square: float
     """Weighted sum of squared errors."""
     cost: float
-    """Geman and McClure's: measurements, of each the less the better it fits."""
+    """Geman and McClure's, the mean over all measurements: 0 where they fit, 1 where none does."""
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
     """Steps of poses and points, the readout and the lens being fixed."""
     by_shared: list[tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]]
@@ -89,7 +92,8 @@ def readout_equation(
         error = error - size * shape
     square = (error**2).sum(axis=-1)
     relative = tracks.seen * square / tolerance**2
-    weight = tracks.seen * geman_mcclure_weight(relative) / tolerance**2
+    ahead = (at.in_cameras()[..., 2] > AHEAD)[nodes].all(axis=1)
+    weight = tracks.seen * ahead * geman_mcclure_weight(relative) / tolerance**2
     root = np.sqrt(weight)
     by_own_pose, by_own_point = at.derivatives()
     by_poses = np.empty((*tracks.seen.shape, 2, around, 6))
@@ -105,7 +109,7 @@ def readout_equation(
     total = (
         float(weight.sum()),
         float((weight * square).sum()),
-        float(geman_mcclure_cost(relative).sum()),
+        float(geman_mcclure_cost(relative)[tracks.seen].mean()),
     )
     return _eliminated(joined, by_point, free, nodes, *total)
 
