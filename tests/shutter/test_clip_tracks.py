@@ -3,7 +3,10 @@
 import cv2
 import numpy as np
 
-from geogs.shutter.clip_tracks import followed_points
+from geogs.geometry.camera import Camera
+from geogs.shutter.clip_tracks import LEAST_SEEN, clip_tracks, even, followed_points
+from geogs.shutter.rolling_camera import RollingCamera
+from geogs.types import Frame
 
 SIZE = 160, 120
 STEP = np.array([[1.004, 0.012, 0.8], [-0.002, 1.002, -0.5]])
@@ -54,3 +57,37 @@ def test_what_is_lost_stays_lost():
 
 def test_an_image_without_texture_has_no_points():
     assert followed_points([np.full((60, 80), 99, np.uint8)] * 3).shape == (3, 0, 2)
+
+
+def test_light_that_falls_off_moves_no_points():
+    """It stays with the camera, while the pattern moves through it."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    light = 1 - 0.6 * np.hypot(u / SIZE[0] - 0.5, v / SIZE[1] - 0.5)
+    dimmed = [np.rint(image * light).astype(np.uint8) for image in images(15)]
+    clear = followed_points([even(image) for image in images(15)])
+
+    def moved(seen: np.ndarray) -> float:
+        """Pixels by which the light has moved the points, where the last image shows them."""
+        both = np.isfinite(seen[14, :, 0])
+        true = seen[7][both] @ after(7)[:2, :2].T + after(7)[:2, 2]
+        return float(np.sqrt(np.square(seen[14][both] - true).mean()))
+
+    as_it_is, evened = moved(followed_points(dimmed)), moved(followed_points([*map(even, dimmed)]))
+    print(as_it_is, evened, moved(clear))
+    assert evened < 0.7 * as_it_is
+    assert evened < 1.2 * moved(clear)
+
+
+def test_an_image_that_shows_few_points_is_left_out():
+    clip = [Frame(k, k / 30, np.repeat(i[..., None], 3, 2)) for k, i in enumerate(images(12))]
+    camera = RollingCamera(Camera(150.0, 150.0, 79.5, 59.5, *SIZE))
+    whole = clip_tracks(clip, camera)
+    grey = np.full_like(clip[0].image, 128)
+    clip[:3] = [Frame(k, k / 30, grey) for k in range(3)]
+    shorter = clip_tracks(clip, camera)
+    assert whole is not None
+    assert shorter is not None
+    assert (len(whole.times), whole.middle) == (12, 6)
+    assert (len(shorter.times), shorter.middle) == (9, 3)
+    assert shorter.seen.sum(axis=1).min() >= LEAST_SEEN
+    np.testing.assert_allclose(shorter.times, (np.arange(3, 12) - 6) / 30, atol=1e-12)

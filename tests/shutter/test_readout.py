@@ -15,6 +15,7 @@ from geogs.shutter.readout import (
     FoundReadout,
     _Adjusted,
     _adjusted,
+    _started,
     _verdict,
     find_readout,
 )
@@ -94,6 +95,30 @@ def test_a_lens_that_nobody_told_is_not_taken_for_rows():
     print(found, taken)
     assert found.readout == pytest.approx(TRUE, rel=0.06)
     assert abs(found.best - TRUE) < 0.5 * abs(taken.best - TRUE)
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.1])
+def test_a_focal_length_that_nobody_told_is_not_taken_for_rows(factor):
+    """Where what it is taken to be is as much too short or too long."""
+    wrong = [replace(a.tracks, plane=a.tracks.plane / factor) for a in clips_of_points(TRUE)]
+    starts = [_started(clip, factor * FOCAL, 1.0) for clip in wrong]
+    seen = [start for start in starts if start is not None]
+    found, taken = verdict(seen, (0.35, *LENS)), verdict(seen)
+    print(found, taken)
+    assert found.readout == pytest.approx(TRUE, rel=0.06)
+    assert abs(found.best - TRUE) < 0.5 * abs(taken.best - TRUE)
+
+
+def test_what_no_readout_explains_tells_nothing():
+    rng = np.random.default_rng(0)
+    shaken_up = [
+        replace(
+            a,
+            tracks=replace(a.tracks, plane=a.tracks.plane + rng.normal(0, 5 / FOCAL, (18, 35, 2))),
+        )
+        for a in clips_of_points(TRUE)
+    ]
+    assert verdict(shaken_up) == FoundReadout()
 
 
 def test_a_steady_motion_tells_nothing():

@@ -116,3 +116,16 @@ def test_steps_lower_the_cost_and_end_where_the_readout_is_right(tracks, start):
         costs.append(part.square)
     assert readout[0] == pytest.approx(READOUT, abs=0.004)
     assert costs[-1] < 0.5 * costs[0]
+
+
+def test_a_point_that_seems_to_be_next_to_the_camera_does_not_outweigh_the_others(tracks, start):
+    plain = readout_equation(tracks, start, np.zeros(1), TOLERANCE)
+    k = tracks.middle + 3
+    beside = start.points.copy()
+    # So near that it is a thousandth of its depth before the camera there.
+    x, y, _ = beside[0]
+    beside[0, 2] = (1e-3 - start.R[k, 2] @ [x, y, 1]) / start.t[k, 2]
+    found = readout_equation(tracks, replace(start, points=beside), np.zeros(1), 50 * TOLERANCE)
+    wide = readout_equation(tracks, start, np.zeros(1), 50 * TOLERANCE)
+    assert plain.cost < 1
+    assert found.curvature[0, 0] < 1.2 * wide.curvature[0, 0]
