@@ -59,7 +59,7 @@ def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | No
     images = [cv2.cvtColor(i.image, cv2.COLOR_RGB2GRAY) for i in clip if i.image is not None]
     if len(images) < len(clip):
         return None
-    pixels = followed_points([even(image) for image in images])
+    pixels = followed_points(images)
     count = np.isfinite(pixels[..., 0]).sum(axis=0)
     longest = np.sort(np.argsort(-count, kind="stable")[:MOST_POINTS])
     pixels = pixels[:, longest[count[longest] >= LEAST_IMAGES]]
@@ -87,26 +87,30 @@ def followed_points(images: _Images) -> Float[np.ndarray, "k n 2"]:
     that is the point whose places are returned. The corner itself would be off in one direction all
     over a floor, by a tenth of a pixel and more.
     """
-    middle = len(images) // 2
-    corners = cv2.goodFeaturesToTrack(images[middle], POINTS, QUALITY, APART)
+    middle, evened = len(images) // 2, [even(image) for image in images]
+    corners = cv2.goodFeaturesToTrack(evened[middle], POINTS, QUALITY, APART)
     if corners is None:
         return np.zeros((len(images), 0, 2))
     corners = corners[_inside(corners[:, 0], images[middle])]
-    to_centre = _amid_gradients(images[middle], corners[:, 0])
+    to_centre = _amid_gradients(evened[middle], corners[:, 0])
     places = np.full((len(images), len(corners), 2), np.nan)
     places[middle] = corners[:, 0] + to_centre
     for way in (range(middle, len(images)), range(middle, -1, -1)):
-        for k, seen in zip(way[1:], _followed(images, corners, way), strict=True):
+        for k, seen in zip(way[1:], _followed(images, evened, corners, way), strict=True):
             places[k] = seen + to_centre
     return places
 
 
 def _followed(
-    images: _Images, corners: Float32[np.ndarray, "n 1 2"], way: Sequence[int]
+    images: _Images, evened: _Images, corners: Float32[np.ndarray, "n 1 2"], way: Sequence[int]
 ) -> Iterable[Float[np.ndarray, "n 2"]]:
-    """Places of the corners of the first image of a way in all others."""
+    """Places of the corners of the first image of a way in all others.
+
+    From image to image they are looked for in the images as they are, whose coarse shapes tell how
+    far they move; where they are, the ``evened`` ones say.
+    """
     window, start = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
-    first, here, motion = images[way[0]], corners, np.zeros_like(corners)
+    first, here, motion = evened[way[0]], corners, np.zeros_like(corners)
     left = np.arange(len(corners))  # those that are not lost yet
     for before, after in itertools.pairwise(way):
         places = np.full((len(corners), 2), np.nan)
@@ -117,10 +121,10 @@ def _followed(
                 _STEPS, start,
             )  # fmt: skip
             there, found, _ = cv2.calcOpticalFlowPyrLK(
-                first, images[after], from_first, there, None, None, window, 0, _STEPS, start
+                first, evened[after], from_first, there, None, None, window, 0, _STEPS, start
             )
             back, returned, _ = cv2.calcOpticalFlowPyrLK(
-                images[after], first, there, from_first.copy(), None, None, window, 0, _STEPS, start
+                evened[after], first, there, from_first.copy(), None, None, window, 0, _STEPS, start
             )
             missed = np.linalg.norm((back - from_first)[:, 0], axis=1) > RETURN
             kept = (found[:, 0] != 0) & (returned[:, 0] != 0) & ~missed
