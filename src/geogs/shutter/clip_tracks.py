@@ -23,9 +23,9 @@ WINDOW, LEVELS = 15, 3
 """Pixels that are compared around a point; halvings at which it is looked for first."""
 RETURN = 0.3
 """Pixels by which a point may miss its place on the way back."""
-NEAR, AROUND, CONTRAST, FAINT = 8.0, 24.0, 40.0, 4.0
-"""Pixels over which the mean of the grey values is taken, and their contrast; what that becomes,
-and grey levels below which it is not raised as much."""
+NEAR, AROUND, CONTRAST, FAINT = 27, 83, 40.0, 4.0
+"""Sides of the squares over which the mean of the grey values is taken, and their contrast; what
+that becomes, and grey levels below which it is not raised as much."""
 _STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.003)
 _Images = Sequence[UInt8[np.ndarray, "h w"]]
 
@@ -140,10 +140,11 @@ def even(image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     Light that falls off towards the corners, or changes, moves a point towards the brighter side of
     its window: of a camera that turns, all of them with the way that they went, as rows do.
     """
-    left = image - cv2.GaussianBlur(image.astype(np.float32), (0, 0), NEAR)
-    contrast = np.sqrt(cv2.GaussianBlur(left**2, (0, 0), AROUND))
-    evened = 128 + CONTRAST * left / (contrast + FAINT)
-    return np.clip(np.rint(evened), 0, 255).astype(np.uint8)
+    grey = image.astype(np.float32)
+    left = grey - cv2.blur(grey, (NEAR, NEAR))
+    contrast = cv2.sqrt(cv2.blur(left * left, (AROUND, AROUND)))
+    evened = 128.5 + CONTRAST * left / (contrast + FAINT)
+    return np.clip(evened, 0, 255).astype(np.uint8)
 
 
 def _inside(
