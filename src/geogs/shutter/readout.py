@@ -139,9 +139,9 @@ class _AdjustedClips:
         return [part for part in self.equations if part.cost <= most]
 
     @property
-    def cost(self) -> float:
-        """Of all that was measured."""
-        return sum(part.cost for part in self.equations)
+    def explained(self) -> float:
+        """How much of what the clips measured fits, each clip being worth one at most."""
+        return sum(1 - part.cost for part in self.equations)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def find_readout(
             of_clip = functools.partial(_started, focal=focal, factor=factor)
             starts += [start for start in thread_map(of_clip, tracks) if start is not None]
         ends = {factor: _adjusted(starts, focal, lens, factor) for factor, starts in begun.items()}
-        best = min(ends, key=lambda factor: ends[factor].cost)
+        best = max(ends, key=lambda factor: ends[factor].explained)
         begun, found = {best: begun[best]}, _verdict(ends[best], focal)
         if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
             break
