@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geogs.geometry.distortion import USUAL_BEND
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.readout import (
     CLIP,
-    LENS,
     LONGEST,
     SHORTEST,
     FoundReadout,
@@ -91,7 +91,7 @@ def test_a_lens_that_nobody_told_is_not_taken_for_rows():
     clips = [bent(a.tracks) for a in clips_of_points(TRUE)]
     starts = [first_reconstruction(clip, 1.2 / FOCAL) for clip in clips]
     seen = [_Adjusted(c, s) for c, s in zip(clips, starts, strict=True) if s is not None]
-    found, taken = verdict(seen, (1e-4, *LENS)), verdict(seen)
+    found, taken = verdict(seen, (1e-4, *USUAL_BEND)), verdict(seen)
     print(found, taken)
     assert found.readout == pytest.approx(TRUE, rel=0.06)
     assert abs(found.best - TRUE) < 0.5 * abs(taken.best - TRUE)
@@ -103,7 +103,7 @@ def test_a_focal_length_that_nobody_told_is_not_taken_for_rows(factor):
     wrong = [replace(a.tracks, plane=a.tracks.plane / factor) for a in clips_of_points(TRUE)]
     starts = [_started(clip, factor * FOCAL, 1.0) for clip in wrong]
     seen = [start for start in starts if start is not None]
-    found, taken = verdict(seen, (0.35, *LENS)), verdict(seen)
+    found, taken = verdict(seen, (0.35, *USUAL_BEND)), verdict(seen)
     print(found, taken)
     assert found.readout == pytest.approx(TRUE, rel=0.06)
     assert abs(found.best - TRUE) < 0.5 * abs(taken.best - TRUE)

@@ -176,11 +176,12 @@ def _with_rows_rectified(source: Source, progress: RunProgress, stop: Stop) -> S
 def _readout(
     source: Source, clips: "Iterator[list[RawFrame]]", report: Callable[[float], None]
 ) -> "FoundReadout":
-    from geogs.shutter.readout import LENS, find_readout
+    from geogs.geometry.distortion import USUAL_BEND
+    from geogs.shutter.readout import find_readout
 
     calibration = source.calibration
-    focal = max(calibration.focal_deviation, 1e-4)
-    lens = (focal, *LENS) if calibration.is_unknown_lens else ()
+    focal = max(calibration.focal_deviation, 1e-4)  # 0 where somebody said it
+    lens = (focal, *USUAL_BEND) if calibration.is_unknown_lens else ()
     return find_readout(clips, source.rolling_camera, report, lens)
 
 

@@ -17,6 +17,8 @@ from jaxtyping import Float
 from geogs.geometry.camera import Camera
 
 LensModel = Literal["polynomial", "fisheye"]
+USUAL_BEND = 0.1, 0.2
+"""Standard deviations of the k1 and k2 of a polynomial lens of which nothing is known."""
 RESAMPLING = cv2.INTER_LANCZOS4
 """How images are straightened. OpenCV's cubic (a = -3/4, which does not keep a slope) would show
 things up to 0.04 pixels beside their place, most where that lies a quarter from a pixel, and rows

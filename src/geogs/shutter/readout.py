@@ -40,12 +40,10 @@ EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
 """Pixels of error at which a measurement counts for a quarter: of each step of the fit of a clip
 alone, as if its shutter were global, and of the stages of the fit of all together with the readout,
 with the number of their steps."""
-FOCALS: tuple[float, ...] = 1.0, 0.78
-ASSUMED = 0.2
-"""Focal lengths, times what it is taken to be, from which the adjustment begins where that leaves
-open more than such a fraction; from a wrong one, rows and lens come to explain each other."""
-LENS = 0.1, 0.2
-"""Standard deviations of the k1 and k2 of a lens of which nothing is known."""
+SHORTER, ASSUMED = 0.78, 0.2
+"""Another focal length from which the adjustment begins, times what it is taken to be, where that
+leaves open more than such a fraction; from a wrong one, rows and lens come to explain each other.
+"""
 LARGEST_STEP = 0.015
 """Seconds."""
 CONVERGED = 5e-5
@@ -201,7 +199,9 @@ def find_readout(
             k2, which are estimated, too. They would be taken for rows, and rows for them.
     """
     found = FoundReadout()
-    begun = {factor: list[_Adjusted]() for factor in FOCALS if _is_assumed(lens) or factor == 1}
+    begun = {1.0: list[_Adjusted]()}
+    if lens and lens[0] > ASSUMED:
+        begun[SHORTER] = []
     focal, left, seen = camera.camera.fx, iter(clips), 0
     for enough in (*ENOUGH_CLIPS, CLIPS):
         group = list(itertools.islice(left, enough - seen))
@@ -256,10 +256,6 @@ def _global_shutter_step(
     at: ClipReconstruction, equation: ReadoutEquation, damping: float
 ) -> Step[ClipReconstruction]:
     return Step(equation.stepped(at, np.zeros(1)))
-
-
-def _is_assumed(lens: tuple[float, ...]) -> bool:
-    return bool(lens) and lens[0] > ASSUMED
 
 
 def _adjusted(

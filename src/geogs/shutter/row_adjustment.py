@@ -41,10 +41,8 @@ class ReadoutEquation:
     """Curvature of the cost in these, poses and points being what is then best."""
     gradient: Float[np.ndarray, "s"]
     """By how much the cost falls at first."""
-    weight: float
-    """Sum over all that was measured, in the unit of the curvature's error^2."""
     square: float
-    """Weighted sum of squared errors."""
+    """Weighted sum of squared errors of all that was measured."""
     cost: float
     """Geman and McClure's, the mean over all measurements: 0 where they fit, 1 where none does."""
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
@@ -106,12 +104,8 @@ def readout_equation(
     joined = np.concatenate([by_poses.reshape(*tracks.seen.shape, 2, -1), other], axis=-1)
     # The middle pose stays where it is.
     free = np.arange(count) != tracks.middle
-    total = (
-        float(weight.sum()),
-        float((weight * square).sum()),
-        float(geman_mcclure_cost(relative)[tracks.seen].mean()),
-    )
-    return _eliminated(joined, by_point, free, nodes, *total)
+    cost = float(geman_mcclure_cost(relative)[tracks.seen].mean())
+    return _eliminated(joined, by_point, free, nodes, float((weight * square).sum()), cost)
 
 
 def _eliminated(
@@ -119,7 +113,6 @@ def _eliminated(
     by_point: Float[np.ndarray, "k n 2 3"],
     free: Bool[np.ndarray, "k"],
     around: Int[np.ndarray, "k j"],
-    weight: float,
     square: float,
     cost: float,
 ) -> ReadoutEquation:
@@ -131,7 +124,6 @@ def _eliminated(
         by_point: by the point.
         free: of all images, whether their pose is free.
         around: the nodes of each image.
-        weight: of the result.
         square: of the result.
         cost: of the result.
     """
@@ -167,7 +159,7 @@ def _eliminated(
         steps.append((all_poses, points))
     left = H[own:, own:] - H[own:, :own] @ following
     by_shared = [(-poses, -points) for poses, points in steps[1:]]
-    return ReadoutEquation(left[1:, 1:], left[0, 1:], weight, square, cost, steps[0], by_shared)
+    return ReadoutEquation(left[1:, 1:], left[0, 1:], square, cost, steps[0], by_shared)
 
 
 def _blended(

@@ -10,15 +10,14 @@ from torch import Tensor
 from geogs.bundle.lens import RadialLens
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
 from geogs.geometry.camera import Camera
+from geogs.geometry.distortion import USUAL_BEND
 from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
 
 LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
-PRIOR = 0.1, 0.2
-"""Deviations of k1 and k2 before any match is asked. A narrow field of view does not tell them."""
 MOST_BEND = 4.0
-"""Such deviations of k1 and k2 beyond which matches tell of no lens, but of nothing at all."""
+"""Usual deviations of k1 and k2 beyond which matches tell of no lens, but of nothing at all."""
 UNRELIABLE = 0.1
 """Relative deviation above which the focal length is not believed and the guess is kept, which may
 be as good."""
@@ -60,7 +59,9 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     angle = 2 * math.degrees(math.atan(lens.camera.long_edge / 2 / lens.camera.fx))
     if not FIELDS_OF_VIEW[0] < angle < FIELDS_OF_VIEW[1]:
         return f"it seems to have a field of view of {angle:.0f} degrees"
-    if any(abs(k) > MOST_BEND * usual for k, usual in zip((lens.k1, lens.k2), PRIOR, strict=True)):
+    if any(
+        abs(k) > MOST_BEND * usual for k, usual in zip((lens.k1, lens.k2), USUAL_BEND, strict=True)
+    ):
         return "its lens seems to bend as none does"
     if bundle.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
@@ -73,11 +74,12 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
 
 
 def with_prior(said: Estimate) -> Estimate:
-    """With what is known of lenses before (``PRIOR``): k1 and k2 are about none."""
+    """With what is known of lenses before any match is asked: k1 and k2 are about none. A narrow
+    field of view does not tell them."""
     lens = said.lens
     size = torch.tensor([0.0, lens.k1, lens.k2], dtype=torch.float64)
     told = LensEstimate(size, said.covariance)
-    for n, deviation in enumerate(PRIOR, 1):
+    for n, deviation in enumerate(USUAL_BEND, 1):
         told = told.told(n, 0.0, deviation)
     moved = lens.moved(*(told.size - size).tolist())
     return Estimate(moved, told.covariance, said.keyframes)
