@@ -81,7 +81,8 @@ def photo_case(seed: int) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Ten
 MULTI = {
     "default": LossConfig(),
     "ncc 5": LossConfig(l1_weight=0.0, ncc_patch=5, ncc_reject=1.5),
-    "l1 plain": LossConfig(ncc_weight=0.0, l1_huber=0.0, l1_cut=1.0),
+    "l1 plain": LossConfig(ncc_weight=0.0, l1_huber=0.0, l1_cut=1.0, photo_texture=0.0),
+    "l1 by texture": LossConfig(ncc_weight=0.0, photo_texture=200.0),
     "ssim": LossConfig(ssim_weight=0.4),
     "colour": LossConfig(
         ssim_weight=0.4, colour=True, occlusion_ratio=0.05, l1_huber=0.0, l1_cut=1.0
@@ -113,7 +114,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
     full = torch.nn.functional.interpolate(depth.nan_to_num(0.0)[None, None], (120, 160))[0, 0]
     odd = torch.nn.functional.interpolate(depth.nan_to_num(0.0)[None, None], (43, 61))[0, 0]
     config = LossConfig(
-        l1_weight=1.0, l1_huber=0.02, l1_cut=0.2, ncc_patch=7, ncc_texture=1e-4
+        l1_weight=1.0, l1_huber=0.02, l1_cut=0.2, ncc_patch=7, photo_texture=30.0
     )  # fmt: skip
     for module in (multi_view_reference, kernel_settings):
         monkeypatch.setattr(module, "NCC_MIN_VARIANCE", 1e-4)

@@ -169,6 +169,7 @@ def photo_on(photo: PhotoView, device: torch.device) -> PhotoView:
     return replace(
         photo,
         grey=photo.grey.to(device),
+        texture=photo.texture.to(device),
         T_cw=photo.T_cw.to(device),
         colours=photo.colours.to(device),
     )
@@ -234,7 +235,9 @@ SINGLE = {
 }
 PAIRS = {
     "l1": {"l1_weight": 1.0},
-    "l1 plain": {"l1_weight": 1.0, "l1_huber": 0.0, "l1_cut": 1.0},
+    "l1 plain": {"l1_weight": 1.0, "l1_huber": 0.0, "l1_cut": 1.0, "photo_texture": 0.0},
+    "l1 by texture": {"l1_weight": 1.0, "photo_texture": 200.0},
+    "l1 by texture, ncc": {"l1_weight": 1.0, "photo_texture": 200.0, "ncc_weight": 0.5},
     "ncc": {"ncc_weight": 0.5},
     "ncc 3": {"ncc_weight": 0.5, "ncc_patch": 3},
     "ncc 11": {"ncc_weight": 0.5, "ncc_patch": 11, "ncc_reject": 1.5},

@@ -6,7 +6,13 @@ import torch
 
 from cuda_emulator import use_emulator
 from geogs.losses import light
-from geogs.losses.light import fitted_on_gpu, relative_light
+from geogs.losses.light import (
+    LEAST_NOISE,
+    USUAL_NOISE,
+    fitted_on_gpu,
+    noise_between,
+    relative_light,
+)
 
 GPU = pytest.param(
     "cuda",
@@ -76,3 +82,18 @@ def test_the_kernel_fits_what_pytorch_fits(device, usable, monkeypatch):
     found = fitted_on_gpu(grey.to(device), other.to(device), counts.to(device)).cpu()
     assert found.tolist() == pytest.approx(expected.tolist(), abs=2e-4)
     assert (expected[0] == 1) == (usable <= 0.01)
+
+
+def test_noise_is_what_differs_where_nothing_else_does():
+    """Places with texture are not quite where they should be; of the bare ones some are hidden."""
+    random = np.random.default_rng(6)
+    true, usable = values(random), torch.ones(2000, dtype=torch.bool)
+    texture = torch.linspace(0, 1, 2000)
+    here, there = true + noise(random), true + noise(random) + 0.2 * (texture - 0.3).clamp(min=0)
+    there[:20] = values(random, 20)
+    usable[60:160] = False
+    here[60:160] = 0.0
+    assert float(noise_between(here, there, texture, usable)) == pytest.approx(0.01**2, rel=0.2)
+    assert float(noise_between(true, true, texture, usable)) == pytest.approx(LEAST_NOISE)
+    usable[200:] = False
+    assert float(noise_between(here, there, texture, usable)) == pytest.approx(USUAL_NOISE)

@@ -11,6 +11,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.losses.kernel_settings import MIN_COVERAGE
+from geogs.losses.light import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView, enlarge_depth
 from oracles.multi_view_reference import multi_view_loss, occlusion_mask, warp
 from oracles.photometric_reference import ssim
@@ -36,7 +37,9 @@ def views(camera: Camera = CAMERA) -> tuple[torch.Tensor, PhotoView, PhotoView, 
     """Reference depth, both views, target depth."""
     depth, a = plane_view(REFERENCE, camera)
     seen, b = plane_view(TARGET, camera)
-    return depth, PhotoView(a, camera, REFERENCE), PhotoView(b, camera, TARGET), seen
+    reference, target = (PhotoView.of(grey[None], camera, T) for grey, T in
+                         ((a, REFERENCE), (b, TARGET)))  # fmt: skip
+    return depth, reference, target, seen
 
 
 def test_the_true_depth_warps_the_target_onto_the_reference() -> None:
@@ -138,8 +141,8 @@ def test_colour_is_compared_as_printed_and_correlation_in_grey() -> None:
         replace(v, colours=gains * v.grey + 0.05 * gains.flip(0)) for v in (reference, target)
     )
     config = LossConfig(
-        l1_weight=0.8, l1_huber=0.0, l1_cut=10.0, ssim_weight=0.2, ncc_weight=0.15, colour=True,
-        occlusion_ratio=0.05,
+        l1_weight=0.8, l1_huber=0.0, l1_cut=10.0, photo_texture=0.0, ssim_weight=0.2,
+        ncc_weight=0.15, colour=True, occlusion_ratio=0.05,
     )  # fmt: skip
     wrong = 1.02 * depth
     warped = warp(target.grey, wrong, CAMERA, CAMERA, REFERENCE, TARGET)
@@ -167,3 +170,34 @@ def test_photo_view_is_grey_smoothed_and_of_the_camera_size() -> None:
     assert 0 < soft.grey[5, 23] < soft.grey[5, 24] < sharp.grey.max()
     with pytest.raises(InputError, match="16"):
         PhotoView.prepare(image, CAMERA.resized(12, 40), REFERENCE)
+
+
+def test_texture_is_the_variance_over_the_noise() -> None:
+    grey = torch.from_numpy(np.random.default_rng(4).random((18, 21)).astype(np.float32))
+    view = PhotoView.of(torch.stack([grey, grey, grey, grey]), CAMERA, REFERENCE)
+    around = torch.nn.functional.pad(grey[None], (2, 2, 2, 2), mode="reflect")[0]
+    slow = torch.stack(
+        [around[y : y + 5, x : x + 5].var(correction=0) for y in range(18) for x in range(21)]
+    )
+    slow = slow.reshape(18, 21) / USUAL_NOISE
+    torch.testing.assert_close(view.texture, slow, rtol=1e-4, atol=0.01)
+    brighter = view.in_light(torch.tensor([1.5, 0.2, 4 * USUAL_NOISE]))
+    assert brighter.colours is not None
+    for plane in (brighter.grey, *brighter.colours):
+        torch.testing.assert_close(plane, 1.5 * grey + 0.2)
+    again = PhotoView.of(brighter.planes, CAMERA, REFERENCE)
+    torch.testing.assert_close(4 * brighter.texture, again.texture, rtol=1e-4, atol=0.01)
+
+
+def test_bare_pixels_count_less() -> None:
+    depth, reference, target, _ = views()
+    wrong = 1.02 * depth
+    mask = warp(target.grey, wrong, CAMERA, CAMERA, REFERENCE, TARGET).in_view
+    v = float(reference.texture[mask].median())
+    plain = LossConfig(photo_texture=0.0)
+    everywhere = multi_view_loss(wrong, reference, target, None, plain)
+    weighed = multi_view_loss(wrong, reference, target, None, replace(plain, photo_texture=v))
+    assert 0.3 * everywhere < weighed < 0.7 * everywhere
+    bare = replace(reference, texture=torch.zeros_like(reference.texture))
+    assert multi_view_loss(wrong, bare, target, None, plain) == everywhere
+    assert multi_view_loss(wrong, bare, target, None, replace(plain, photo_texture=v)) == 0

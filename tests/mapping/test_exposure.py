@@ -62,7 +62,7 @@ def mapped(samples: list[Sample], level: bool = True) -> Mapper:
 def test_gain_and_offset_are_undone(samples):
     mapper = mapped(samples)
     for n, (gain, offset) in enumerate(zip(GAINS, OFFSETS, strict=True)):
-        compensated = mapper.views[n].exposure.tolist()
+        compensated = mapper.views[n].exposure[:2].tolist()
         assert compensated == pytest.approx([1 / gain, -offset / gain], abs=0.04)
         # What was clipped cannot come back, the rest is as it was.
         grey, middle = 0.5, (0.5 * gain + offset)
@@ -72,7 +72,7 @@ def test_gain_and_offset_are_undone(samples):
 def test_photos_follow_and_come_back_from_a_checkpoint(samples):
     mapper = mapped(samples)
     view, as_taken = mapper.views[2], mapped(samples, level=False).views[2]
-    assert as_taken.exposure.tolist() == [1.0, 0.0]
+    assert as_taken.exposure[:2].tolist() == [1.0, 0.0]
     expected = view.exposure[0] * as_taken.photo.grey + view.exposure[1]
     assert torch.equal(view.photo.grey, expected)
     mapper.settle()

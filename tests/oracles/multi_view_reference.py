@@ -145,7 +145,7 @@ def _plane_loss(
     if target_depth is not None:
         tolerance = occlusion_tolerance(config, target.camera)
         mask = occlusion_mask(warped, target_depth, target.camera, tolerance)
-    return photometric_loss(grey, warped.image, mask, config)
+    return photometric_loss(grey, warped.image, mask, config, reference.texture.to(depth.dtype))
 
 
 def photometric_loss(
@@ -153,17 +153,22 @@ def photometric_loss(
     warped: Float[Tensor, "h w *c"],
     mask: Bool[Tensor, "h w"],
     config: LossConfig,
+    texture: Float[Tensor, "h w"],
 ) -> Float[Tensor, ""]:
-    """``lambda_1 L_1 + lambda_ssim L_ssim + lambda_ncc L_ncc``, sums over the number of pixels."""
+    """``lambda_1 L_1 + lambda_ssim L_ssim + lambda_ncc L_ncc``, sums over the number of pixels.
+
+    L_1 and L_ncc count ``v / (v + photo_texture)`` where the reference's texture is v.
+    """
     c, total = config, reference.new_zeros(())
+    share = texture / (texture + c.photo_texture) if c.photo_texture > 0 else 1.0
     if c.l1_weight > 0:
         loss, _ = robust_l1(reference, warped, mask, c.l1_huber, c.l1_cut)
-        total = total + c.l1_weight * loss.sum()
+        total = total + c.l1_weight * (share * loss).sum()
     if c.ssim_weight > 0:
         loss, _ = ssim(reference, warped, mask, MIN_COVERAGE)
         total = total + c.ssim_weight * loss.sum()
     if c.ncc_weight > 0:
-        thresholds = c.ncc_reject, NCC_MIN_VARIANCE, c.ncc_texture, MIN_COVERAGE
+        thresholds = c.ncc_reject, NCC_MIN_VARIANCE, MIN_COVERAGE
         loss, _ = ncc(reference, warped, mask, c.ncc_patch, *thresholds)
-        total = total + c.ncc_weight * loss.sum()
+        total = total + c.ncc_weight * (share * loss).sum()
     return total / mask.numel()

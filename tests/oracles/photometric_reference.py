@@ -54,16 +54,14 @@ def ncc(
     patch: int = 7,
     reject: float = 0.9,
     min_variance: float = 1e-4,
-    texture: float = 1e-3,
     min_coverage: float = 0.7,
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """``1 - NCC`` over square windows, signed, weighted by the reference's texture.
+    """``1 - NCC`` over square windows, signed.
 
     Paper Eq. zncc. Masked pixels of ``warped`` are filled from ``reference``, so that they add no
     difference, and windows with less than ``min_coverage`` of comparable pixels are left out, as
     are windows that leave the image, whose reference has a variance below ``min_variance`` (of
-    grey values), or with ``1 - NCC >= reject`` (PGSR's rejection of occluded patches). A window of
-    variance v weighs ``v / (v + texture)``, because the noise of NCC falls with texture.
+    grey values), or with ``1 - NCC >= reject`` (PGSR's rejection of occluded patches).
     """
     a = _channels_first(reference)
     b = torch.where(mask, _channels_first(warped), a)
@@ -76,8 +74,7 @@ def ncc(
 
     coverage = _window_mean(mask.to(a.dtype)[None, None], patch)
     used = (coverage >= min_coverage) & (variance_a > min_variance) & (loss < reject)
-    weight = variance_a / (variance_a + texture)
-    loss = torch.where(used, weight * loss, torch.zeros_like(loss))
+    loss = torch.where(used, loss, torch.zeros_like(loss))
     return loss.mean((0, 1)), used.any(0)[0]
 
 

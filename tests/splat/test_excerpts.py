@@ -84,7 +84,7 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
     for p, q in zip(first.disks.parameters, second.disks.parameters, strict=True):
         torch.testing.assert_close(p, q, rtol=0, atol=2e-6)
     for p, q in zip(first.disks.second, second.disks.second, strict=True):
-        torch.testing.assert_close(p, q, rtol=1e-4, atol=1e-12)
+        torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-12)
     assert torch.equal(first.disks.steps, second.disks.steps)
     assert torch.equal(first.disks.seen, second.disks.seen)
     assert int(first.disks.seen.sum()) > 100
@@ -137,6 +137,8 @@ def test_few_slots_serve_many_keyframes():
     assert torch.equal(known.table.poses[first[0]], c.T_cw[:3].reshape(-1))
     maps = known.table._maps[first[0]]
     assert torch.equal(maps[2], c.known.prior_depth)
-    assert torch.equal(known.table._photos[first[0]], c.photo.planes)
+    *planes, texture = known.table._photos[first[0]]
+    assert torch.equal(torch.stack(planes), c.photo.planes)
+    assert torch.equal(texture, c.photo.texture)
     assert len(set(known.slots([a, b, c]))) == 3  # more at once than there should be
     assert torch.equal(known.table.poses[known.slots([a])[0]], a.T_cw[:3].reshape(-1))

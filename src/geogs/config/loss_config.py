@@ -55,8 +55,9 @@ class LossConfig(Settings, group="mapping.loss"):
     """Side of the correlation window in pixels of the photometric image."""
     ncc_reject: Annotated[float, Range(1e-9, 2)] = 0.9
     """Windows with 1 - NCC of this or more are taken for occluded or changed."""
-    ncc_texture: Fraction = 1e-6
-    """A window of grey variance v weighs v / (v + this); 0 weighs all windows alike."""
+    photo_texture: Weight = 0.5
+    """A pixel around which grey varies by v times its noise (variances) counts v / (v + this) in
+    L_1, and in L_ncc the window around it; 0 counts all alike."""
     ssim_weight: Weight = 0.0
     """L_ssim, 1 - structural similarity; slow on a CPU."""
     occlusion: Positive = 2.25

@@ -39,7 +39,7 @@ def paper_losses() -> LossConfig:
         ncc_weight=0.15,
         ncc_patch=7,
         ncc_reject=2.0,
-        ncc_texture=0.0,
+        photo_texture=0.0,
         ssim_weight=0.2,
         occlusion_ratio=0.05,
         colour=True,

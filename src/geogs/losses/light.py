@@ -1,4 +1,4 @@
-"""How bright one view is against another: what exposure and white balance did between them."""
+"""How bright one view is against another, and how noisy: exposure, white balance, noise."""
 
 from pathlib import Path
 
@@ -17,13 +17,19 @@ _PLAIN = 0.01
 _FEWEST = 50
 """Weights of pixels, summed, that tell anything."""
 _LARGEST_GAIN = 8.0
+USUAL_NOISE = 1e-4
+"""Variance of grey values (of 1) by which two views of a place differ where nobody measured it."""
+LEAST_NOISE = 1e-6
+"""That of rounding to 8 bits, about."""
+_MEDIAN_TO_DEVIATION = 1.4826
+"""Standard deviation over the median of the absolute value, normal distribution."""
 _THREADS = 1024
 """Threads of the one block, as many as one may have."""
 
 
-def same_light(device: torch.device | str) -> Float[Tensor, "2"]:
-    """Gain 1 and offset 0."""
-    return torch.tensor([1.0, 0.0], device=device)
+def same_light(device: torch.device | str) -> Float[Tensor, "3"]:
+    """Gain 1, offset 0, the usual noise."""
+    return torch.tensor([1.0, 0.0, USUAL_NOISE], device=device)
 
 
 def relative_light(
@@ -55,7 +61,7 @@ def relative_light(
         scale = _SCALE * max(1.0, 4.0 * (1 - n / (_ROUNDS / 2)))
         weight = usable / (1 + (residual / scale).square())
     found = torch.stack([gain, mean_y - gain * mean_x])
-    return torch.where(weight.sum() > _FEWEST, found, same_light(grey.device).to(grey))
+    return torch.where(weight.sum() > _FEWEST, found, same_light(grey.device)[:2].to(grey))
 
 
 def fitted_on_gpu(
@@ -68,3 +74,24 @@ def fitted_on_gpu(
         1, _THREADS, *values, len(grey), _ROUNDS, _SCALE, _PLAIN, _FEWEST, _LARGEST_GAIN, light
     )
     return light
+
+
+def noise_between(
+    grey: Float[Tensor, "n"],
+    other: Float[Tensor, "n"],
+    texture: Float[Tensor, "n"],
+    usable: Bool[Tensor, "n"],
+) -> Float[Tensor, ""]:
+    """Variance by which either of two views in the same light differs from what both show.
+
+    From the median difference of their grey values where the first has least ``texture``, so that
+    pixels that are not quite in place do not count for noise. The usual noise where too few can be
+    compared. Nothing waits for a GPU.
+    """
+    order = torch.where(usable, texture, torch.inf).argsort(stable=True)
+    bare = usable.sum() // 4
+    apart = (grey - other).abs()[order]
+    apart = torch.where(torch.arange(len(apart), device=grey.device) < bare, apart, torch.inf)
+    deviation = _MEDIAN_TO_DEVIATION * apart.sort().values[(bare // 2)[None]][0]
+    found = (deviation.square() / 2).clamp(min=LEAST_NOISE)
+    return torch.where(bare > _FEWEST, found, USUAL_NOISE)

@@ -13,11 +13,14 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.losses.light import USUAL_NOISE
 
 # A point must keep this fraction of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
 # Degrees between the rays of two views at which the occlusion test is told in pixels.
 _PARALLAX = 10.0
+_TEXTURE_SIDE = 5
+"""Side in pixels of the window whose variance is a pixel's texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,8 @@ class PhotoView:
     """Intrinsics at photometric size."""
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
+    texture: Float[Tensor, "h w"]
+    """Variance of the grey values around each pixel over that of their noise; float32."""
     colours: Float[Tensor, "3 h w"] | None = None
     """Red, green and blue in [0, 1], smoothed; where they are compared."""
 
@@ -59,15 +64,21 @@ class PhotoView:
         for plane in planes:
             small = cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
             smooth.append(cv2.GaussianBlur(small, (0, 0), blur) if blur > 0 else small)
-        return PhotoView.of(torch.from_numpy(np.stack(smooth)).to(device), camera, T_cw)
+        return PhotoView.of(torch.from_numpy(np.stack(smooth)), camera, T_cw, device)
 
     @staticmethod
     def of(
-        planes: Float[Tensor, "k h w"], camera: Camera, T_cw: Float[Tensor, "4 4"]
+        planes: Float[Tensor, "k h w"],
+        camera: Camera,
+        T_cw: Float[Tensor, "4 4"],
+        device: torch.device | str = "cpu",
     ) -> "PhotoView":
-        """The view of a grey image, followed by red, green and blue or by nothing."""
-        colours = planes[1:] if len(planes) > 1 else None
-        return PhotoView(planes[0], camera, T_cw.detach().double(), colours)
+        """The view of a grey image, followed by red, green and blue or by nothing, from a CPU. It
+        has the usual noise."""
+        texture = _local_variance(planes[0]) / USUAL_NOISE
+        planes = torch.cat([planes, texture[None]]).to(device)
+        colours = planes[1:-1] if len(planes) > 2 else None
+        return PhotoView(planes[0], camera, T_cw.detach().double(), planes[-1], colours)
 
     @property
     def planes(self) -> Float[Tensor, "k h w"]:
@@ -86,6 +97,21 @@ class PhotoView:
     def at(self, T_cw: Float[Tensor, "4 4"]) -> "PhotoView":
         """The same image with another pose."""
         return replace(self, T_cw=T_cw)
+
+    def in_light(self, light: Float[Tensor, "3"]) -> "PhotoView":
+        """The image as it was prepared with its values times a gain plus an offset, which leaves a
+        noise of so much variance."""
+        gain, offset, noise = light
+        colours = None if self.colours is None else gain * self.colours + offset
+        texture = self.texture * (gain.square() * USUAL_NOISE / noise)
+        return replace(self, grey=gain * self.grey + offset, texture=texture, colours=colours)
+
+
+def _local_variance(grey: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Variance in the window around each pixel, mirrored at the border, of an image on a CPU."""
+    image, side = grey.numpy(), (_TEXTURE_SIDE, _TEXTURE_SIDE)
+    mean, square = (cv2.boxFilter(each, -1, side) for each in (image, image * image))
+    return torch.from_numpy(square - mean * mean).clamp(min=0)
 
 
 def enlarge_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float[Tensor, "H W"]:

@@ -77,11 +77,11 @@ class MapView:
     @property
     def photo(self) -> PhotoView:
         """What the multi-view losses need."""
-        return PhotoView.of(self.arrays.load(self.id).photo, self.arrays.cameras.photo, self.T_cw)
+        return self.arrays.load(self.id).photo.at(self.T_cw)
 
     @property
-    def exposure(self) -> Float[Tensor, "2"]:
-        """Gain and offset that its photo has had."""
+    def exposure(self) -> Float[Tensor, "3"]:
+        """Gain and offset that its photo has had, and the variance of its noise."""
         known = self.row.exposure
         return same_light(self.arrays.device) if known is None else known
 
@@ -138,12 +138,12 @@ class MapView:
         """Take over a dense depth, on which the losses' constants then live."""
         self.arrays.set_depth(self.id, depth)
 
-    def set_exposure(self, exposure: Float[Tensor, "2"]) -> None:
-        """Compensate its exposure, which was not known."""
+    def set_exposure(self, exposure: Float[Tensor, "3"]) -> None:
+        """Compensate its exposure and know its noise, which were not known."""
         self.row.exposure = exposure
         loaded = self.arrays.loaded.peek(self.id)
         if loaded is not None:
-            loaded.photo = exposure[0] * loaded.photo + exposure[1]
+            loaded.photo = loaded.photo.in_light(exposure)
 
 
 class KeyframeViews(Mapping[int, MapView]):

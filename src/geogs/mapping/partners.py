@@ -1,4 +1,4 @@
-"""Which keyframes check each other by their images, and the exposure by which these differ."""
+"""Which keyframes check each other by their images, and the exposure and noise of these."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from geogs.depth.sweep_neighbors import view_pairs
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
-from geogs.losses.light import relative_light, same_light
+from geogs.losses.light import noise_between, relative_light, same_light
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.world.map import MapTable
 
@@ -75,25 +75,32 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
     return [i for _, i in scored[: config.candidates]]
 
 
-def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "2"]:
-    """Gain and offset that bring the grey values of a view to those of others.
+def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
+    """Gain and offset that bring the grey values of a view to those of others, and its noise.
 
     The others' exposure is compensated already. The dense depth of the view tells where its pixels
-    are in them. Gain 1 and offset 0 where there is nothing to compare with.
+    are in them. Gain 1, offset 0 and the usual noise where there is nothing to compare with.
     """
     if not others:
         return same_light(view.dense.depth.device)
     points, confident = _sparse_points(view)
-    (mine,), (inside,) = _sampled(view.photo.grey[None], view.photo.camera, points[None])
+    (mine, texture), (inside, _) = _sampled(
+        torch.stack([view.photo.grey, view.photo.texture]),
+        view.photo.camera,
+        points.expand(2, -1, -1),
+    )
     usable = confident & inside & _is_exposed(mine)
     T_cw = torch.stack([other.T_cw for other in others]).cpu()
     T = to_device((T_cw @ se3_inverse(view.T_cw).to(T_cw)).to(points.dtype), points.device)
     greys = torch.stack([other.photo.grey for other in others])
     there = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
     theirs, inside = _sampled(greys, view.photo.camera, there)
-    gain, offset = torch.stack([other.exposure for other in others])[..., None].unbind(1)
-    common = usable & inside & _is_exposed((theirs - offset) / gain)
-    return relative_light(mine.repeat(len(others)), theirs.flatten(), common.flatten())
+    gain, offset, _ = torch.stack([other.exposure for other in others])[..., None].unbind(1)
+    common = (usable & inside & _is_exposed((theirs - offset) / gain)).flatten()
+    mine, texture = mine.repeat(len(others)), texture.repeat(len(others))
+    gain, offset = relative_light(mine, theirs.flatten(), common)
+    noise = noise_between(gain * mine + offset, theirs.flatten(), texture, common)
+    return torch.stack([gain, offset, noise])
 
 
 def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:

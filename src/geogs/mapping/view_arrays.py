@@ -51,8 +51,8 @@ class LoadedView:
     """What is as large as an image: all but the depths follows from the keyframe's image."""
 
     image: UInt8[np.ndarray, "wh ww 3"]
-    photo: Float[Tensor, "k ph pw"]
-    """Planes of the :class:`PhotoView` with exposure compensated, on the map's device."""
+    photo: PhotoView
+    """With the exposure compensated, on the map's device; its pose was the keyframe's once."""
     normal: Float[Tensor, "h w 3"] | None
     """A prior's normals at the render size, on the map's device."""
     depth: DenseDepth | None = None
@@ -176,9 +176,9 @@ class ViewArrays:
         image = keyframe.image
         photo = PhotoView.prepare(
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
-        ).planes
+        )
         if row.exposure is not None:
-            photo = row.exposure[0] * photo + row.exposure[1]
+            photo = photo.in_light(row.exposure)
         normal = None
         if loss.normal_weight:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)

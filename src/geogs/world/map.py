@@ -60,8 +60,9 @@ class ViewRow:
     """Ids of the keyframes whose images check this one's depth, best first."""
     search: DepthSearch | None = None
     """Where its depth is searched; none leaves that to the tracker's depth."""
-    exposure: Float32[Tensor, "2"] | None = None
-    """Gain and offset that compensate its exposure; none until known."""
+    exposure: Float32[Tensor, "3"] | None = None
+    """Gain and offset that compensate its exposure, and the variance of the noise that is in its
+    grey values then; none until known."""
     depth: SearchedDepth | None = None
     """None until it was searched."""
 

@@ -96,7 +96,8 @@ def _enlargement(source: int, size: int) -> tuple[np.ndarray, np.ndarray]:
 class _MultiView(torch.autograd.Function):
     @staticmethod
     def forward(ctx, depth, T, reference, target, target_depth, config):  # type: ignore[no-untyped-def]
-        grey, image = _array(reference.grey), _array(target.grey)
+        grey, texture = _array(reference.grey), _array(reference.texture)
+        image = _array(target.grey)
         height, width = grey.shape
         small, T34 = _array(depth), np.ascontiguousarray(T.detach().numpy()[:3], np.float32)
         tables = (*_enlargement(len(small), height), *_enlargement(small.shape[1], width))
@@ -114,7 +115,7 @@ class _MultiView(torch.autograd.Function):
         loss = np.zeros(height, np.float32)
         over_rows(
             lambda a, b: multi.warp_rows(
-                a, b, small, *tables, grey, image, hidden, lenses, T34, settings,
+                a, b, small, *tables, grey, texture, image, hidden, lenses, T34, settings,
                 warped, slope, mask, extra, loss,
             ),
             height,
@@ -122,7 +123,7 @@ class _MultiView(torch.autograd.Function):
         if half >= 0:
             over_rows(
                 lambda a, b: multi.correlate_rows(
-                    a, b, grey, warped, mask, half, settings, fields, loss
+                    a, b, grey, texture, warped, mask, half, settings, fields, loss
                 ),
                 height,
             )
@@ -138,8 +139,8 @@ class _MultiView(torch.autograd.Function):
         if with_depth or with_pose:
             over_rows(
                 lambda a, b: multi.depth_gradient_rows(
-                    a, b, *tables, grey, warped, slope, mask, half, settings, fields, g_image,
-                    g_depth,
+                    a, b, *tables, grey, texture, warped, slope, mask, half, settings, fields,
+                    g_image, g_depth,
                 ),
                 len(small),
             )  # fmt: skip

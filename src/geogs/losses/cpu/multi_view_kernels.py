@@ -120,10 +120,16 @@ def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
         geometry[4, x] = gy * (qy - py * qz) * inverse
 
 
+@njit(**PART)
+def share_of(texture, weak):
+    """What counts of a pixel by its texture: half at ``weak``, all where that is 0."""
+    return texture / (texture + weak) if weak > ZERO else ONE
+
+
 @njit(**KERNEL)
 def warp_rows(
-    first, last, depth, rows, row_share, columns, column_share, reference, target, target_depth,
-    lenses, T, settings, warped, slope, mask, extra, loss,
+    first, last, depth, rows, row_share, columns, column_share, reference, texture, target,
+    target_depth, lenses, T, settings, warped, slope, mask, extra, loss,
 ):  # fmt: skip
     """The target image through the reference's depth, rows ``first <= y < last``.
 
@@ -159,12 +165,12 @@ def warp_rows(
         for x in range(reference.shape[1]):
             size = min(abs(warped[y, x] - reference[y, x]), settings.cut)
             small = min(size, settings.huber)
-            total += small * (size - HALF * small)
+            total += share_of(texture[y, x], settings.texture) * small * (size - HALF * small)
         loss[y] = settings.l1 / settings.huber * total
 
 
 @njit(**KERNEL)
-def correlate_rows(first, last, reference, warped, mask, half, settings, fields, loss):
+def correlate_rows(first, last, reference, texture, warped, mask, half, settings, fields, loss):
     """L_ncc of windows centred in rows ``first <= y < last`` and what their pixels need of it.
 
     settings as in :func:`warp_rows`. The gradient
@@ -209,7 +215,7 @@ def correlate_rows(first, last, reference, warped, mask, half, settings, fields,
             ncc = (share * sums[4, x] - mean_a * mean_b) * inverse
             used = (raw_a > settings.min_variance) & (ONE - ncc < settings.reject)
             used = used & (share * sums[5, x] > settings.min_coverage - np.float32(1e-4))
-            w = settings.ncc * raw_a / (raw_a + settings.texture) if used else ZERO
+            w = settings.ncc * share_of(texture[y, x + half], settings.texture) if used else ZERO
             total += w * (ONE - ncc)
             cross = -w * share * inverse
             own = w * share * ncc / var_b if raw_b > ZERO else ZERO
@@ -243,8 +249,8 @@ def window_sums(y, fields, half, line, sums):
 
 @njit(**KERNEL)
 def depth_gradient_rows(
-    first, last, rows, row_share, columns, column_share, reference, warped, slope, mask, half,
-    settings, fields, g_image, g_depth,
+    first, last, rows, row_share, columns, column_share, reference, texture, warped, slope, mask,
+    half, settings, fields, g_image, g_depth,
 ):  # fmt: skip
     """d loss / d depth for the depth rows ``first <= y < last``: the enlargement's adjoint.
 
@@ -266,7 +272,8 @@ def depth_gradient_rows(
             a, b = reference[y, x], warped[y, x]
             near = abs(b - a) < settings.cut
             push = min(max((b - a) / settings.huber, -ONE), ONE) if near else ZERO
-            sums[0, x] += a * sums[1, x] + b * sums[2, x] + settings.l1 * push
+            push *= settings.l1 * share_of(texture[y, x], settings.texture)
+            sums[0, x] += a * sums[1, x] + b * sums[2, x] + push
         if g_image.shape[1] > 0:
             for x in range(width):
                 sums[0, x] += g_image[0, y, x]

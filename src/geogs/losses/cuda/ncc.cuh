@@ -15,7 +15,7 @@ struct Correlation {
   __device__ static __forceinline__ bool counts(int y, int x, int height, int width, bool) {
     return y >= HALF && y < height - HALF && x >= HALF && x < width - HALF;
   }
-  __device__ static __forceinline__ float compare(const Moments& m, const PhotoSettings& c, WindowGradient& g) {
+  __device__ static __forceinline__ float compare(const Moments& m, float texture, const PhotoSettings& c, WindowGradient& g) {
     const float share = 1.f / (float)((2 * HALF + 1) * (2 * HALF + 1));
     const float mean_a = share * m.a, mean_b = share * m.b;
     const float raw_a = fmaxf(share * m.aa - mean_a * mean_a, 0.f);
@@ -25,7 +25,7 @@ struct Correlation {
     const float ncc = (share * m.ab - mean_a * mean_b) * inverse;
     // The shares of seen pixels are multiples of ``share``; the margin absorbs rounding.
     if (!(raw_a > c.min_variance && 1.f - ncc < c.reject && share * m.seen > c.min_coverage - 1e-4f)) return 0.f;
-    const float w = c.ncc * raw_a / (raw_a + c.texture);
+    const float w = c.ncc * share_of(texture, c.texture);
     const float cross = -w * share * inverse, own = raw_b > 0.f ? w * share * ncc / variance_b : 0.f;
     g = {-cross * mean_a - own * mean_b, cross, own};
     return w * (1.f - ncc);

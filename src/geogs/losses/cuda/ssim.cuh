@@ -22,7 +22,7 @@ struct Structure {
   __device__ static __forceinline__ bool counts(int y, int x, int height, int width, bool seen) {
     return seen && y >= 0 && y < height && x >= 0 && x < width;
   }
-  __device__ static __forceinline__ float compare(const Moments& m, const PhotoSettings& c, WindowGradient& g) {
+  __device__ static __forceinline__ float compare(const Moments& m, float, const PhotoSettings& c, WindowGradient& g) {
     const float share = fmaxf(m.seen, 1e-6f), inverse = 1.f / share, c1 = 0.01f * 0.01f, c2 = 0.03f * 0.03f;
     if (!(share >= c.min_coverage)) return 0.f;
     const float mean_a = m.a * inverse, mean_b = m.b * inverse;

@@ -5,7 +5,7 @@
 #define HUGE_VALUE 1e30f
 
 // Columns of the pointer table; the order of ``ViewTable``.
-enum ViewField { EDGE, IMAGE_GRADIENT, PRIOR_DEPTH, CONFIDENCE, PRIOR_NORMAL, GREY, RENDERED_DEPTH, VIEW_FIELDS };
+enum ViewField { EDGE, IMAGE_GRADIENT, PRIOR_DEPTH, CONFIDENCE, PRIOR_NORMAL, GREY, TEXTURE, RENDERED_DEPTH, VIEW_FIELDS };
 
 __device__ __forceinline__ float* view_map(const long long* maps, int slot, ViewField field) {
   return (float*)maps[(size_t)slot * VIEW_FIELDS + field];

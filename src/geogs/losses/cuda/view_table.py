@@ -22,7 +22,8 @@ class ViewField(IntEnum):
     CONFIDENCE = 3
     PRIOR_NORMAL = 4
     GREY = 5
-    RENDERED_DEPTH = 6
+    TEXTURE = 6
+    RENDERED_DEPTH = 7
 
 
 class ViewTable:
@@ -59,6 +60,7 @@ class ViewTable:
         self._maps: list[Float[Tensor, "fields h w"]] = []
         self._normals: list[Float[Tensor, "3 h w"] | None] = []
         self._photos: list[Float[Tensor, "k ph pw"]] = []
+        """Planes of each slot's photometric image, then its texture."""
 
     def __len__(self) -> int:
         return len(self._maps)
@@ -70,7 +72,7 @@ class ViewTable:
             self._grow()
         size = (self.render.height, self.render.width)
         maps = torch.zeros(5, *size, device=self.device)
-        planes = self._upload(photo.planes)
+        planes = self._uploaded_photo(photo)
         if planes.shape[1:] != (self.photo.height, self.photo.width):
             raise ValueError(
                 f"the grey image has size {tuple(planes.shape[1:])}, not the photo camera's"
@@ -78,7 +80,7 @@ class ViewTable:
         self._maps.append(maps)
         self._normals.append(None)
         self._photos.append(planes)
-        while len(self.planes) < len(planes):
+        while len(self.planes) < len(planes) - 1:
             self.planes.append(torch.zeros_like(self.pointers))
         self._point(slot)
         if view is not None:
@@ -92,7 +94,7 @@ class ViewTable:
         All maps stay where they are, so captured graphs remain valid.
         """
         self._maps[slot].zero_()
-        self._photos[slot].copy_(self._upload(photo.planes))
+        self._photos[slot].copy_(self._uploaded_photo(photo))
         self.rendered[slot : slot + 1].zero_()
         if view is not None:
             self.set_constants(slot, view)
@@ -126,6 +128,9 @@ class ViewTable:
         """No rendered depth counts any more, as after the map has moved."""
         self.rendered.zero_()
 
+    def _uploaded_photo(self, photo: PhotoView) -> Float[Tensor, "k ph pw"]:
+        return self._upload(torch.cat([photo.planes, photo.texture[None]]))
+
     def _upload(self, tensor: Tensor) -> Tensor:
         return to_device(tensor.float().contiguous(), self.device)
 
@@ -138,7 +143,9 @@ class ViewTable:
                                      ViewField.RENDERED_DEPTH)):  # fmt: skip
             address[field] = maps[row].data_ptr()
         address[ViewField.PRIOR_NORMAL] = 0 if normal is None else normal.data_ptr()
-        for pointers, plane in zip(self.planes, self._photos[slot], strict=True):
+        *planes, texture = self._photos[slot]
+        address[ViewField.TEXTURE] = texture.data_ptr()
+        for pointers, plane in zip(self.planes, planes, strict=True):
             address[ViewField.GREY] = plane.data_ptr()
             line = torch.tensor([address[field] for field in ViewField], dtype=torch.int64)
             pointers[slot].copy_(to_device(line, self.device))

@@ -57,14 +57,19 @@ __device__ __forceinline__ bool is_visible(
   return known && fabsf(z - upper - (lower - upper) * fy) < tolerance * z;
 }
 
-// Derivative of the weighted L_1 in the warped image, and the loss.
-__device__ __forceinline__ float l1_push(float a, float b, const PhotoSettings& c) {
-  const float e = b - a;
-  return fabsf(e) < c.cut ? c.l1 * fminf(fmaxf(e / c.huber, -1.f), 1.f) : 0.f;
+// What counts of a pixel by its texture: half at ``weak``, all where that is 0.
+__device__ __forceinline__ float share_of(float texture, float weak) {
+  return weak > 0.f ? texture / (texture + weak) : 1.f;
 }
-__device__ __forceinline__ float l1_loss(float a, float b, const PhotoSettings& c) {
+
+// Derivative of the weighted L_1 in the warped image at a pixel of a texture, and the loss.
+__device__ __forceinline__ float l1_push(float a, float b, float texture, const PhotoSettings& c) {
+  const float e = b - a;
+  return fabsf(e) < c.cut ? c.l1 * share_of(texture, c.texture) * fminf(fmaxf(e / c.huber, -1.f), 1.f) : 0.f;
+}
+__device__ __forceinline__ float l1_loss(float a, float b, float texture, const PhotoSettings& c) {
   const float size = fminf(fabsf(b - a), c.cut), small = fminf(size, c.huber);
-  return c.l1 * (small / c.huber) * (size - 0.5f * small);
+  return c.l1 * share_of(texture, c.texture) * (small / c.huber) * (size - 0.5f * small);
 }
 
 // A warped image holds its mask in the sign: filled from the reference, negative where not seen.
@@ -126,6 +131,7 @@ extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
   const float* image = view_map(maps, target, GREY);
   const float* hidden = rendered[target] ? view_map(maps, target, RENDERED_DEPTH) : 0;
   const float* grey = view_map(maps, batch[b], GREY);
+  const float* texture = view_map(maps, batch[b], TEXTURE);
   const int x = blockIdx.x * 32 + threadIdx.x, end = min((int)(blockIdx.y + 1) * WARP_ROWS, big_height);
   depth += (size_t)b * height * width;
   const Source column = source_pixels(x, width, (float)width / big_width);
@@ -142,13 +148,14 @@ extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
     Sample s = {a, 0.f, 0.f};
     if (seen) s = sample_image(image, big_height, big_width, p.u, p.v);
     const float rate = seen ? s.dx * p.du + s.dy * p.dv : 0.f;
-    if (seen && c.l1 > 0.f) total += l1_loss(a, s.value, c);
+    const bool counts = seen && c.l1 > 0.f;
+    if (counts) total += l1_loss(a, s.value, texture[pixel], c);
     warped[at] = packed(s.value, seen);
     if (!last) {
       slope[at] = rate;
       continue;
     }
-    const float g = seen && c.l1 > 0.f ? l1_push(a, s.value, c) : 0.f;
+    const float g = counts ? l1_push(a, s.value, texture[pixel], c) : 0.f;
     slope[at] = g * rate;
     if (push) push[at] = g;
   }

@@ -76,6 +76,7 @@ __device__ __forceinline__ void compare_windows(
   if (threadIdx.x == 0) c = *(const PhotoSettings*)settings;
   const size_t plane = (size_t)height * width;
   const PairImages source = {view_map(maps, batch[b], GREY), warped + pair * plane, height, width};
+  const float* textures = view_map(maps, batch[b], TEXTURE);
   const int t = threadIdx.x, x = blockIdx.x * (STRIP - 4 * HALF) - 2 * HALF + t;
   const int first = blockIdx.y * rows, end = min(first + rows, height);
   const bool summed = t >= HALF && t < STRIP - HALF;
@@ -103,11 +104,16 @@ __device__ __forceinline__ void compare_windows(
     const bool finished = owned && done >= first;
     const size_t at = pair * plane + (size_t)done * width + x;
     PixelPair out = {0.f, 0.f, false};
-    float rate = 0.f;
+    float rate = 0.f, texture = 0.f;
     if (finished) {
       out = source.load(done, x);
-      if (flags & FINISH) rate = pull[at];
+      if (flags & FINISH) {
+        rate = pull[at];
+        texture = textures[(size_t)done * width + x];
+      }
     }
+    const bool counts = Measure::counts(centre, x, height, width, (history >> HALF) & 1u);
+    const float texture_around = counts ? textures[(size_t)centre * width + x] : 0.f;
     __syncthreads();
     if (!summed) continue;
 
@@ -126,8 +132,8 @@ __device__ __forceinline__ void compare_windows(
     const Moments m = {moments[0].feed(line.a), moments[1].feed(line.aa), moments[2].feed(line.b),
                        moments[3].feed(line.bb), moments[4].feed(line.ab), moments[5].feed(line.seen)};
     given = {0.f, 0.f, 0.f};
-    if (Measure::counts(centre, x, height, width, (history >> HALF) & 1u)) {
-      const float value = Measure::compare(m, c, given);
+    if (counts) {
+      const float value = Measure::compare(m, texture_around, c, given);
       if (owned && centre >= first && centre < end) total += value;
     }
 
@@ -148,7 +154,7 @@ __device__ __forceinline__ void compare_windows(
       continue;
     }
     if (flags & ADD_EARLIER) push += gradient[at];
-    if (out.seen && c.l1 > 0.f) push += l1_push(out.a, out.b, c);
+    if (out.seen && c.l1 > 0.f) push += l1_push(out.a, out.b, texture, c);
     if (flags & KEEP_GRADIENT) gradient[at] = push;
     pull[at] = rate * push;
   }
