@@ -12,6 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import kernel_settings
 from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.light import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView
 from loss_scenes import ALL_TERMS, random_view
 from oracles import multi_view_reference
@@ -72,6 +73,7 @@ def photo_case(seed: int) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Ten
     near = se3_exp(torch.tensor([0.02, -0.01, 0.01, 0.002, 0.003, -0.01]).double())
     images = [x.astype(np.uint8) for x in (texture, other)]
     reference = PhotoView.prepare(images[0], BIG, torch.eye(4).double(), with_colour=True)
+    reference = reference.in_light(torch.tensor([1.0, 0.0, 3 * USUAL_NOISE]))
     target = PhotoView.prepare(images[1], BIG, near, with_colour=True)
     hidden = depth.clone().nan_to_num(0.0)
     hidden[40:50, 10:30] *= 0.8
@@ -114,7 +116,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
     full = torch.nn.functional.interpolate(depth.nan_to_num(0.0)[None, None], (120, 160))[0, 0]
     odd = torch.nn.functional.interpolate(depth.nan_to_num(0.0)[None, None], (43, 61))[0, 0]
     config = LossConfig(
-        l1_weight=1.0, l1_huber=0.02, l1_cut=0.2, ncc_patch=7, photo_texture=30.0
+        l1_weight=1.0, l1_huber=1.4, l1_cut=0.2, ncc_patch=7, photo_texture=30.0
     )  # fmt: skip
     for module in (multi_view_reference, kernel_settings):
         monkeypatch.setattr(module, "NCC_MIN_VARIANCE", 1e-4)
@@ -127,7 +129,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
         b.backward()
         # In float32 a few windows fall on the other side of a threshold.
         assert float(a.detach()) == pytest.approx(float(b.detach()), rel=5e-4)
-        assert relative(fast.grad, slow.grad) < 5e-3
+        assert relative(fast.grad, slow.grad) < 1e-2
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:

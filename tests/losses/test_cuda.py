@@ -18,6 +18,7 @@ from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses.cuda import ViewTable, WindowLosses, window_losses
+from geogs.losses.light import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import MIN_ALPHA, ViewConstants
 from loss_scenes import random_view
@@ -79,7 +80,8 @@ class Scene:
             T_cw = se3_exp((k - 1.3) * move)
             scene.views.append(constants_on(view, device))
             pixels = image.astype(np.uint8)
-            scene.photos.append(PhotoView.prepare(pixels, photo, T_cw, 0.3, with_colour=True))
+            taken = PhotoView.prepare(pixels, photo, T_cw, 0.3, with_colour=True)
+            scene.photos.append(taken.in_light(torch.tensor([1.0, 0.0, (k + 1) * USUAL_NOISE])))
             scene.table.add(view, scene.photos[k])
             rendered.append(maps)
         scene.photos = [photo_on(p, device) for p in scene.photos]
@@ -170,6 +172,7 @@ def photo_on(photo: PhotoView, device: torch.device) -> PhotoView:
         photo,
         grey=photo.grey.to(device),
         texture=photo.texture.to(device),
+        noise=photo.noise.to(device),
         T_cw=photo.T_cw.to(device),
         colours=photo.colours.to(device),
     )

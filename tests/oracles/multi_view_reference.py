@@ -3,7 +3,8 @@
 The target image is seen through the reference's rendered depth.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -145,7 +146,9 @@ def _plane_loss(
     if target_depth is not None:
         tolerance = occlusion_tolerance(config, target.camera)
         mask = occlusion_mask(warped, target_depth, target.camera, tolerance)
-    return photometric_loss(grey, warped.image, mask, config, reference.texture.to(depth.dtype))
+    quadratic = config.l1_huber * math.sqrt(2 * float(reference.noise))
+    texture = reference.texture.to(depth.dtype)
+    return photometric_loss(grey, warped.image, mask, replace(config, l1_huber=quadratic), texture)
 
 
 def photometric_loss(
@@ -157,7 +160,8 @@ def photometric_loss(
 ) -> Float[Tensor, ""]:
     """``lambda_1 L_1 + lambda_ssim L_ssim + lambda_ncc L_ncc``, sums over the number of pixels.
 
-    L_1 and L_ncc count ``v / (v + photo_texture)`` where the reference's texture is v.
+    L_1 and L_ncc count ``v / (v + photo_texture)`` where the reference's texture is v;
+    ``l1_huber`` is a difference here.
     """
     c, total = config, reference.new_zeros(())
     share = texture / (texture + c.photo_texture) if c.photo_texture > 0 else 1.0

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from geogs.config.setting import CountOrZero, Fraction, Only, Positive, Range, Settings, Weight
+from geogs.config.setting import CountOrZero, Only, Positive, Range, Settings, Weight
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,10 @@ class LossConfig(Settings, group="mapping.loss"):
     """L_ds, edge-aware smoothness of depth over its median."""
     l1_weight: Weight = 4.0
     """L_1, difference between a view and its neighbour warped into it."""
-    l1_huber: Fraction = 0.005
-    """Grey difference (of 1) up to which L_1 is quadratic; 0 for the plain absolute value."""
-    l1_cut: Annotated[float, Range(above="l1_huber", most=10)] = 0.1
+    l1_huber: Annotated[float, Range(0, 100)] = 1.345
+    """Deviations of noise between two views up to which their difference is quadratic in L_1; 0
+    for the plain absolute value."""
+    l1_cut: Annotated[float, Range(above=0, most=10)] = 0.1
     """Grey difference (of 1) from which L_1 is constant."""
     ncc_weight: Weight = 0.5
     """L_ncc, 1 - normalised cross-correlation."""

@@ -3,6 +3,7 @@
 On a GPU they are the structs of these names in ``cuda/view_maps.cuh``.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +58,7 @@ class PhotoSettings(NamedTuple):
     """Relative depth difference from which a pixel is hidden."""
     l1: float
     huber: float
+    """Difference up to which L_1 is quadratic over the deviation of the reference's noise."""
     cut: float
     ncc: float
     reject: float
@@ -95,7 +97,7 @@ def photo_settings(config: LossConfig, camera: Camera, weight: float = 1.0) -> P
         min_depth_ratio=MIN_DEPTH_RATIO,
         occlusion=occlusion_tolerance(c, camera),
         l1=weight * c.l1_weight / pixels,
-        huber=max(c.l1_huber, 1e-12),
+        huber=max(math.sqrt(2) * c.l1_huber, 1e-9),
         cut=c.l1_cut,
         ncc=weight * c.ncc_weight / pixels,
         reject=c.ncc_reject,

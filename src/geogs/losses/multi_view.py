@@ -35,6 +35,8 @@ class PhotoView:
     """World to camera, float64."""
     texture: Float[Tensor, "h w"]
     """Variance of the grey values around each pixel over that of their noise; float32."""
+    noise: Float[Tensor, ""]
+    """Variance of the noise in the grey values."""
     colours: Float[Tensor, "3 h w"] | None = None
     """Red, green and blue in [0, 1], smoothed; where they are compared."""
 
@@ -78,7 +80,8 @@ class PhotoView:
         texture = _local_variance(planes[0]) / USUAL_NOISE
         planes = torch.cat([planes, texture[None]]).to(device)
         colours = planes[1:-1] if len(planes) > 2 else None
-        return PhotoView(planes[0], camera, T_cw.detach().double(), planes[-1], colours)
+        noise = planes.new_tensor(USUAL_NOISE)
+        return PhotoView(planes[0], camera, T_cw.detach().double(), planes[-1], noise, colours)
 
     @property
     def planes(self) -> Float[Tensor, "k h w"]:
@@ -99,12 +102,13 @@ class PhotoView:
         return replace(self, T_cw=T_cw)
 
     def in_light(self, light: Float[Tensor, "3"]) -> "PhotoView":
-        """The image as it was prepared with its values times a gain plus an offset, which leaves a
-        noise of so much variance."""
+        """The same image with its values times a gain plus an offset, which leaves a noise of so
+        much variance."""
         gain, offset, noise = light
         colours = None if self.colours is None else gain * self.colours + offset
-        texture = self.texture * (gain.square() * USUAL_NOISE / noise)
-        return replace(self, grey=gain * self.grey + offset, texture=texture, colours=colours)
+        texture = self.texture * (gain.square() * self.noise / noise)
+        grey = gain * self.grey + offset
+        return replace(self, grey=grey, texture=texture, noise=noise, colours=colours)
 
 
 def _local_variance(grey: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -5,6 +5,7 @@ the value, so the backward pass only scales it. Results do not depend on the num
 """
 
 import functools
+import math
 
 import numpy as np
 import torch
@@ -106,6 +107,7 @@ class _MultiView(torch.autograd.Function):
         cameras = (reference.camera, target.camera, seen)
         lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], np.float32)
         settings = record(photo_settings(config, target.camera))
+        settings["huber"] *= math.sqrt(float(reference.noise))
         half = config.ncc_patch // 2 if config.ncc_weight > 0 else -1
         with_depth, with_pose = ctx.needs_input_grad[:2]
 

@@ -33,51 +33,51 @@ struct Correlation {
 };
 
 extern "C" __global__ void __launch_bounds__(128) correlate_3(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<1>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<1>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
 extern "C" __global__ void __launch_bounds__(128, 6) correlate_5(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<2>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<2>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
 extern "C" __global__ void __launch_bounds__(128, 5) correlate_7(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<3>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<3>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
 extern "C" __global__ void __launch_bounds__(128) correlate_9(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<4>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<4>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
 extern "C" __global__ void __launch_bounds__(128) correlate_11(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<5>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<5>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
 extern "C" __global__ void __launch_bounds__(128) correlate_13(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<6>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<6>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
 extern "C" __global__ void __launch_bounds__(128) correlate_15(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Correlation<7>>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Correlation<7>>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }

@@ -42,9 +42,9 @@ struct Structure {
 };
 
 extern "C" __global__ void __launch_bounds__(128) compare_structure(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
-  compare_windows<Structure>(batch, targets, maps, settings, warped, pull, gradient, loss,
+  compare_windows<Structure>(batch, targets, maps, deviations, settings, warped, pull, gradient, loss,
                              height, width, partners, rows, flags);
 }

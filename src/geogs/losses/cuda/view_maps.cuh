@@ -18,7 +18,8 @@ struct SingleViewSettings {
   float min_alpha, relative, normal_epsilon, eta, rewards_edges;
 };
 
-// Weights are divided by the number of pixels and scaled by the share of a pair.
+// Weights are divided by the number of pixels and scaled by the share of a pair. As they come,
+// ``huber`` is in deviations of the reference's noise.
 struct PhotoSettings {
   float fx, fy, cx, cy;
   float min_depth_ratio, occlusion;

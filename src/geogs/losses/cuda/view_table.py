@@ -30,7 +30,7 @@ class ViewTable:
     """Maps and poses of keyframes on a device, one slot each, in any number.
 
     The kernels find them through ``pointers`` and ``poses``, so a captured graph follows whatever
-    slots its input names. Adding slots beyond the capacity replaces these two and ``rendered`` by
+    slots its input names. Adding slots beyond the capacity replaces what has a row for each by
     larger ones and raises ``generation``: graphs captured before must be captured again.
     """
 
@@ -41,7 +41,8 @@ class ViewTable:
         self.photo = photo
         self.device = device
         self.generation = 0
-        """Rises whenever ``pointers``, ``poses`` and ``rendered`` are other tensors than before."""
+        """Rises whenever ``pointers``, ``poses``, ``rendered`` and ``deviations`` are other tensors
+        than before."""
         self.pointers: Int[Tensor, "slots fields"] = torch.zeros(
             capacity, len(ViewField), dtype=torch.int64, device=device
         )
@@ -57,6 +58,8 @@ class ViewTable:
             capacity, dtype=torch.int32, device=device
         )
         """1 where the slot's rendered depth is known."""
+        self.deviations: Float[Tensor, "slots"] = torch.zeros(capacity, device=device)
+        """Standard deviation of the noise in the slots' grey values."""
         self._maps: list[Float[Tensor, "fields h w"]] = []
         self._normals: list[Float[Tensor, "3 h w"] | None] = []
         self._photos: list[Float[Tensor, "k ph pw"]] = []
@@ -83,6 +86,7 @@ class ViewTable:
         while len(self.planes) < len(planes) - 1:
             self.planes.append(torch.zeros_like(self.pointers))
         self._point(slot)
+        self._set_noise(slot, photo)
         if view is not None:
             self.set_constants(slot, view)
         self.set_poses([slot], photo.T_cw[None])
@@ -96,6 +100,7 @@ class ViewTable:
         self._maps[slot].zero_()
         self._photos[slot].copy_(self._uploaded_photo(photo))
         self.rendered[slot : slot + 1].zero_()
+        self._set_noise(slot, photo)
         if view is not None:
             self.set_constants(slot, view)
         self.set_poses([slot], photo.T_cw[None])
@@ -128,6 +133,9 @@ class ViewTable:
         """No rendered depth counts any more, as after the map has moved."""
         self.rendered.zero_()
 
+    def _set_noise(self, slot: int, photo: PhotoView) -> None:
+        self.deviations[slot : slot + 1].copy_(self._upload(photo.noise.sqrt()[None]))
+
     def _uploaded_photo(self, photo: PhotoView) -> Float[Tensor, "k ph pw"]:
         return self._upload(torch.cat([photo.planes, photo.texture[None]]))
 
@@ -157,4 +165,5 @@ class ViewTable:
         self.pointers = self.planes[0]
         self.poses = torch.cat([self.poses, more(self.poses)])
         self.rendered = torch.cat([self.rendered, more(self.rendered)])
+        self.deviations = torch.cat([self.deviations, more(self.deviations)])
         self.generation += 1

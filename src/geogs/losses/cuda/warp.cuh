@@ -121,12 +121,13 @@ extern "C" __global__ void __launch_bounds__(128) begin_window(
 // ``slope`` becomes d loss / d enlarged depth, and ``push`` (unless null) d loss / d warped.
 extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
     const int* batch, const int* targets, const float* motions, const long long* maps,
-    const int* rendered, const float* settings, const float* depth, float* warped, float* slope,
-    float* push, float* loss, int height, int width, int big_height, int big_width, int partners,
+    const int* rendered, const float* deviations, const float* settings, const float* depth,
+    float* warped, float* slope, float* push, float* loss, int height, int width, int big_height, int big_width, int partners,
     int last) {
   const int pair = blockIdx.z, b = pair / partners, target = targets[pair];
   if (target < 0) return;
-  const PhotoSettings c = *(const PhotoSettings*)settings;
+  PhotoSettings c = *(const PhotoSettings*)settings;
+  c.huber *= deviations[batch[b]];
   const PixelMotion motion = *(const PixelMotion*)(motions + 12 * pair);
   const float* image = view_map(maps, target, GREY);
   const float* hidden = rendered[target] ? view_map(maps, target, RENDERED_DEPTH) : 0;

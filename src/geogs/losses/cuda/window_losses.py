@@ -159,7 +159,7 @@ class WindowLosses:
         columns = _blocks(width, 32)
         kernels["warp_pairs"](
             (columns, _blocks(height, _WARP_ROWS), pairs), (32, 8), batch, self._targets,
-            self._motions, pointers, t.rendered, settings, self._clean, self._warped,
+            self._motions, pointers, t.rendered, t.deviations, settings, self._clean, self._warped,
             self._pull, self._image_gradient, loss, *sizes, not windowed,
         )  # fmt: skip
         keep = _Flags.KEEP_GRADIENT if self._with_pose else _Flags(0)
@@ -194,7 +194,8 @@ class WindowLosses:
         strips = _blocks(photo.width, _STRIP - 4 * half)
         grid = (strips, _blocks(photo.height, _STRIP_ROWS), self.views * self.partners)
         self._kernels[kernel](
-            grid, _STRIP, batch, self._targets, pointers, settings, self._warped, self._pull,
+            grid, _STRIP, batch, self._targets, pointers, self.table.deviations, settings,
+            self._warped, self._pull,
             self._image_gradient, loss, photo.height, photo.width,
             self.partners, _STRIP_ROWS, int(flags),
         )  # fmt: skip

@@ -62,8 +62,8 @@ enum { ADD_EARLIER = 1, FINISH = 2, KEEP_GRADIENT = 4 };
 // depth, and with KEEP_GRADIENT the sum is kept in ``gradient``.
 template <class Measure>
 __device__ __forceinline__ void compare_windows(
-    const int* batch, const int* targets, const long long* maps, const float* settings,
-    const float* warped, float* pull, float* gradient, float* loss, int height, int width,
+    const int* batch, const int* targets, const long long* maps, const float* deviations,
+    const float* settings, const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
   const int HALF = Measure::HALF, SIDE = 2 * HALF + 1;
   __shared__ float2 images[2][STRIP];
@@ -73,7 +73,10 @@ __device__ __forceinline__ void compare_windows(
   if (targets[pair] < 0) return;
   // In shared memory, because registers are short here.
   __shared__ PhotoSettings c;
-  if (threadIdx.x == 0) c = *(const PhotoSettings*)settings;
+  if (threadIdx.x == 0) {
+    c = *(const PhotoSettings*)settings;
+    c.huber *= deviations[batch[b]];
+  }
   const size_t plane = (size_t)height * width;
   const PairImages source = {view_map(maps, batch[b], GREY), warped + pair * plane, height, width};
   const float* textures = view_map(maps, batch[b], TEXTURE);
