@@ -48,7 +48,7 @@ class LossConfig(Settings, group="mapping.loss"):
     l1_huber: Annotated[float, Range(0, 100)] = 1.345
     """Deviations of noise between two views up to which their difference is quadratic in L_1; 0
     for the plain absolute value."""
-    l1_cut: Annotated[float, Range(above=0, most=10)] = 0.1
+    l1_cut: Annotated[float, Range(1e-9, 10)] = 0.1
     """Grey difference (of 1) from which L_1 is constant."""
     ncc_weight: Weight = 0.5
     """L_ncc, 1 - normalised cross-correlation."""
