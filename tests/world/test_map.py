@@ -32,7 +32,7 @@ def filled() -> MapTable:
     table.disks.append(DiskParameters(*(torch.randn(s, generator=random) for s in sizes)), 1)
     table.disks.second.position.fill_(0.5)
     search = DepthSearch(1.0, 2.0, 3.0)
-    table.views = {0: ViewRow(), 1: ViewRow([0], search, torch.ones(2), SearchedDepth(2.0, 1.0))}
+    table.views = {0: ViewRow(), 1: ViewRow([0], search, torch.ones(3), SearchedDepth(2.0, 1.0))}
     for name, value in (("depth", 2.0), ("confidence", 0.5)):
         table.arrays.put(name, 1, np.full(SIZE, value, np.float32))
     table.mapped, table.resident, table.unit, table.order = [1], [1], 2.0, [0]
