@@ -197,6 +197,12 @@ def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatc
     bent = error(tracker, truth)
     assert tracker.keyframes.grid.camera == CAMERA
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)  # two dozen keyframes tell little
+    tracker, _ = tracker_of(BEND, -0.05)
+    global_bundle(tracker, ends=True)
+    unsure = tracker.keyframes.table.lens
+    assert unsure is not None
+    assert unsure.focal == 1  # what matches do not know to 5 % does not overrule what was given
+    monkeypatch.setattr(lens_correction, "FOCAL_DOUBT", 1.0)
     tracker, truth = tracker_of(BEND, -0.05)
     global_bundle(tracker, ends=True)
     lens = tracker.keyframes.table.lens

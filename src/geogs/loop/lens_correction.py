@@ -17,6 +17,7 @@ from geogs.bundle.uncertainty.lens_error import (
     SHAPES,
     STANDARD_ERRORS,
     LensBend,
+    LensEstimate,
     lens_prior,
 )
 from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
@@ -43,6 +44,9 @@ keyframes err alike, too: where the lens was known it is 1 to 10, where it was n
 FOCAL_EVIDENCE = 4.0
 """Deviations from which on the focal length is believed to be off, too, where k1 and k2 are. Where
 it was given it is 0 to 2.2 (docs/lens.md)."""
+FOCAL_DOUBT = 0.05
+"""Deviation of the focal length, as a part of it, from which on matches do not overrule one that
+was given: what they know that badly k1 and k2 explain as well."""
 READOUT_DOUBT = 0.05
 """Part of the readout that its deviation has to be for matches to be asked for it, too: what they
 say of it comes out 2 to 6 % short itself (docs/lens.md)."""
@@ -90,7 +94,7 @@ def correct_lens(
                 said = said.told(n, -taken[n], prior)
         if rows is not None:
             said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
-        if ends and not is_asked and abs(said.size[0]) > FOCAL_EVIDENCE * said.deviation[0]:
+        if ends and not is_asked and _contradict_focal(said):
             is_asked, left = True, ROUNDS
         if is_asked:
             said = said.shortened(0, MOST_AT_ONCE)
@@ -122,6 +126,12 @@ def correct_lens(
         return found
     open_focal = math.hypot(*of_focal, FOCAL_LEFT * focal)
     return replace(found, focal=math.exp(focal), deviation_focal=open_focal)
+
+
+def _contradict_focal(said: LensEstimate) -> bool:
+    """Whether matches say for sure that the focal length is another than was given."""
+    size, deviation = abs(float(said.size[0])), float(said.deviation[0])
+    return size > FOCAL_EVIDENCE * deviation and STANDARD_ERRORS * deviation < FOCAL_DOUBT
 
 
 def _rows_in_doubt(log: FrameLog, keyframes: KeyframeSet, readout: float) -> RowErrors | None:
