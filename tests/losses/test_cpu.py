@@ -116,7 +116,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
     full = torch.nn.functional.interpolate(depth.nan_to_num(0.0)[None, None], (120, 160))[0, 0]
     odd = torch.nn.functional.interpolate(depth.nan_to_num(0.0)[None, None], (43, 61))[0, 0]
     config = LossConfig(
-        l1_weight=1.0, l1_huber=1.4, l1_cut=0.2, ncc_patch=7, photo_texture=30.0
+        l1_weight=1.0, l1_huber=0.8, l1_cut=0.2, ncc_patch=7, photo_texture=0.3
     )  # fmt: skip
     for module in (multi_view_reference, kernel_settings):
         monkeypatch.setattr(module, "NCC_MIN_VARIANCE", 1e-4)
@@ -129,7 +129,7 @@ def test_the_photometric_size_may_equal_the_render_size_or_be_no_multiple(monkey
         b.backward()
         # In float32 a few windows fall on the other side of a threshold.
         assert float(a.detach()) == pytest.approx(float(b.detach()), rel=5e-4)
-        assert relative(fast.grad, slow.grad) < 1e-2
+        assert relative(fast.grad, slow.grad) < 5e-3
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:

@@ -67,7 +67,9 @@ LOSS = MappingConfig().loss
 
 
 def test_training_an_excerpt_is_training_the_map(monkeypatch):
-    config = replace(MappingConfig(), disk=DiskConfig(max_scale=1.0))
+    # Not by noise: where all is nearly quadratic, rounding is a larger part of what moves disks.
+    loss = replace(LOSS, l1_huber=0.35, photo_texture=0.0)
+    config = replace(MappingConfig(), disk=DiskConfig(max_scale=1.0), loss=loss)
     trained = []
     for share in (0.7, 0.0):  # 0: always the whole map
         monkeypatch.setattr(training, "_LARGE_EXCERPT", share)
@@ -82,9 +84,9 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
     first, second = trained
     # Equal but for the rounding of loops that are cut at other disks.
     for p, q in zip(first.disks.parameters, second.disks.parameters, strict=True):
-        torch.testing.assert_close(p, q, rtol=0, atol=1e-5)
+        torch.testing.assert_close(p, q, rtol=0, atol=2e-6)
     for p, q in zip(first.disks.second, second.disks.second, strict=True):
-        torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-12)
+        torch.testing.assert_close(p, q, rtol=1e-4, atol=1e-12)
     assert torch.equal(first.disks.steps, second.disks.steps)
     assert torch.equal(first.disks.seen, second.disks.seen)
     assert int(first.disks.seen.sum()) > 100
