@@ -1,11 +1,19 @@
 """Points followed through images whose motion is known."""
 
+from collections.abc import Generator
+
 import cv2
 import numpy as np
 
 from geogs.geometry.camera import Camera
 from geogs.shutter import clip_tracks as clip_tracks_module
-from geogs.shutter.clip_tracks import LEAST_SEEN, clip_tracks, followed_points
+from geogs.shutter.clip_tracks import (
+    LEAST_SEEN,
+    FollowedClips,
+    even,
+    followed_clip,
+    followed_points,
+)
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.types import Frame
 
@@ -83,13 +91,58 @@ def test_light_that_falls_off_moves_no_points(monkeypatch):
 def test_an_image_that_shows_few_points_is_left_out():
     clip = [Frame(k, k / 30, np.repeat(i[..., None], 3, 2)) for k, i in enumerate(images(12))]
     camera = RollingCamera(Camera(150.0, 150.0, 79.5, 59.5, *SIZE))
-    whole = clip_tracks(clip, camera)
+    whole = followed_clip(clip)
     grey = np.full_like(clip[0].image, 128)
     clip[:3] = [Frame(k, k / 30, grey) for k in range(3)]
-    shorter = clip_tracks(clip, camera)
+    shorter = followed_clip(clip)
     assert whole is not None
     assert shorter is not None
+    whole, shorter = whole.through(camera), shorter.through(camera)
     assert (len(whole.times), whole.middle) == (12, 6)
     assert (len(shorter.times), shorter.middle) == (9, 3)
     assert shorter.seen.sum(axis=1).min() >= LEAST_SEEN
     np.testing.assert_allclose(shorter.times, (np.arange(3, 12) - 6) / 30, atol=1e-12)
+
+
+def test_points_are_seen_where_the_camera_has_their_rays():
+    clip = [Frame(k, k / 30, np.repeat(i[..., None], 3, 2)) for k, i in enumerate(images(9))]
+    followed = followed_clip(clip)
+    assert followed is not None
+    camera = RollingCamera(Camera(150.0, 140.0, 79.5, 59.5, *SIZE), (-0.1, 0.02, 0.0, 0.0))
+    tracks = followed.through(camera)
+    seen = np.isfinite(followed.pixels[..., 0])
+    np.testing.assert_array_equal(tracks.seen, seen)
+    again = camera.pixels(np.column_stack([tracks.plane[seen], np.ones(seen.sum())]))
+    np.testing.assert_allclose(again, followed.pixels[seen], atol=1e-3)
+    assert not tracks.plane[~seen].any()
+
+
+def test_a_bare_image_is_evened_to_grey():
+    """Sums that run along its rows may leave a contrast a little below nothing."""
+    bare = np.full((240, 320), 255, np.uint8)
+    bare[:, :90] = np.random.default_rng(0).integers(0, 255, (240, 90))
+    with np.errstate(invalid="raise"):
+        evened = even(bare)
+    np.testing.assert_array_equal(evened[:, 250:], 128)
+
+
+def test_clips_are_read_and_followed_once():
+    clip = [Frame(k, k / 30, np.repeat(i[..., None], 3, 2)) for k, i in enumerate(images(9))]
+    read: list[int] = []
+
+    def clips(first: int) -> Generator[list[Frame], None, None]:
+        for n in range(first, 5):
+            read.append(n)
+            yield clip if n != 1 else clip[:4]
+
+    followed, told = FollowedClips(clips), list[float]()
+    first = next(followed.up_to((2, 4, 12), told.append))
+    assert read == [0, 1]
+    assert len(first) == 1  # the other is too short
+    assert told == [1 / 12, 2 / 12]
+    groups = list(followed.up_to((2, 4, 12), told.append))
+    assert read == [0, 1, 2, 3, 4]
+    assert [len(group) for group in groups] == [1, 2, 1]
+    assert groups[0][0] is first[0]
+    assert list(map(len, followed.up_to((3, 12), told.append))) == [2, 2]
+    assert read == [0, 1, 2, 3, 4]

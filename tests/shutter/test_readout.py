@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from geogs.geometry.distortion import USUAL_BEND
+from geogs.shutter.clip_tracks import FollowedClips
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.readout import (
     CLIP,
@@ -163,7 +164,8 @@ def test_clips_that_disagree_are_not_believed():
 
 
 def test_a_video_without_texture_or_images_tells_nothing():
-    assert find_readout([], RollingCamera(CAMERA)) == FoundReadout()
+    none = FollowedClips(lambda first: (clip for clip in ()))
+    assert find_readout(none, RollingCamera(CAMERA)) == FoundReadout()
 
 
 def clips(readout: float) -> list[list]:
@@ -183,7 +185,9 @@ def clips(readout: float) -> list[list]:
 )
 def test_a_rendered_video_tells_its_readout(readout, least, most):
     done = []
-    found = find_readout(clips(readout), RollingCamera(CAMERA), done.append)
+    followed = FollowedClips(lambda first: (clip for clip in clips(readout)[first:]))
+    found = find_readout(followed, RollingCamera(CAMERA), done.append)
+    assert find_readout(followed, RollingCamera(CAMERA)) == found
     assert least <= found.readout <= most
     assert done == sorted(done)
     assert done[-1] == 1.0

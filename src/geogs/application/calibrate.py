@@ -1,9 +1,10 @@
 """Before a run: focal length and shutter that nobody gave, from the video itself."""
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -17,12 +18,11 @@ from geogs.shutter.shutter import Shutter
 from geogs.types import FoundLens
 
 if TYPE_CHECKING:
-    from geogs.io.sources.reader import RawFrame
     from geogs.shutter.readout import FoundReadout
     from geogs.tracking.calibration.self_calibration import SelfCalibration
 
-T = TypeVar("T")
 F = TypeVar("F")
+Report = Callable[[float], None]
 
 
 def self_calibrated(
@@ -45,15 +45,10 @@ def self_calibrated(
                 "--intrinsics fx,fy,cx,cy for a better result."
             )
         return source
-    from geogs.tracking.calibration.self_calibration import self_calibrate
-
     radial = config.calibration.radial and not source.calibration.is_distorted
     rectified = _with_rows_rectified(source, progress, stop)
-    found = None if rectified is None else _found_in(
-        rectified.linked_frames(), "calibration", progress, stop,
-        lambda frames, report: self_calibrate(
-            frames, source.camera, radial, device, report, source.mask, source.black_is_masked
-        ),
+    found = None if rectified is None else _found(
+        "calibration", progress, stop, partial(_self_calibration, rectified, radial, device)
     )  # fmt: skip
     if found is None:
         progress.write(
@@ -64,6 +59,17 @@ def self_calibrated(
     calibration = refined(source.calibration, source.camera.fx, found)
     progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
+
+
+def _self_calibration(
+    source: Source, radial: bool, device: str | torch.device, report: Report
+) -> "SelfCalibration":
+    from geogs.tracking.calibration.self_calibration import self_calibrate
+
+    with closing(source.linked_frames()) as frames:
+        return self_calibrate(
+            frames, source.camera, radial, device, report, source.mask, source.black_is_masked
+        )
 
 
 def refined(
@@ -140,10 +146,7 @@ def with_shutter_found(
     progress, stop = progress or RunProgress(), stop or Stop()
     if not source.is_shutter_open:
         return source
-    found = _found_in(
-        source.clips(), "shutter", progress, stop,
-        lambda clips, report: _readout(source, clips, report),
-    )  # fmt: skip
+    found = _found("shutter", progress, stop, partial(_readout, source))
     if found is None:
         progress.write(
             "The search for the shutter's readout is stopped; going on with a global shutter. "
@@ -166,23 +169,21 @@ def _with_rows_rectified(source: Source, progress: RunProgress, stop: Stop) -> S
     request to stop."""
     if not source.is_shutter_open:
         return source
-    found = _found_in(
-        source.clips(), "calibration", progress, stop,
-        lambda clips, report: _readout(source, clips, lambda fraction: report(0.0)),
+    found = _found(
+        "calibration", progress, stop,
+        lambda report: _readout(source, lambda fraction: report(0.0)),
     )  # fmt: skip
     return None if found is None else source.with_shutter(Shutter(found.readout))
 
 
-def _readout(
-    source: Source, clips: "Iterator[list[RawFrame]]", report: Callable[[float], None]
-) -> "FoundReadout":
+def _readout(source: Source, report: Report) -> "FoundReadout":
     from geogs.geometry.distortion import USUAL_BEND
     from geogs.shutter.readout import find_readout
 
     calibration = source.calibration
     focal = max(calibration.focal_deviation, 1e-4)  # 0 where somebody said it
     lens = (focal, *USUAL_BEND) if calibration.is_unknown_lens else ()
-    return find_readout(clips, source.rolling_camera, report, lens)
+    return find_readout(source.followed_clips, source.rolling_camera, report, lens)
 
 
 def _evidence(found: "FoundReadout") -> str:
@@ -193,22 +194,16 @@ def _evidence(found: "FoundReadout") -> str:
     return f"{found.clips} clips say {best:.1f} ms, standard error {error:.1f} ms"
 
 
-def _found_in(
-    images: Generator[T, None, None],
-    stage: str,
-    progress: RunProgress,
-    stop: Stop,
-    find: Callable[[Iterator[T], Callable[[float], None]], F],
-) -> F | None:
-    """What is found in some images; none after a request to stop."""
+def _found(stage: str, progress: RunProgress, stop: Stop, find: Callable[[Report], F]) -> F | None:
+    """What is found; none after a request to stop."""
 
     def report(fraction: float) -> None:
         progress.stage(stage, fraction)
         stop.check()
 
-    with stop, closing(images):
+    with stop:
         try:
-            return find(images, report)
+            return find(report)
         except KeyboardInterrupt:
             if not stop.requested:
                 raise

@@ -1,7 +1,8 @@
 """Points followed through a few neighbouring images, as rays with the time of their row."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import cv2
@@ -10,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from geogs.shutter.neighbours import Image
 from geogs.shutter.rolling_camera import RollingCamera
+from geogs.threads import thread_map
 
 MOST_POINTS = 160
 LEAST_POINTS = 30
@@ -17,6 +19,8 @@ LEAST_IMAGES = 8
 """That a point is followed through."""
 LEAST_SEEN = 24
 """Points of an image that counts."""
+LONGEST_INTERVAL = 0.26
+"""Seconds between two images; over more, nothing says how points move from one to the next."""
 POINTS, QUALITY, APART = 250, 0.005, 8
 """Corners, at most; the least strength of one against the strongest; pixels between two."""
 WINDOW, LEVELS = 15, 3
@@ -49,13 +53,33 @@ class ClipTracks:
         return int(np.abs(self.times).argmin())
 
 
-def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | None:
+@dataclass(frozen=True)
+class FollowedClip:
+    """Where points are in the images of a clip, whatever camera took them."""
+
+    pixels: Float[np.ndarray, "k n 2"]
+    """nan where a point is not seen."""
+    times: Float[np.ndarray, "k"]
+    """Seconds of the middle rows, from that of the middle image."""
+
+    def through(self, camera: RollingCamera) -> ClipTracks:
+        """The points as rays of the camera that took the images."""
+        seen = np.isfinite(self.pixels[..., 0])
+        plane, line_times = np.zeros_like(self.pixels), np.zeros(seen.shape)
+        rays = camera.rays(self.pixels[seen])
+        plane[seen] = rays[:, :2] / rays[:, 2:]
+        line_times[seen] = camera.line_times(self.pixels[seen])
+        return ClipTracks(plane, line_times, seen, self.times)
+
+
+def followed_clip(clip: Sequence[Image]) -> FollowedClip | None:
     """Corners of the middle image, those that are seen longest; none where they are too few.
 
-    Args:
-        clip: neighbours in a video, all of which could be read.
-        camera: that took them.
+    Nor is there any where images are too few, too far apart, or could not all be read.
     """
+    intervals = np.diff([image.timestamp for image in clip])
+    if len(clip) < LEAST_IMAGES or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
+        return None
     images = [cv2.cvtColor(i.image, cv2.COLOR_RGB2GRAY) for i in clip if i.image is not None]
     if len(images) < len(clip):
         return None
@@ -67,15 +91,41 @@ def clip_tracks(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | No
         return None
     # Where a fast turn leaves few of them, they do not tell a pose.
     enough = np.isfinite(pixels[..., 0]).sum(axis=1) >= LEAST_SEEN
-    pixels, kept = pixels[enough], [i for i, e in zip(clip, enough, strict=True) if e]
-    if len(kept) < LEAST_IMAGES:
+    if enough.sum() < LEAST_IMAGES:
         return None
-    seen = np.isfinite(pixels[..., 0])
-    plane, line_times = np.zeros_like(pixels), np.zeros(seen.shape)
-    rays = camera.rays(pixels[seen])
-    plane[seen], line_times[seen] = rays[:, :2] / rays[:, 2:], camera.line_times(pixels[seen])
-    times = np.array([image.timestamp for image in kept])
-    return ClipTracks(plane, line_times, seen, times - clip[len(clip) // 2].timestamp)
+    times = np.array([image.timestamp for image in clip])
+    return FollowedClip(pixels[enough], times[enough] - clip[len(clip) // 2].timestamp)
+
+
+class FollowedClips:
+    """Clips of a video, followed when somebody asks for them, and no more than once."""
+
+    def __init__(self, read: Callable[[int], Generator[Sequence[Image], None, None]]) -> None:
+        """``read`` gives the clips from a number on."""
+        self.read = read
+        self._known: list[FollowedClip | None] = []
+
+    def up_to(
+        self, counts: Sequence[int], report: Callable[[float], None]
+    ) -> Generator[list[FollowedClip], None, None]:
+        """Clips up to the first of ``counts``, from there to the second, and so on until there are
+        no more; of each group those that tell something. Several are followed at a time, and
+        ``report`` gets how many there are by then, as a part of the last count."""
+        given = 0
+        with closing(self.read(len(self._known))) as unread:
+            for count in counts:
+                known = len(self._known)
+                new = list(itertools.islice(unread, max(count - known, 0)))
+
+                def done(fraction: float, known: int = known, new: int = len(new)) -> None:
+                    report(min(1.0, (known + fraction * new) / counts[-1]))
+
+                self._known += thread_map(followed_clip, new, done)
+                group = self._known[given:count]
+                if not group:
+                    return
+                given += len(group)
+                yield [clip for clip in group if clip is not None]
 
 
 def followed_points(images: _Images) -> Float[np.ndarray, "k n 2"]:
@@ -142,7 +192,8 @@ def even(image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """
     grey = image.astype(np.float32)
     left = grey - cv2.blur(grey, (NEAR, NEAR))
-    contrast = cv2.sqrt(cv2.blur(left * left, (AROUND, AROUND)))
+    # Of sums that run along a row, what is left of a bare part may be a little below 0.
+    contrast = np.sqrt(np.maximum(cv2.blur(left * left, (AROUND, AROUND)), 0))
     evened = 128.5 + CONTRAST * left / (contrast + FAINT)
     return np.clip(evened, 0, 255).astype(np.uint8)
 

@@ -7,8 +7,8 @@ stays the same. Errors of the matches change slowly and are hardly taken for it.
 """
 
 import functools
-import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,9 +16,8 @@ from jaxtyping import Float
 
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.clip_tracks import LEAST_IMAGES, ClipTracks, clip_tracks
+from geogs.shutter.clip_tracks import ClipTracks, FollowedClips
 from geogs.shutter.first_reconstruction import first_reconstruction
-from geogs.shutter.neighbours import Image
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.row_adjustment import NODES, ReadoutEquation, readout_equation
 from geogs.threads import thread_map
@@ -32,8 +31,6 @@ ENOUGH_CLIPS, ENOUGH = (5, 7, 9), 0.002
 """No more clips are looked at where so many leave a standard error of so many seconds."""
 CONFIDENT, SMALL = 3.0, 0.01
 """Nor where the readout is less than so many seconds by so many standard errors."""
-LONGEST_INTERVAL = 0.26
-"""Seconds between two images; over more, nothing says how points move from one to the next."""
 FIRST_TOLERANCE = 1.2
 """Pixels of an inlier between the two views that a clip begins with."""
 EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
@@ -183,7 +180,7 @@ class _CommonReadout:
 
 
 def find_readout(
-    clips: Iterable[Sequence[Image]],
+    clips: FollowedClips,
     camera: RollingCamera,
     report: Report = lambda fraction: None,
     lens: tuple[float, ...] = (),
@@ -191,8 +188,7 @@ def find_readout(
     """Find the readout with which clips of a video fit best; 0 unless it is clearly better.
 
     Args:
-        clips: up to ``CLIP`` neighbours in the video each; no more are taken than are needed, and
-            the points of several are followed at a time.
+        clips: up to ``CLIP`` neighbours in the video each; no more are taken than are needed.
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
         lens: standard deviations of a lens that is not known: of the relative focal length, k1 and
@@ -202,38 +198,20 @@ def find_readout(
     begun = {1.0: list[_Adjusted]()}
     if lens and lens[0] > ASSUMED:
         begun[SHORTER] = []
-    focal, left, seen = camera.camera.fx, iter(clips), 0
-    for enough in (*ENOUGH_CLIPS, CLIPS):
-        group = list(itertools.islice(left, enough - seen))
-        done = functools.partial(_reported, report, seen, len(group))
-        followed = thread_map(functools.partial(_followed, camera=camera), group, done)
-        tracks = [clip for clip in followed if clip is not None]
-        seen += len(group)
-        if seen < enough and not group:
-            break
-        for factor, starts in begun.items():
-            of_clip = functools.partial(_started, focal=focal, factor=factor)
-            starts += [start for start in thread_map(of_clip, tracks) if start is not None]
-        ends = {factor: _adjusted(starts, focal, lens, factor) for factor, starts in begun.items()}
-        best = max(ends, key=lambda factor: ends[factor].explained)
-        begun, found = {best: begun[best]}, _verdict(ends[best], focal)
-        if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
-            break
+    focal = camera.camera.fx
+    with closing(clips.up_to((*ENOUGH_CLIPS, CLIPS), report)) as groups:
+        for group in groups:
+            tracks = [clip.through(camera) for clip in group]
+            for factor, starts in begun.items():
+                of_clip = functools.partial(_started, focal=focal, factor=factor)
+                starts += [start for start in thread_map(of_clip, tracks) if start is not None]
+            ends = {f: _adjusted(starts, focal, lens, f) for f, starts in begun.items()}
+            best = max(ends, key=lambda factor: ends[factor].explained)
+            begun, found = {best: begun[best]}, _verdict(ends[best], focal)
+            if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
+                break
     report(1.0)
     return found
-
-
-def _reported(report: Report, before: int, group: int, fraction: float) -> None:
-    """Tell what is done when so much is of some clips, before which there were others."""
-    report(min(1.0, (before + fraction * group) / CLIPS))
-
-
-def _followed(clip: Sequence[Image], camera: RollingCamera) -> ClipTracks | None:
-    """The points of a clip; none where its images are too few or too far apart."""
-    intervals = np.diff([image.timestamp for image in clip])
-    if len(clip) < LEAST_IMAGES or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
-        return None
-    return clip_tracks(clip, camera)
 
 
 def _started(tracks: ClipTracks, focal: float, factor: float) -> _Adjusted | None:

@@ -133,7 +133,7 @@ def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
     for k in range(14):
         write_image(tmp_path / f"{k:03d}.png", np.full((48, 64, 3), k, np.uint8))
     source = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=1, stop=13, stride=2))
-    given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.clips()]
+    given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.followed_clips.read(0)]
     assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
     assert clips.clip_starts(0, 2, 3) == []
     assert clips.clip_starts(4, 5, 3) == [4, 6]
@@ -145,7 +145,9 @@ def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
     images = [np.full((48, 64, 3), 12 * k, np.uint8) for k in range(12)]
     write_video(tmp_path / "video.mp4", images)
     source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5", start=1))
-    given = [[round(raw.image.mean() / 12) for raw in clip] for clip in source.clips()]
+    given = [
+        [round(raw.image.mean() / 12) for raw in clip] for clip in source.followed_clips.read(0)
+    ]
     assert given == [[1, 2, 3], [3, 4, 5], [5, 6, 7], [7, 8, 9], [9, 10, 11]]
 
 
@@ -155,7 +157,7 @@ def test_clips_of_few_images_a_second_last_three_seconds(tmp_path, interval, ima
     times = [interval * k for k in range(40)]
     write_video(tmp_path / "video.mp4", shown, times)
     source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5"))
-    assert {len(clip) for clip in source.clips()} == {images}
+    assert {len(clip) for clip in source.followed_clips.read(0)} == {images}
 
 
 def test_who_says_what_the_shutter_is(folder):

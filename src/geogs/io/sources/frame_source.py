@@ -10,6 +10,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.reader import RawFrame, fingerprint_of
 from geogs.io.sources.working_images import WorkingImages
+from geogs.shutter.clip_tracks import FollowedClips
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.shutter import Shutter
 from geogs.types import FoundLens, Frame
@@ -194,12 +195,13 @@ class Source:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`clips` gives."""
+        """The camera of the images of ``followed_clips``."""
         return self._recordings[0].rolling_camera
 
-    def clips(self) -> Generator[list[RawFrame], None, None]:
-        """Neighbouring images of the first recording at working size, as they came."""
-        return self._recordings[0].clips()
+    @property
+    def followed_clips(self) -> FollowedClips:
+        """Of the first recording's images at working size, as they came."""
+        return self._recordings[0].followed_clips
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """The frames of the first recording, between which there is no cut."""

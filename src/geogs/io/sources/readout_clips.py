@@ -1,6 +1,8 @@
 """Clips of neighbouring images from all over a source, which tell its shutter's readout."""
 
+import itertools
 from collections.abc import Callable, Generator
+from contextlib import closing
 
 from geogs.config import InputConfig
 from geogs.io.sources.reader import RawFrame, Reader, read_side_by_side
@@ -11,9 +13,12 @@ MINUTE = 60.0
 
 
 def read_clips(
-    reader: Reader, config: InputConfig, resized: Callable[[RawFrame], RawFrame]
+    reader: Reader,
+    config: InputConfig,
+    resized: Callable[[RawFrame], RawFrame],
+    first: int = 0,
 ) -> Generator[list[RawFrame], None, None]:
-    """Neighbouring images of the selection, ``resized``; the stride does not count.
+    """Neighbouring images of the selection, ``resized``, from a clip on; the stride does not count.
 
     They are as many as tell the readout. A video can only be read from its beginning on, so that
     they come from its first minute.
@@ -22,22 +27,27 @@ def read_clips(
     clip = min(CLIP, max(1, round(SPAN * reader.info.fps)))
     count = min(ends) - config.start if ends else clip * CLIPS
     if len(reader.paths) > 1:
-        starts = clip_starts(config.start, count, clip)
-        yield from read_side_by_side(
-            lambda n: list(map(resized, reader.read(n, n + clip, 1))), starts
+        # Image by image, as those that are read ahead are given up where the clips so far suffice.
+        starts = clip_starts(config.start, count, clip)[first:]
+        images = read_side_by_side(
+            lambda n: [*map(resized, reader.read(n, n + 1, 1))],
+            (n for start in starts for n in range(start, start + clip)),
         )
+        with closing(images):
+            for _ in starts:
+                yield [*itertools.chain.from_iterable(itertools.islice(images, clip))]
         return
-    starts = clip_starts(config.start, min(count, round(MINUTE * reader.info.fps)), clip)
+    starts = clip_starts(config.start, min(count, round(MINUTE * reader.info.fps)), clip)[first:]
     if not starts:
         return
-    images: list[RawFrame] = []
+    latest: list[RawFrame] = []
     raws = reader.read(starts[0], starts[-1] + clip, 1)
     for position, raw in enumerate(raws, starts[0]):
         if any(start <= position < start + clip for start in starts):
-            images.append(resized(raw))
+            latest.append(resized(raw))
         if position - clip + 1 in starts:
-            yield images[-clip:]
-        del images[:-clip]
+            yield latest[-clip:]
+        del latest[:-clip]
 
 
 def clip_starts(first: int, count: int, clip: int) -> list[int]:

@@ -31,6 +31,7 @@ from geogs.io.sources.reader import (
 from geogs.io.sources.readout_clips import read_clips
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.angular_motion import AngularMotion
+from geogs.shutter.clip_tracks import FollowedClips
 from geogs.shutter.neighbours import with_angular_motion
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
@@ -57,11 +58,12 @@ class WorkingImages:
         calibration: Calibration | None = None,
         shutter: Shutter | None = None,
         focal: float | None = None,
+        followed_clips: FollowedClips | None = None,
     ) -> None:
         """``calibration`` of the upright images, where it is known better than the reader's.
 
         ``shutter``, where it is known better than the settings'; ``focal`` of the working images
-        instead of what the settings ask for.
+        instead of what the settings ask for; ``followed_clips`` of the same recording.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -88,6 +90,8 @@ class WorkingImages:
         self.shutter = shutter or given
         """By which rows are rectified; a global one until it is found."""
         self._focal = focal
+        self.followed_clips = followed_clips or FollowedClips(self._clips)
+        """From all over the selection, of images at working size, lens and rows as they came."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
         self.camera = self._rectifier.camera
         """The pinhole camera of the working images."""
@@ -138,8 +142,9 @@ class WorkingImages:
         info = self.reader.info
         known = calibration.fit(info.width, info.height) if calibration else self.calibration
         return WorkingImages(
-            self.reader, self._config, known, shutter or self.shutter, focal or self._focal
-        )
+            self.reader, self._config, known, shutter or self.shutter, focal or self._focal,
+            self.followed_clips,
+        )  # fmt: skip
 
     @property
     def is_shutter_open(self) -> bool:
@@ -148,15 +153,14 @@ class WorkingImages:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`clips` gives."""
+        """The camera of the images of ``followed_clips``."""
         info = self.reader.info
         turns = info.quarter_turns
         lines = info.width if turns % 2 else info.height
         return self._rectifier.rolling_camera(lines, turns)
 
-    def clips(self) -> Generator[list[RawFrame], None, None]:
-        """Neighbouring images at working size as they came, from all over the selection."""
-        return read_clips(self.reader, self._config, self._at_working_size)
+    def _clips(self, first: int) -> Generator[list[RawFrame], None, None]:
+        return read_clips(self.reader, self._config, self._at_working_size, first)
 
     def _at_working_size(self, raw: RawFrame) -> RawFrame:
         """The image at working size, lens and rows as they came."""
