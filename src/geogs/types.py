@@ -79,6 +79,10 @@ class FlowMatch:
         best = torch.quantile(weight.float(), 0.98, dim=-1, keepdim=True)
         return (weight > 0) & (weight > 0.01 * best)
 
+    def only_sure(self) -> "FlowMatch":
+        """Positions and weights, those of cells alone that a geometry may be guessed from."""
+        return FlowMatch(self.pixels, torch.where(self.sure()[..., None], self.weight, 0.0))
+
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Frame(ShortRepr):

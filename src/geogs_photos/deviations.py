@@ -108,7 +108,7 @@ def _covariance(model: Any, config: Any, options: Any) -> Any | None:
 
 
 def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"] | None:
-    """The covariance of all poses; none where a pose was not free."""
+    """The covariance of all poses; none where a pose was not free, or what it is overflows."""
     joint = np.zeros((6 * len(numbers), 6 * len(numbers)))
     for a, one in enumerate(numbers):
         for b, other in enumerate(numbers[: a + 1]):
@@ -120,4 +120,4 @@ def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"
                 return None
             joint[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] = block
             joint[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] = block.T
-    return joint
+    return joint if np.isfinite(joint).all() else None

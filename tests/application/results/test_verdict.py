@@ -41,7 +41,8 @@ def test_a_good_run_says_how_good():
         (20, 0.001, 0.01, "the camera was lost in 33% of the frames"),
         (30, 0.1, 0.01, "its place is known only to 28% of the extent"),
         (30, 0.001, 0.4, "even the best known depths are known only to 40%"),
-        (30, 0.001, np.inf, "depths are known only to nothing"),
+        (30, 0.001, np.inf, "nothing tells the depths of what it sees"),
+        (30, np.inf, 0.01, "Not to be relied on: nothing tells its place."),
     ],
 )
 def test_a_bad_run_says_why(tracked, position, depth, reason):

@@ -124,6 +124,18 @@ def test_noise_alone_speaks_for_a_rotation_and_parallax_for_more(seed: int) -> N
     assert angle(moved.R, T) < 0.5
 
 
+def test_guesses_do_not_outvote_matches() -> None:
+    """What a network guesses of bare walls agrees with a rotation and with more."""
+    T = turned(0.02, -0.15, 0.03)
+    T[:3, 3] = 0.1, 0.03, 0.0
+    match = flow(T, DEPTH, SIGMA, 0)
+    guessed = torch.arange(GRID.size) % 4 > 0
+    match.weight[0, guessed] = 1 / 12**2
+    found = two_view_rotation(GRID, match)
+    assert found is not None
+    assert not found.is_pure
+
+
 def test_nothing_is_said_of_noise() -> None:
     rng = np.random.default_rng(0)
     pixels = torch.from_numpy(rng.uniform(0, 140, (1, GRID.size, 2))).float()

@@ -169,3 +169,14 @@ def test_a_step_beside_a_turn_is_parallax() -> None:
     view = two_view(CAMERA, match)
     assert view is not None
     assert has_moved_surely(SampleGrid(CAMERA), match, view.T_ji)
+
+
+def test_guesses_do_not_outvote_parallax() -> None:
+    """Of a bare wall a rotation explains what a network guesses as well as a motion does."""
+    depth = torch.from_numpy(render(pose(0.0))[1][4:-3:8, 4:-3:8].reshape(-1).copy()).float()
+    match = _flow(depth, pose(0.1, 0.05, 0.1, 0.02))
+    weight = match.weight * 100
+    view = two_view(CAMERA, FlowMatch(match.pixels, weight))
+    assert view is not None
+    weight[:, torch.arange(weight.shape[1]) % 8 > 0] = 1 / 12**2
+    assert has_moved_surely(SampleGrid(CAMERA), FlowMatch(match.pixels, weight), view.T_ji)

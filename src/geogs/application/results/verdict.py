@@ -85,14 +85,15 @@ def verdict(
     if orientation_only > MAX_ORIENTATION_ONLY:
         reasons.append(f"of {orientation_only:.0%} of the frames only the orientation is known")
     if not position <= MAX_POSITION_DEVIATION:
-        reasons.append(f"its place is known only to {_percent(position)} of the extent of its path")
+        known_to = "its place is known only to {:.0%} of the extent of its path"
+        reasons.append(_known_to(position, known_to, "nothing tells its place"))
     if not depth <= MAX_DEPTH_DEVIATION:
-        reasons.append(f"even the best known depths are known only to {_percent(depth)}")
+        known_to = "even the best known depths are known only to {:.0%}"
+        reasons.append(_known_to(depth, known_to, "nothing tells the depths of what it sees"))
     if not known.focal <= MAX_FOCAL_DEVIATION:
-        reasons.append(
-            "nobody said its focal length and the video tells it only to "
-            f"{_percent(known.focal)}: give --intrinsics"
-        )
+        known_to = "the video tells it only to {:.0%}"
+        told = _known_to(known.focal, known_to, "the video does not tell it")
+        reasons.append(f"nobody said its focal length and {told}: give --intrinsics")
     elif not is_explained:
         reasons.append(
             "no camera explains how its first views move, as if much of what they show moves "
@@ -124,5 +125,6 @@ def _finely(value: float) -> str:
     return f"{value:.1%}" if value >= 0.001 else f"{100 * value:.1g}%"
 
 
-def _percent(value: float) -> str:
-    return f"{value:.0%}" if value < 10 else "nothing"
+def _known_to(deviation: float, known: str, unknown: str) -> str:
+    """One clause or, where a deviation is so large that it says nothing, another."""
+    return known.format(deviation) if deviation < 10 else unknown

@@ -62,12 +62,12 @@ class TwoViewRotation:
 def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | None:
     """The rotation between two views by the model that their flow (one edge) speaks for.
 
-    None where too few cells agree with either.
+    None where too few cells agree with either. Those that are merely guessed have no say.
     """
-    rotated = fit_rotation(grid, match)
+    pair = match.on_cpu().only_sure()
+    rotated = fit_rotation(grid, pair)
     if rotated is None:
         return None
-    pair = match.on_cpu()
     moved = relative_pose(grid.camera, pair)
     if moved is not None:
         T_ji = torch.from_numpy(moved[0])

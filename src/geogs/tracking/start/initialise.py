@@ -100,10 +100,13 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
 
 def has_moved_surely(grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]) -> bool:
     """Whether a flow (one edge, on the CPU) speaks for a relative pose, not for a rotation alone,
-    with matches as unsure as the camera's model leaves them."""
-    moved = (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
-    weight = match.weight / (1 + match.weight * (MODEL_ERROR * moved).square())
-    unsure = replace(match, weight=weight)
+    with matches as unsure as the camera's model leaves them.
+
+    Guesses have no say: of a bare wall they agree with either, and each speaks for the simpler one.
+    """
+    sure, moved = match.only_sure(), (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
+    weight = sure.weight / (1 + sure.weight * (MODEL_ERROR * moved).square())
+    unsure = replace(sure, weight=weight)
     rotated = fit_rotation(grid, unsure)
     return rotated is None or has_moved(grid, unsure, rotated, T_ji)
 

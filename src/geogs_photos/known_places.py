@@ -1,0 +1,40 @@
+"""Frames of a video whose place structure from motion does not know."""
+
+from typing import Any
+
+import numpy as np
+
+from geogs.application.results.verdict import MAX_POSITION_DEVIATION
+from geogs.evaluation.trajectory_errors import extent_of
+from geogs_photos.deviations import pose_deviations
+from geogs_photos.incremental_mapping import LEAST_IMAGES, placed_images, world_to_camera
+
+OUTLYING = 3.0
+"""Times the median deviation: where all are unsure, that is for the verdict to say."""
+
+
+def of_known_places(model: Any, is_known: bool) -> Any:
+    """A reconstruction whose frames' places its matches tell; the others lose their poses.
+
+    What sees little but far things, or the rest of the world along one direction alone, lies
+    anywhere on a line as far as its matches go, and thereby stretches the extent of the path that
+    places are to be known by. So the worst go first, until all are known to
+    ``MAX_POSITION_DEVIATION`` of it.
+
+    Args:
+        model: by incremental or global mapping.
+        is_known: whether the camera was given, or found along with the poses.
+    """
+    while len(images := placed_images(model)) > LEAST_IMAGES:
+        T_cw = np.stack([world_to_camera(image) for image in images])
+        error = float(model.compute_mean_reprojection_error())
+        deviation, _ = pose_deviations(model, images, T_cw, error, is_known)
+        allowed = MAX_POSITION_DEVIATION * extent_of(np.linalg.inv(T_cw))
+        unknown = deviation > max(allowed, OUTLYING * float(np.median(deviation)))
+        if not unknown.any():
+            break
+        for image, is_unknown in zip(images, unknown, strict=True):
+            if is_unknown:
+                model.deregister_frame(image.frame_id)
+        model.tear_down()
+    return model
