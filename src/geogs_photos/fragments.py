@@ -28,6 +28,7 @@ from geogs_photos.incremental_mapping import (
     placed_images,
     put_together,
 )
+from geogs_photos.known_places import of_known_places
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_VIEWS = 3
@@ -57,23 +58,23 @@ def rejoined(
     known = known_cameras(cameras)
     is_known = len(known) == len(cameras)
     false = false_pairs(parts[0], database) if parts else []
-    best = _believed(parts, database)
+    best = _believed(parts, database, is_known)
     if false and _placed(best) < WHOLE * count:
         again, database = _without(
             false, database, count, known, seed,
             lambda f: progress("finding poses again", f),
         )  # fmt: skip
-        best = max(best, _believed(again, database), key=_placed)
+        best = max(best, _believed(again, database, is_known), key=_placed)
     if _placed(best) < WHOLE * count:
         progress("finding poses globally", 0.0)
         once = _globally(database, is_known, seed)
-        best = max(best, _believed(once, database), key=_placed)
+        best = max(best, _believed(once, database, is_known), key=_placed)
         progress("finding poses globally", 1.0)
     if best and _placed(best) < WHOLE * count and not is_known:
         again = _with_camera_of(
             best[0], database, count, seed, lambda f: progress("finding poses again", f)
         )
-        best = max(best, _believed(again, database), key=_placed)
+        best = max(best, _believed(again, database, is_known), key=_placed)
     return best
 
 
@@ -135,9 +136,10 @@ def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndar
     return kept
 
 
-def _believed(parts: Sequence[Any], database: Path) -> list[Any]:
+def _believed(parts: Sequence[Any], database: Path, is_known: bool) -> list[Any]:
     """What is to be believed of each; the largest first."""
-    return sorted((believed(part, database) for part in parts), key=lambda part: -_placed([part]))
+    found = (of_known_places(believed(part, database), is_known) for part in parts)
+    return sorted(found, key=lambda part: -_placed([part]))
 
 
 def _placed(parts: Sequence[Any]) -> int:
