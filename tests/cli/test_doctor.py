@@ -1,6 +1,7 @@
 """``geogs doctor``: findings, what is to be mended, exit codes."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -30,6 +31,7 @@ def machine(monkeypatch):
 
 def test_healthy_cpu_machine(machine, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("GEOGS_CACHE", str(tmp_path))
+    monkeypatch.setattr(doctor, "cache_from_source", lambda source: __file__)
     machine(None, None)
     assert main([]) == 0
     text = capsys.readouterr().out
@@ -41,6 +43,14 @@ def test_healthy_cpu_machine(machine, capsys, monkeypatch, tmp_path):
     assert "BAD" not in text
     assert "ms forward and backward" in text
     assert text.rstrip().endswith("everything works")
+
+
+def test_a_python_that_keeps_no_bytecode_is_slow(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(doctor, "cache_from_source", lambda source: str(tmp_path / "none.pyc"))
+    assert main(["--device", "cpu"]) == 0
+    text = capsys.readouterr().out
+    assert "unset PYTHONDONTWRITEBYTECODE, or run" in text
+    assert str(Path(torch.__file__).parent) in text
 
 
 def test_wrong_results_fail(monkeypatch, capsys):

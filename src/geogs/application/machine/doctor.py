@@ -1,9 +1,12 @@
 """What this machine can do, and what to mend."""
 
 import platform
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import cache_from_source
+from pathlib import Path
 
 import cv2
 import numba
@@ -60,6 +63,7 @@ def _versions() -> Iterator[Finding]:
     yield Finding(
         "PyTorch", f"{torch.__version__}, built {'for ' * bool(torch.version.cuda)}{build}"
     )
+    yield _bytecode()
     yield Finding("OpenCV", cv2.__version__)
     yield Finding("numba", numba.__version__)
     try:
@@ -68,6 +72,19 @@ def _versions() -> Iterator[Finding]:
         yield Finding("video", f"PyAV does not load ({error})", "Install av to read videos.")
     else:
         yield Finding("video", f"PyAV {av.__version__}, FFmpeg {av.ffmpeg_version_info}")
+
+
+def _bytecode() -> Finding:
+    """Whether Python keeps what it compiles of the largest library that every command loads."""
+    if Path(cache_from_source(str(torch.__file__))).exists():
+        return Finding("bytecode", "kept")
+    return Finding(
+        "bytecode",
+        "none of PyTorch",
+        "Python keeps no bytecode of PyTorch, so every command compiles it again, some seconds: "
+        f"unset PYTHONDONTWRITEBYTECODE, or run {sys.executable} -m compileall -q "
+        f"{Path(str(torch.__file__)).parent}",
+    )
 
 
 def _gpus() -> Iterator[Finding]:
