@@ -12,7 +12,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import ParamSpec, Protocol, TypeVar, runtime_checkable
 
@@ -78,7 +78,7 @@ class Each(Protocol):
 
 def ordered_map(
     function: Callable[[T], R], items: Iterable[T], threads: int, name: str = ""
-) -> Generator[R, None, None]:
+) -> Iterator[R]:
     """``map(function, items)``, the next ones being computed meanwhile in a few threads.
 
     No more items are taken than there are threads, beside the one that is asked for.

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from geogs.evaluation.rotation_errors import rotation_angle
 from geogs.geometry.nearest_rotation import nearest_rotation
+from geogs_photos.incremental_mapping import without_poses
 from geogs_photos.photo_pairs import FOLLOWING
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
@@ -67,10 +68,7 @@ def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
     place = {n: first if first is not None and n in known else k for k, n in enumerate(images)}
     parts = undivided(len(images), _votes(model, database, place))
     kept = max(parts, key=lambda part: (first in part, len(part)), default=[])
-    for number in images:
-        if place[number] not in kept:
-            model.deregister_frame(model.images[number].frame_id)
-    return model
+    return without_poses(model, [number for number in images if place[number] not in kept])
 
 
 def false_pairs(model: Any, database: Path) -> list[tuple[int, int]]:

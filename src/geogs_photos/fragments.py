@@ -27,6 +27,7 @@ from geogs_photos.incremental_mapping import (
     largest_first,
     placed_images,
     put_together,
+    without_poses,
 )
 from geogs_photos.known_places import of_known_places
 from geogs_photos.pycolmap_library import load_colmap
@@ -103,10 +104,7 @@ def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
     point, image = np.array(rows, np.int64).reshape(-1, 2).T
     seen = csr_array((np.ones(len(rows), np.int64), (point, image)), (len(firm), len(images)))
     kept = of_one_scale(seen, np.array([number in known for number in images], bool))
-    for number in set(images) - {images[k] for k in kept}:
-        model.deregister_frame(model.images[number].frame_id)
-    model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
-    return model
+    return without_poses(model, set(images) - {images[k] for k in kept})
 
 
 def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndarray, "m"]:

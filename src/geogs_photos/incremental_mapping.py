@@ -1,7 +1,7 @@
 """Poses, cameras and points of matched photographs, by pycolmap's incremental mapping."""
 
 import itertools
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -130,6 +130,14 @@ def placed_images(model: Any) -> list[Any]:
     """Frames of a video by name; those that few points place have no pose that counts."""
     placed = (i for i in model.images.values() if i.has_pose and i.num_points3D >= LEAST_POINTS)
     return sorted(placed, key=lambda image: image.name)
+
+
+def without_poses(model: Any, numbers: Iterable[int]) -> Any:
+    """The reconstruction whose pictures of these numbers have lost their poses."""
+    for number in numbers:
+        model.deregister_frame(model.images[number].frame_id)
+    model.tear_down()  # lets go of pictures without a pose, which covariances stumble over
+    return model
 
 
 def world_to_camera(image: Any) -> Float64[np.ndarray, "4 4"]:

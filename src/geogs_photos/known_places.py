@@ -7,7 +7,12 @@ import numpy as np
 from geogs.application.results.verdict import MAX_POSITION_DEVIATION
 from geogs.evaluation.trajectory_errors import extent_of
 from geogs_photos.deviations import pose_deviations
-from geogs_photos.incremental_mapping import LEAST_IMAGES, placed_images, world_to_camera
+from geogs_photos.incremental_mapping import (
+    LEAST_IMAGES,
+    placed_images,
+    without_poses,
+    world_to_camera,
+)
 
 OUTLYING = 3.0
 """Times the median deviation: where all are unsure, that is for the verdict to say."""
@@ -33,8 +38,5 @@ def of_known_places(model: Any, is_known: bool) -> Any:
         unknown = deviation > max(allowed, OUTLYING * float(np.median(deviation)))
         if not unknown.any():
             break
-        for image, is_unknown in zip(images, unknown, strict=True):
-            if is_unknown:
-                model.deregister_frame(image.frame_id)
-        model.tear_down()
+        model = without_poses(model, [images[k].image_id for k in np.flatnonzero(unknown)])
     return model

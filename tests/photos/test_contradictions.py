@@ -97,7 +97,7 @@ def test_the_smaller_part_of_a_broken_world_loses_its_poses(monkeypatch):
     """A pair that speaks for the joint is false."""
     kept = set(range(1, 7))
     images = {n: SimpleNamespace(image_id=n, has_pose=True, frame_id=n) for n in kept}
-    model = SimpleNamespace(images=images, deregister_frame=kept.remove)
+    model = SimpleNamespace(images=images, deregister_frame=kept.remove, tear_down=lambda: None)
     claims = {(i, j): 53.0 if (i < 5) != (j < 5) else 10.0 for i in kept for j in kept if i < j}
     claims[2, 5] = 10.0
     pairs = [PairMatches(*n, (p := pair(12.0, c)).T, p.rays, FOCAL) for n, c in claims.items()]

@@ -1,12 +1,15 @@
 """Deviations against random poses that are aligned one by one."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from geogs.geometry.umeyama import umeyama
-from geogs_photos.deviations import without_gauge
+from geogs_photos import deviations
+from geogs_photos.deviations import pose_deviations, without_gauge
 
 
 def test_against_samples_that_are_aligned():
@@ -108,3 +111,18 @@ def test_what_hangs_on_at_either_end_is_told_beside_that_end():
     assert turn == pytest.approx(np.sqrt(turned / 400), rel=0.15)
     together, _ = without_gauge(joint, T_cw, [known.tolist()] * 10)
     assert (together > 10 * place).all()
+
+
+def test_a_covariance_that_overflows_tells_nothing(monkeypatch):
+    """Nor does anything warn of it, which would fail here."""
+    pytest.importorskip("pycolmap")
+    block = np.full((6, 6), np.inf)
+    overflown = SimpleNamespace(
+        get_cam_cov_from_world=lambda one: block,
+        get_cam_cross_cov_from_world=lambda one, other: block,
+    )
+    monkeypatch.setattr(deviations, "_covariance", lambda *given: overflown)
+    images = [SimpleNamespace(image_id=n) for n in range(4)]
+    T_cw = np.tile(np.eye(4), (4, 1, 1))
+    for known in pose_deviations(SimpleNamespace(), images, T_cw, 0.5, False):
+        np.testing.assert_array_equal(known, np.inf)

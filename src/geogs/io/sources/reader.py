@@ -2,7 +2,7 @@
 
 import hashlib
 import stat
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -120,7 +120,7 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
             yield item  # type: ignore[misc]  # not the end mark
 
 
-def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Generator[T, None, None]:
+def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T]:
     """``map(read, places)``, the next ones being read meanwhile in a few threads."""
     return ordered_map(read, places, READERS, "read-ahead")
 

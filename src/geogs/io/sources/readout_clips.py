@@ -1,8 +1,6 @@
 """Clips of neighbouring images from all over a source, which tell its shutter's readout."""
 
-import itertools
 from collections.abc import Callable, Generator
-from contextlib import closing
 
 from geogs.config import InputConfig
 from geogs.io.sources.reader import RawFrame, Reader, read_side_by_side
@@ -27,27 +25,22 @@ def read_clips(
     clip = min(CLIP, max(1, round(SPAN * reader.info.fps)))
     count = min(ends) - config.start if ends else clip * CLIPS
     if len(reader.paths) > 1:
-        # Image by image, as those that are read ahead are given up where the clips so far suffice.
         starts = clip_starts(config.start, count, clip)[first:]
-        images = read_side_by_side(
-            lambda n: [*map(resized, reader.read(n, n + 1, 1))],
-            (n for start in starts for n in range(start, start + clip)),
+        yield from read_side_by_side(
+            lambda n: list(map(resized, reader.read(n, n + clip, 1))), starts
         )
-        with closing(images):
-            for _ in starts:
-                yield [*itertools.chain.from_iterable(itertools.islice(images, clip))]
         return
     starts = clip_starts(config.start, min(count, round(MINUTE * reader.info.fps)), clip)[first:]
     if not starts:
         return
-    latest: list[RawFrame] = []
+    images: list[RawFrame] = []
     raws = reader.read(starts[0], starts[-1] + clip, 1)
     for position, raw in enumerate(raws, starts[0]):
         if any(start <= position < start + clip for start in starts):
-            latest.append(resized(raw))
+            images.append(resized(raw))
         if position - clip + 1 in starts:
-            yield latest[-clip:]
-        del latest[:-clip]
+            yield images[-clip:]
+        del images[:-clip]
 
 
 def clip_starts(first: int, count: int, clip: int) -> list[int]:
