@@ -1,7 +1,7 @@
 """A mesh made in boxes of space against the same made in one volume."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,14 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mesh.blocks import blocks_of, boxes_of, mesh_block, sees_box, stitched_blocks
+from geogs.mesh.blocks import (
+    blocks_of,
+    boxes_of,
+    expanded_mesh,
+    mesh_block,
+    sees_box,
+    stitched_blocks,
+)
 from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.level_set import CHUNK
@@ -38,6 +45,13 @@ def inside_of_a_box(count: int = 8) -> list[DepthMapView]:
     return views
 
 
+def before_a_background(count: int = 8) -> list[DepthMapView]:
+    """The same, in every other place the wall of a hall that is twenty times as large."""
+    views, far = inside_of_a_box(count), torch.zeros(60, 80, dtype=torch.bool)
+    far[::12], far[:, 40:] = True, True
+    return [replace(v, depth=torch.where(far, 20 * v.depth, v.depth)) for v in views]
+
+
 def in_boxes(views: list[DepthMapView], plan: VolumePlan, most: int) -> tuple[Mesh, list[BlockBox]]:
     blocks = torch.unique(torch.cat([blocks_of(view, plan) for view in views]), dim=0).numpy()
     boxes = boxes_of(blocks, most)
@@ -61,18 +75,22 @@ def test_boxes_hold_every_block_once_and_no_more_than_they_may():
     assert boxes_of(np.zeros((0, 3), np.int64), 5) == []
 
 
-def test_the_mesh_is_that_of_one_volume_to_the_last_digit():
-    views = inside_of_a_box()
+@pytest.mark.parametrize("scene", [inside_of_a_box, before_a_background])
+def test_the_mesh_is_that_of_one_volume_to_the_last_digit(scene):
+    views = scene()
     plan = plan_volume(views, CONFIG)
+    assert bool(plan.contraction) == (scene is before_a_background)
     whole = extract_mesh(views, CONFIG)
     mesh, boxes = in_boxes(views, plan, 60)
+    mesh = expanded_mesh(mesh, plan.contraction)
     assert len(boxes) >= 4
     for part in fields(Mesh)[:3]:
         assert np.array_equal(getattr(mesh, part.name), getattr(whole, part.name)), part.name
 
 
-def test_a_view_is_left_out_of_a_box_only_where_it_could_change_nothing():
-    views = inside_of_a_box()
+@pytest.mark.parametrize("scene", [inside_of_a_box, before_a_background])
+def test_a_view_is_left_out_of_a_box_only_where_it_could_change_nothing(scene):
+    views = scene()
     plan = plan_volume(views, CONFIG)
     box = BlockBox((4, -2, -2), (6, 2, 2))
     left_out = 0

@@ -19,8 +19,9 @@ from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.mesh.volume import tsdf
+from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes, widest
-from geogs.mesh.volume.tsdf import SparseTsdf, blocks_seen
+from geogs.mesh.volume.tsdf import SparseTsdf, blocks_seen, pixel_growth
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()
@@ -53,17 +54,22 @@ def to_gpu(view: DepthMapView) -> DepthMapView:
     return replace(view, depth=view.depth.cuda(), weight=view.weight.cuda())
 
 
-def test_kernel_updates_voxels_like_torch(monkeypatch):
+CONTRACTIONS = [UNCONTRACTED, Contraction((0.1, -0.2, 0.3), 1.8)]
+
+
+@pytest.mark.parametrize("contraction", CONTRACTIONS)
+def test_kernel_updates_voxels_like_torch(monkeypatch, contraction):
     use_emulator(monkeypatch, tsdf)
     camera = Camera(40.0, 41.0, 23.2, 19.7, 48, 40)
-    expected, tested = (SparseTsdf(0.09, 3.0) for _ in range(2))
+    expected, tested = (SparseTsdf(0.09, 3.0, contraction=contraction) for _ in range(2))
     for view in views(camera, 3):
         expected.integrate(view.depth, view.weight, camera, view.T_cw)
         valid = view.valid()
         planes = PixelPlanes.of(view.depth, valid, camera)
-        tested._allocate(blocks_seen(planes, view.T_cw, 0.09, 3.0))
-        table, truncation = planes.table(view.weight), planes.truncation(0.27)
-        far = torch.where(valid, view.depth, 0.0).amax() + widest(0.27)
+        tested._allocate(blocks_seen(planes, view.T_cw, 0.09, 3.0, contraction))
+        growth = pixel_growth(planes, view.T_cw, contraction)
+        table, truncation = planes.table(view.weight), planes.truncation(0.27 * growth)
+        far = torch.where(valid, view.depth, 0.0).amax() + widest(0.27 * 4)
         tested.update_by_kernel(table, truncation, camera, view.T_cw, far)
     assert (tested.coordinates == expected.coordinates).all()
     seen = expected.weight > 0
@@ -89,9 +95,10 @@ def test_blocks_out_of_view_stay_untouched(monkeypatch):
 
 @pytest.mark.gpu
 @NEEDS_GPU
-def test_fusion_on_a_gpu():
+@pytest.mark.parametrize("contraction", CONTRACTIONS)
+def test_fusion_on_a_gpu(contraction):
     camera = Camera(240.0, 240.0, 159.5, 89.5, 320, 180)
-    volumes = [SparseTsdf(0.02, 4.0), SparseTsdf(0.02, 4.0, "cuda")]
+    volumes = [SparseTsdf(0.02, 4.0, d, contraction=contraction) for d in ("cpu", "cuda")]
     for view in views(camera, 8):
         volumes[0].integrate(view.depth, view.weight, camera, view.T_cw)
         volumes[1].integrate(view.depth.cuda(), view.weight.cuda(), camera, view.T_cw)

@@ -4,8 +4,9 @@ All boxes sample the same grid of voxels, and each has one layer of its neighbou
 two boxes meet they compute the same distances, so the same vertices on the same voxel edges.
 """
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from geogs.geometry.camera import Camera
 from geogs.mesh.clean import cleaned
 from geogs.mesh.extract import VolumePlan, integrate
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
+from geogs.mesh.volume.contraction import Contraction
 from geogs.mesh.volume.free_space import FreeSpace
 from geogs.mesh.volume.level_set import CHUNK, SurfacePart, stitched, surface_parts
 from geogs.mesh.volume.pixel_planes import PixelPlanes, widest
@@ -37,7 +39,7 @@ def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
     valid = view.valid() & (view.depth <= plan.max_depth)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
     planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
-    return blocks_seen(planes, T_cw, plan.voxel, plan.truncation)
+    return blocks_seen(planes, T_cw, plan.voxel, plan.truncation, plan.contraction)
 
 
 def boxes_of(blocks: Int[np.ndarray, "k 3"], most: int) -> list[BlockBox]:
@@ -73,11 +75,11 @@ def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> b
     """Whether a view may change a voxel of a box; those that may not need not be fused there."""
     side = plan.voxel * BLOCK
     low, high = (np.array(c, dtype=np.float64) for c in (box.low, box.high))
-    centre, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
-    T = T_cw.double().numpy()
-    point = torch.from_numpy(T[:3, :3] @ centre + T[:3, 3])[None]
+    middle, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
+    centre, reach = plan.contraction.balls(torch.from_numpy(middle)[None], radius)
+    point = centre @ T_cw[:3, :3].double().mT + T_cw[:3, 3].double()
     far = plan.max_depth + widest(plan.truncation * plan.voxel)
-    return bool(meets_frustum(point, radius, camera, far))
+    return bool(meets_frustum(point, reach, camera, math.inf if plan.contraction else far))
 
 
 @on_one_torch_thread
@@ -93,14 +95,14 @@ def mesh_block(
     ``views`` are those that see the box, in the order in which all would be fused; others change
     nothing.
     """
-    tsdf = SparseTsdf(plan.voxel, plan.truncation, device, box=box)
+    tsdf = SparseTsdf(plan.voxel, plan.truncation, device, box=box, contraction=plan.contraction)
     for view in views:
         integrate(tsdf, view, plan)
     return MeshBlock(tuple(surface_parts(tsdf, min_weight)), FreeSpace.of(tsdf, min_weight))
 
 
 def stitched_blocks(blocks: Sequence[MeshBlock], plan: VolumePlan, config: MeshConfig) -> Mesh:
-    """The mesh of all boxes, cleaned as one; neither coloured nor decimated.
+    """The mesh of all boxes in contracted space, cleaned as one; neither coloured nor decimated.
 
     Raises:
         InputError: there is no surface.
@@ -110,8 +112,16 @@ def stitched_blocks(blocks: Sequence[MeshBlock], plan: VolumePlan, config: MeshC
     return Mesh(found.vertices.numpy(), found.faces.to(torch.int32).numpy(), normals.numpy())
 
 
+def expanded_mesh(mesh: Mesh, contraction: Contraction) -> Mesh:
+    """The mesh of the world that one of contracted space stands for, with its colours."""
+    if not contraction:
+        return mesh
+    vertices = contraction.expanded(torch.from_numpy(mesh.vertices).double()).float().numpy()
+    return replace(Mesh.from_triangles(vertices, mesh.faces), colours=mesh.colours)
+
+
 def near(mesh: Mesh, box: BlockBox, plan: VolumePlan) -> Bool[np.ndarray, "n"]:
-    """Which vertices lie in a box."""
+    """Which vertices of a mesh in contracted space lie in a box."""
     side = plan.voxel * BLOCK
     block = np.floor_divide(mesh.vertices.astype(np.float64), side)
     return np.asarray(((block >= box.low) & (block < box.high)).all(axis=1))

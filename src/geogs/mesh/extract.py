@@ -19,6 +19,7 @@ from geogs.mesh.device.surface import device_surface
 from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.block_count import fitting, fitting_voxel
+from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.free_space import SeenFree
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
@@ -32,6 +33,16 @@ _MOST_OUT_OF_REACH = 0.05
 _CROWDED = 0.1
 """Part of the memory limit from which on, by a sample of the pixels, all of them are asked how many
 blocks they have: of what is scattered, as outdoors, there are several times as many."""
+_NEAR = 0.1
+"""Part of the pixels that show what is nearest."""
+_COARSEST = 4.0
+"""Times the footprints of those pixels that voxels are at most, where there is room for smaller
+ones: of what is near, a background fills most of the image."""
+_AROUND = 0.95
+"""Part of the cameras and of the surface that distances from the middle are told of."""
+_FAR = 4.0
+"""Times the radius of the scene around the cameras that its surface reaches where there is a
+background, which is contracted."""
 OVERRUN = 1.5
 """Times the memory limit that a volume may take, where the plan is a sample's."""
 COARSER = 1.5
@@ -45,7 +56,7 @@ class VolumePlan:
     """How a scene is going to be fused, chosen from its depth maps."""
 
     voxel: float
-    """Map units."""
+    """Map units, where space is not contracted."""
     truncation: float
     """Voxels."""
     max_depth: float
@@ -54,6 +65,8 @@ class VolumePlan:
     """Estimated number."""
     triangles: int
     """Estimated number, before those that the surface does not need are merged."""
+    contraction: Contraction = UNCONTRACTED
+    """Of the space in which the voxels are a grid."""
 
     @property
     def bytes(self) -> int:
@@ -65,19 +78,26 @@ class VolumePlan:
 def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
     """Choose voxel size and depth range from the depth maps, before anything is allocated.
 
-    The voxel is the footprint of a pixel at the median depth, larger if the
-    triangle budget or the memory limit demand it. The depth range is twice the 95 % quantile,
-    so that a few stray far pixels do not blow up the volume. Looks at 40 views at most.
+    The voxel is the footprint of a pixel at the median depth, smaller where what is near is much
+    nearer than that, larger if the triangle budget or the memory limit demand it. A background
+    that lies far beyond where the cameras were and what is around them is contracted. The depth
+    range is twice the 95 % quantile, so that a few stray far pixels do not blow up the volume.
+    Looks at 40 views at most.
 
     Raises InputError if no pixel has a depth, or a voxel size is given that does not fit into the
     memory limit or whose volume does not reach as far as the scene.
     """
     stride = max(1, len(views) // _SAMPLED_VIEWS)
-    depths, footprints, points = _sample_points(views[::stride])
+    sampled = views[::stride]
+    depths, footprints, points = _sample_points(sampled)
     if not len(depths):
         raise InputError("No depth map has a valid pixel, so there is no surface to extract.")
     max_depth = 2 * float(depths.quantile(0.95))
+    voxel = float(min(footprints.median(), _COARSEST * footprints.quantile(_NEAR)))
+    near = float(depths[footprints <= voxel].amax())
     points = points[depths <= max_depth]
+    contraction = _contraction([view.T_cw for view in sampled], points, near)
+    points = contraction.contracted(points)
     limit = config.memory_limit * 2**30
     if config.voxel is not None:
         reach = LIMIT * config.voxel
@@ -94,12 +114,14 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
                 f"larger voxel or leave it to be chosen."
             )
         triangles = round(_FACES_PER_SQUARE * _area(points, config.voxel) / config.voxel**2)
-        return VolumePlan(config.voxel, config.truncation, max_depth, blocks, triangles)
-    voxel = float(footprints.median())
+        return VolumePlan(
+            config.voxel, config.truncation, max_depth, blocks, triangles, contraction
+        )
     faces = _FACES_PER_SQUARE * _area(points, voxel)
     voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
     voxel, blocks = fitting(points, voxel, config.truncation, int(limit / BYTES_PER_BLOCK))
-    return VolumePlan(voxel, config.truncation, max_depth, blocks, round(faces / voxel**2))
+    triangles = round(faces / voxel**2)
+    return VolumePlan(voxel, config.truncation, max_depth, blocks, triangles, contraction)
 
 
 @on_one_torch_thread
@@ -140,10 +162,12 @@ def extract_mesh(
     seen = None
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
-        seen = seen_colours(surface.vertices, surface.normals, views, 2 * plan.voxel, report)
+        world = surface.expanded(plan.contraction)
+        seen = seen_colours(world.vertices, world.normals, views, 2 * plan.voxel, report)
+        del world
     if progress:
         progress("merge", 0, 1)
-    mesh = _merged_mesh(surface, seen, config, plan.voxel)
+    mesh = _merged_mesh(surface, seen, config, plan)
     if progress:
         progress("merge", 1, 1)
     return mesh
@@ -152,7 +176,9 @@ def extract_mesh(
 def _counted(plan: VolumePlan, views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
     """The plan with all pixels of all views counted."""
     most = int(config.memory_limit * 2**30 / BYTES_PER_BLOCK)
-    voxel, blocks = fitting_voxel(views, plan.voxel, plan.truncation, plan.max_depth, most)
+    voxel, blocks = fitting_voxel(
+        views, plan.voxel, plan.truncation, plan.max_depth, most, plan.contraction
+    )
     triangles = round(plan.triangles * (plan.voxel / voxel) ** 2)
     return replace(plan, voxel=voxel, blocks=blocks, triangles=triangles)
 
@@ -165,6 +191,14 @@ class _Surface:
     faces: Int[Tensor, "m 3"]
     """int32."""
     normals: Float[Tensor, "n 3"]
+
+    def expanded(self, contraction: Contraction) -> "_Surface":
+        """The surface of the world that one of contracted space stands for."""
+        if not contraction:
+            return self
+        vertices = contraction.expanded(self.vertices.double()).float()
+        normals = TensorMesh(vertices, self.faces.long()).normals()
+        return _Surface(vertices, self.faces, normals)
 
 
 def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
@@ -179,22 +213,27 @@ def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
 
 
 def _merged_mesh(
-    surface: _Surface, seen: tuple[Tensor, Tensor] | None, config: MeshConfig, voxel: float
+    surface: _Surface, seen: tuple[Tensor, Tensor] | None, config: MeshConfig, plan: VolumePlan
 ) -> Mesh:
-    """A surface on the host, decimated and smoothed, with the colours of those of its vertices that
-    were seen.
+    """A surface of contracted space, decimated and smoothed there, in the world and on the host,
+    with the colours of those of its vertices that were seen.
 
     Others take theirs only now, when there are few.
     """
-    vertices, faces = surface.vertices, surface.faces
-    few = merged(vertices, faces, config.detail * voxel)
+    few = merged(surface.vertices, surface.faces, config.detail * plan.voxel)
     if few is not None:
-        faces = few.faces
-        vertices = denoised(few.position, faces, config.smoothing * voxel).float()
+        vertices = denoised(few.position, few.faces, config.smoothing * plan.voxel).float()
+        normals = TensorMesh(vertices, few.faces.long()).normals()
+        surface = _Surface(vertices, few.faces, normals)
         seen = None if seen is None else few.means(*seen)
-    colours = None if seen is None else filled(vertices, *seen).cpu().numpy()
-    normals = surface.normals if few is None else TensorMesh(vertices, faces.long()).normals()
-    return Mesh(vertices.cpu().numpy(), faces.cpu().numpy(), normals.cpu().numpy(), colours)
+    colours = None if seen is None else filled(surface.vertices, *seen).cpu().numpy()
+    world = surface.expanded(plan.contraction)
+    return Mesh(
+        world.vertices.cpu().numpy(),
+        world.faces.cpu().numpy(),
+        world.normals.cpu().numpy(),
+        colours,
+    )
 
 
 def fuse(
@@ -206,7 +245,9 @@ def fuse(
     """All views in one volume, on the device of the first depth map; None as soon as that takes
     more than ``most`` bytes."""
     device = views[0].depth.device
-    tsdf = SparseTsdf(plan.voxel, plan.truncation, device, plan.blocks)
+    tsdf = SparseTsdf(
+        plan.voxel, plan.truncation, device, plan.blocks, contraction=plan.contraction
+    )
     for number, view in enumerate(views):
         integrate(tsdf, view, plan)
         if len(tsdf) * BYTES_PER_BLOCK > most:
@@ -240,6 +281,22 @@ def _sample_points(
         footprints.append(depth / (0.5 * (view.camera.fx + view.camera.fy)))
         points.append((rays * depth[:, None] - T_cw[:3, 3]) @ T_cw[:3, :3])
     return torch.cat(depths), torch.cat(footprints), torch.cat(points)
+
+
+def _contraction(
+    poses: Sequence[Float[Tensor, "4 4"]], points: Float[Tensor, "n 3"], near: float
+) -> Contraction:
+    """What contracts the background of a scene; nothing where it has none.
+
+    Around the cameras, up to the depth ``near``, space stays as it is.
+    """
+    centres = torch.stack([-(T[:3, :3].mT @ T[:3, 3]) for T in poses]).to(points)
+    middle = centres.mean(0)
+    radius = float((centres - middle).norm(dim=1).quantile(_AROUND)) + near
+    if not len(points) or (points - middle).norm(dim=1).quantile(_AROUND) <= _FAR * radius:
+        return UNCONTRACTED
+    x, y, z = middle.tolist()
+    return Contraction((x, y, z), radius)
 
 
 def _area(points: Float[Tensor, "n 3"], voxel: float) -> float:

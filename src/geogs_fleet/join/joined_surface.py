@@ -12,6 +12,7 @@ from geogs.mesh.blocks import (
     MeshBlock,
     blocks_of,
     boxes_of,
+    expanded_mesh,
     mesh_block,
     near,
     sees_box,
@@ -107,18 +108,22 @@ def joint_mesh(space: SpacePlan, config: MeshConfig, workers: Workers, device: s
         colours = coloured(mesh, 2 * space.volume.voxel, space, workers)
         mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, colours)
     voxel = space.volume.voxel
-    return decimate(mesh, config.detail * voxel, config.smoothing * voxel)
+    few = decimate(mesh, config.detail * voxel, config.smoothing * voxel)
+    return expanded_mesh(few, space.volume.contraction)
 
 
 def coloured(
     mesh: Mesh, tolerance: float, space: SpacePlan, workers: Workers
 ) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of the vertices of a mesh, box by box; grey where there is no box."""
+    """Colours of the vertices of a mesh in contracted space, box by box; grey where there is no
+    box."""
+    world = expanded_mesh(mesh, space.volume.contraction)
     colours = np.full((len(mesh.vertices), 3), 128, np.uint8)
     inside = [np.flatnonzero(near(mesh, box, space.volume)) for box in space.boxes]
     some = [n for n, at in enumerate(inside) if len(at)]
     jobs = [
-        (space.views[n], mesh.vertices[inside[n]], mesh.normals[inside[n]], tolerance) for n in some
+        (space.views[n], world.vertices[inside[n]], world.normals[inside[n]], tolerance)
+        for n in some
     ]
     for n, made in zip(some, workers.map("colouring", colours_of, jobs), strict=True):
         colours[inside[n]] = made

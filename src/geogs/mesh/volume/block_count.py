@@ -11,8 +11,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
-from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, pack, unpack
+from geogs.mesh.volume.tsdf import (
+    HALF,
+    LIMIT,
+    band_blocks,
+    footprints_in_world,
+    pack,
+    unpack,
+)
 
 COARSER = 1.1
 """Times larger are the voxels that are tried next."""
@@ -21,7 +29,12 @@ _CELLS_PER_BLOCK = 3
 
 
 def fitting_voxel(
-    views: Sequence[DepthMapView], voxel: float, truncation: float, max_depth: float, most: int
+    views: Sequence[DepthMapView],
+    voxel: float,
+    truncation: float,
+    max_depth: float,
+    most: int,
+    contraction: Contraction = UNCONTRACTED,
 ) -> tuple[float, int]:
     """The voxel, or the least one larger by steps of ``COARSER``, of which ``most`` blocks hold
     the surface of all views with its band, and how many do.
@@ -30,7 +43,8 @@ def fitting_voxel(
     """
     cells = torch.empty(0, dtype=torch.long, device=views[0].depth.device)
     for view in views:
-        cells = torch.unique(torch.cat([cells, _cells(_surface(view, voxel, max_depth), voxel)]))
+        new = contraction.contracted(_surface(view, voxel, max_depth, contraction))
+        cells = torch.unique(torch.cat([cells, _cells(new, voxel)]))
         while len(cells) > _CELLS_PER_BLOCK * most:
             points = _centres(cells, voxel)
             voxel *= COARSER
@@ -41,18 +55,20 @@ def fitting_voxel(
 def fitting(
     points: Float[Tensor, "n 3"], voxel: float, truncation: float, most: int
 ) -> tuple[float, int]:
-    """As :func:`fitting_voxel`, of a surface that some world points tell of."""
+    """As :func:`fitting_voxel`, of a surface that some points of contracted space tell of."""
     while (blocks := len(band_blocks(points, voxel, truncation))) > most:
         voxel *= COARSER
     return voxel, blocks
 
 
-def _surface(view: DepthMapView, voxel: float, max_depth: float) -> Float[Tensor, "n 3"]:
+def _surface(
+    view: DepthMapView, voxel: float, max_depth: float, contraction: Contraction
+) -> Float[Tensor, "n 3"]:
     """World points along the footprints of the pixels, half a block apart or less."""
     valid = view.valid() & (view.depth <= max_depth)
     planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
-    return (planes.footprints(voxel * HALF).double() - T_cw[:3, 3]) @ T_cw[:3, :3]
+    return footprints_in_world(planes, T_cw, voxel, contraction)
 
 
 def _cells(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:

@@ -57,17 +57,22 @@ class PixelPlanes:
         weight = torch.where(self.valid, weight, 0.0)
         return torch.stack([self.inverse, self.right, self.down, weight], -1).flatten(0, 1)
 
-    def truncation(self, shortest: float) -> Float[Tensor, "p"]:
+    def points(self) -> Float[Tensor, "h w 3"]:
+        """Points of the camera's frame, one for each pixel."""
+        rays = self.camera.rays(torch.float64, self.inverse.device)
+        return rays / self.inverse[..., None]
+
+    def truncation(self, shortest: Float[Tensor, "h w"] | float) -> Float[Tensor, "p"]:
         """Truncation along the optical axis, map units, by rows.
 
         ``shortest``, but wider where that would leave less than :data:`LEAST_BAND` of it along the
         normal.
         """
-        return shortest * (LEAST_BAND / self._incidence()).clamp(min=1).flatten()
+        return (shortest * (LEAST_BAND / self._incidence()).clamp(min=1)).flatten()
 
-    def footprints(self, spacing: float) -> Float[Tensor, "n 3"]:
+    def footprints(self, spacing: Float[Tensor, "h w"] | float) -> Float[Tensor, "n 3"]:
         """Points of the camera's frame along the footprints of the pixels with a depth, ``spacing``
-        apart or less.
+        (map units) apart or less.
 
         A pixel of a surface that faces the camera has one; one at a slant has more, up to 64, along
         the way on which its depth changes most.

@@ -9,12 +9,14 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
+from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
 from geogs.threads import run_chunks, worker_count
 
@@ -56,7 +58,7 @@ def unpack(keys: Int[Tensor, "n"]) -> Int[Tensor, "n 3"]:
 def band_blocks(
     points: Float[Tensor, "n 3"], voxel: float, truncation: float
 ) -> Int[Tensor, "k 3"]:
-    """Coordinates of every block that comes within the truncation of a point.
+    """Coordinates of every block that comes within the truncation of a point of contracted space.
 
     Points are first gathered into half blocks, whose neighbours in reach of the truncation cover
     the band around all of their points. ``truncation`` is in voxels. Points at :data:`LIMIT`
@@ -75,19 +77,41 @@ def band_blocks(
 
 
 def blocks_seen(
-    planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], voxel: float, truncation: float
+    planes: PixelPlanes,
+    T_cw: Float[Tensor, "4 4"],
+    voxel: float,
+    truncation: float,
+    contraction: Contraction,
 ) -> Int[Tensor, "k 3"]:
-    """Coordinates of the blocks in which the surface of a depth map lies, with its band.
+    """Coordinates of the blocks in which the surface of a depth map lies, with its band."""
+    points = footprints_in_world(planes, T_cw, voxel, contraction)
+    return band_blocks(contraction.contracted(points), voxel, truncation)
 
-    Footprints are followed from one half block to the next, so that a floor that is seen at a
-    slant has no gaps between the rows of the image.
-    """
-    points = planes.footprints(voxel * HALF).double()
-    return band_blocks((points - T_cw[:3, 3]) @ T_cw[:3, :3], voxel, truncation)
+
+def footprints_in_world(
+    planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], voxel: float, contraction: Contraction
+) -> Float[Tensor, "n 3"]:
+    """World points along the footprints of the pixels of a depth map, half a block apart or less,
+    so that a floor that is seen at a slant has no gaps between the rows of the image."""
+    points = planes.footprints(voxel * HALF * pixel_growth(planes, T_cw, contraction)).double()
+    return (points - T_cw[:3, 3]) @ T_cw[:3, :3]
+
+
+def pixel_growth(
+    planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], contraction: Contraction
+) -> Float[Tensor, "h w"] | float:
+    """Times larger than near the centre of a contraction voxels are where the pixels show."""
+    if not contraction:
+        return 1.0
+    growth = contraction.growth((planes.points() - T_cw[:3, 3]) @ T_cw[:3, :3])
+    return growth.to(planes.inverse) if isinstance(growth, Tensor) else growth
 
 
 def meets_frustum(
-    points: Float[Tensor, "k 3"], radius: float, camera: Camera, far: float
+    points: Float[Tensor, "k 3"],
+    radius: Float[Tensor, "k"] | float,
+    camera: Camera,
+    far: float,
 ) -> Bool[Tensor, "k"]:
     """Whether balls around points of the camera's frame meet its view frustum up to ``far``."""
     x, y, z = points.unbind(-1)
@@ -104,9 +128,10 @@ def meets_frustum(
 class SparseTsdf:
     """Distances and weights of the voxels near observed surfaces.
 
-    Voxel (i, j, k) is the sample at ``voxel * (i, j, k)`` in the world frame. A distance is in
-    units of the truncation, in [-1, 1], positive in front of the surface; a weight is the sum of
-    the weights of the observations, 0 where the voxel was never seen.
+    Voxel (i, j, k) is the sample at ``voxel * (i, j, k)`` in contracted space, which is that of the
+    world frame where there is no contraction. A distance is in units of the truncation, in
+    [-1, 1], positive in front of the surface; a weight is the sum of the weights of the
+    observations, 0 where the voxel was never seen.
     """
 
     def __init__(
@@ -116,6 +141,7 @@ class SparseTsdf:
         device: torch.device | str = "cpu",
         expected_blocks: int = 1024,
         box: BlockBox | None = None,
+        contraction: Contraction = UNCONTRACTED,
     ) -> None:
         """``voxel`` in map units, ``truncation`` in voxels.
 
@@ -125,6 +151,7 @@ class SparseTsdf:
         self.box = box
         self.voxel = voxel
         self.truncation = truncation
+        self.contraction = contraction
         self.device = torch.device(device)
         self._keys = torch.empty(0, dtype=torch.long, device=self.device)
         self._slots = torch.empty(0, dtype=torch.long, device=self.device)
@@ -183,7 +210,8 @@ class SparseTsdf:
         truncation behind the surface, so free space seen later clears what an earlier view put
         there. In the farther half of that the weight falls to zero (Bylow et al. 2013), since what
         is behind one view's silhouette is often in front of another's surface. Distances, and the
-        truncation, are along the optical axis; at a slant that is wider (``PixelPlanes``).
+        truncation, are along the optical axis; at a slant that is wider (``PixelPlanes``), and
+        where space is contracted it grows as voxels do.
         """
         depth = depth.to(self.device, torch.float32)
         weight = weight.to(self.device, torch.float32)
@@ -192,16 +220,19 @@ class SparseTsdf:
             return
         T_cw = T_cw.to(self.device, torch.float64)
         planes = PixelPlanes.of(depth, valid, camera)
-        self._allocate(self._kept(blocks_seen(planes, T_cw, self.voxel, self.truncation)))
+        seen = blocks_seen(planes, T_cw, self.voxel, self.truncation, self.contraction)
+        self._allocate(self._kept(seen))
         if not len(self):
             return
-        table, truncation = planes.table(weight), planes.truncation(self.truncation * self.voxel)
+        growth = pixel_growth(planes, T_cw, self.contraction)
+        table = planes.table(weight)
+        truncation = planes.truncation(self.truncation * self.voxel * growth)
         far = torch.where(valid, depth + truncation.view_as(depth), 0.0).amax()
         if self.device.type == "cuda":
             self.update_by_kernel(table, truncation, camera, T_cw, far)
             return
-        projection, slots = camera.matrix() @ T_cw[:3], self._in_view(camera, T_cw, float(far))
-        self._update(slots, projection, table, truncation, camera)
+        slots = self._in_view(camera, T_cw, float(far))
+        self._update(slots, camera, T_cw, table, truncation)
 
     def update_by_kernel(
         self,
@@ -219,7 +250,7 @@ class SparseTsdf:
         kernels_for(_SOURCE, self.device)["integrate"](
             len(self), BLOCK**3, self._coordinates, self._distance, self._weight, table,
             truncation, T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
-            self.voxel,
+            self.voxel, *self.contraction.centre, self.contraction.radius,
         )  # fmt: skip
 
     def _kept(self, blocks: Int[Tensor, "k 3"]) -> Int[Tensor, "l 3"]:
@@ -255,33 +286,44 @@ class SparseTsdf:
     def _in_view(self, camera: Camera, T_cw: Tensor, far: float) -> Int[Tensor, "k"]:
         """Slots of the blocks whose bounding sphere meets the view frustum up to ``far``."""
         side = self.voxel * BLOCK
-        radius = side * 0.5 * 3**0.5
-        centre = (self._coordinates + 0.5).double() * side
+        middle = (self._coordinates + 0.5).double() * side
+        centre, radius = self.contraction.balls(middle, side * 0.5 * 3**0.5)
         points = centre @ T_cw[:3, :3].mT + T_cw[:3, 3]
         return meets_frustum(points, radius, camera, far).nonzero()[:, 0]
 
     def _update(
         self,
         slots: Int[Tensor, "k"],
-        projection: Float[Tensor, "3 4"],
+        camera: Camera,
+        T_cw: Float[Tensor, "4 4"],
         table: Float[Tensor, "p 4"],
         truncation: Float[Tensor, "p"],
-        camera: Camera,
     ) -> None:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
-        from geogs.mesh.volume.tsdf_kernels import average_in
+        from geogs.mesh.volume.tsdf_kernels import average_in, average_in_contracted
 
-        corner = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
-        block = (corner + projection[:, 3:]).float().mT.contiguous().numpy()
-        local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float().numpy()
+        centre = T_cw.new_tensor(self.contraction.centre)[:, None]
+        projection, corner = camera.matrix() @ T_cw[:3], self._coordinates[slots].double().mT
+        rotation, shift = projection[:, :3], projection[:, 3:] + projection[:, :3] @ centre
+        corner, steps = corner * BLOCK * self.voxel - centre, self._offsets.double().mT * self.voxel
+        block, local = _rows(rotation @ corner + shift), (rotation @ steps).float().numpy()
         distance, weight = self._distance.numpy(), self._weight.numpy()
-        planes, reach = table.numpy(), truncation.numpy()
+        planes, reach, number = table.numpy(), truncation.numpy(), slots.numpy()
+        apart, away = _rows(corner), steps.float().numpy()
+        middle, radius = shift[:, 0].float().numpy(), np.float32(self.contraction.radius)
 
         def update(chunk: int) -> None:
             some = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
-            average_in(
-                slots.numpy()[some], block[some], local, planes, reach, camera.width,
-                camera.height, distance, weight,
-            )  # fmt: skip
+            view = planes, reach, camera.width, camera.height, distance, weight
+            if self.contraction:
+                average_in_contracted(
+                    number[some], block[some], local, apart[some], away, middle, radius, *view
+                )
+            else:
+                average_in(number[some], block[some], local, *view)
 
         run_chunks(update, -(-len(slots) // _CHUNK), worker_count())
+
+
+def _rows(columns: Float[Tensor, "3 k"]) -> Float[np.ndarray, "k 3"]:
+    return np.ascontiguousarray(columns.mT.float().numpy())

@@ -14,27 +14,62 @@ def average_in(slots, block, local, table, truncation, width, height, distance, 
     ``table`` (pixels, 4) and ``truncation`` (pixels), in map units, are those of ``PixelPlanes``.
     """
     for k in range(len(slots)):
-        slot = slots[k]
         for j in range(local.shape[1]):
+            x, y = block[k, 0] + local[0, j], block[k, 1] + local[1, j]
             z = block[k, 2] + local[2, j]
-            if not z > _NEAREST:
+            _average(x, y, z, slots[k], j, table, truncation, width, height, distance, weight)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def average_in_contracted(
+    slots, block, local, corner, step, middle, radius,
+    table, truncation, width, height, distance, weight,
+):  # fmt: skip
+    """As :func:`average_in`, of voxels in a ``Contraction`` with a ``radius``.
+
+    ``corner`` (k, 3) and ``step`` (3, voxels) add up to where a voxel lies from its centre, which
+    is at ``middle`` (3) as ``block`` and ``local`` are.
+    """
+    for k in range(len(slots)):
+        for j in range(local.shape[1]):
+            a, b, c = (
+                corner[k, 0] + step[0, j],
+                corner[k, 1] + step[1, j],
+                corner[k, 2] + step[2, j],
+            )
+            away = np.sqrt(a * a + b * b + c * c) / radius
+            if not away < _TWO - _NEAREST:
                 continue
-            inverse = _ONE / z
-            u = (block[k, 0] + local[0, j]) * inverse
-            v = (block[k, 1] + local[1, j]) * inverse
-            column, row = np.rint(u), np.rint(v)
-            if not (column >= 0 and row >= 0 and column < width and row < height):
-                continue
-            pixel = np.int64(row) * width + np.int64(column)
-            plane = table[pixel]
-            surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
-            ahead = (_ONE / surface - z) / truncation[pixel]
-            if not ahead > -_ONE:
-                continue
-            gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)
-            if not gain > 0:
-                continue
-            new = weight[slot, j] + gain
-            change = min(ahead, _ONE) - distance[slot, j]
-            distance[slot, j] += change * (gain / new)
-            weight[slot, j] = new
+            x, y = block[k, 0] + local[0, j], block[k, 1] + local[1, j]
+            z = block[k, 2] + local[2, j]
+            if away > _ONE:
+                stretch = _ONE / (away * (_TWO - away))
+                x = middle[0] + stretch * (x - middle[0])
+                y = middle[1] + stretch * (y - middle[1])
+                z = middle[2] + stretch * (z - middle[2])
+            _average(x, y, z, slots[k], j, table, truncation, width, height, distance, weight)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average(x, y, z, slot, j, table, truncation, width, height, distance, weight):
+    """Update a voxel whose u z, v z and z are given."""
+    if not z > _NEAREST:
+        return
+    inverse = _ONE / z
+    u, v = x * inverse, y * inverse
+    column, row = np.rint(u), np.rint(v)
+    if not (column >= 0 and row >= 0 and column < width and row < height):
+        return
+    pixel = np.int64(row) * width + np.int64(column)
+    plane = table[pixel]
+    surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
+    ahead = (_ONE / surface - z) / truncation[pixel]
+    if not ahead > -_ONE:
+        return
+    gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)
+    if not gain > 0:
+        return
+    new = weight[slot, j] + gain
+    change = min(ahead, _ONE) - distance[slot, j]
+    distance[slot, j] += change * (gain / new)
+    weight[slot, j] = new

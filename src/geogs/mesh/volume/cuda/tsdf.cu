@@ -18,33 +18,57 @@ __device__ __forceinline__ bool in_view(const double c[3], float radius, float f
          bottom * z - y > -radius * sqrtf(1.f + bottom * bottom);
 }
 
+// Where a place y of contracted space lies in the world, from the centre of the contraction: y itself
+// within the radius. False where it lies at infinity or beyond.
+__device__ __forceinline__ bool expand(double y[3], double radius) {
+  const double away = sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2]) / radius;
+  if (!(away < 2.0 - 1e-6)) return false;
+  if (away > 1.0)
+    for (int c = 0; c < 3; ++c) y[c] /= away * (2.0 - away);
+  return true;
+}
+
 // One thread block per volume block, one thread per voxel. planes (h, w, 4) holds inverse depth, its
 // two slopes and the weight of each pixel, truncation (h, w) that along the axis in map units; T_cw
-// (4, 4) is world to camera; far (1) the depth behind which nothing changes. distance and weight
-// (blocks, 512) are averaged in place.
+// (4, 4) is world to camera; far (1) the depth behind which nothing changes; space is contracted
+// around (ox, oy, oz) beyond the radius, which may be infinite. distance and weight (blocks, 512) are
+// averaged in place.
 extern "C" __global__ void integrate(const long long* __restrict__ coordinates,
                                      float* __restrict__ distance, float* __restrict__ weight,
                                      const float4* __restrict__ planes,
                                      const float* __restrict__ truncation,
                                      const double* __restrict__ T_cw,
                                      const float* __restrict__ far, int width, int height,
-                                     float fx, float fy, float cx, float cy, double voxel) {
+                                     float fx, float fy, float cx, float cy, double voxel,
+                                     double ox, double oy, double oz, double radius) {
   const int block = blockIdx.x, i = threadIdx.x;
   const double* T = T_cw;
-  double corner[3], centre[3];
-  for (int c = 0; c < 3; ++c) corner[c] = (double)(coordinates[3 * block + c] * SIDE);
-  for (int r = 0; r < 3; ++r) {
-    centre[r] = T[4 * r + 3];
-    for (int c = 0; c < 3; ++c) centre[r] += T[4 * r + c] * voxel * (corner[c] + 0.5 * SIDE);
+  const double origin[3] = {ox, oy, oz};
+  const int step[3] = {i / (SIDE * SIDE), i / SIDE % SIDE, i % SIDE};
+  double middle[3], place[3], centre[3];
+  for (int c = 0; c < 3; ++c) {
+    const double corner = (double)(coordinates[3 * block + c] * SIDE);
+    middle[c] = voxel * (corner + 0.5 * SIDE) - origin[c];
+    place[c] = voxel * (corner + step[c]) - origin[c];
   }
-  const float radius = (float)(voxel * SIDE * 0.8660254037844386);
-  if (!in_view(centre, radius, far[0], fx, fy, cx, cy, width, height)) return;
-  const double place[3] = {corner[0] + i / (SIDE * SIDE), corner[1] + i / SIDE % SIDE,
-                           corner[2] + i % SIDE};
+  const double reach = voxel * SIDE * 0.8660254037844386;
+  const double outermost =
+      (sqrt(middle[0] * middle[0] + middle[1] * middle[1] + middle[2] * middle[2]) + reach) / radius;
+  if (outermost < 2.0 - 1e-6) {  // else its ball reaches to infinity
+    expand(middle, radius);
+    for (int r = 0; r < 3; ++r) {
+      centre[r] = T[4 * r + 3];
+      for (int c = 0; c < 3; ++c) centre[r] += T[4 * r + c] * (middle[c] + origin[c]);
+    }
+    const double least = 2.0 - fmax(outermost, 1.0);
+    const float ball = (float)(reach / (least * least));
+    if (!in_view(centre, ball, far[0], fx, fy, cx, cy, width, height)) return;
+  }
+  if (!expand(place, radius)) return;
   float p[3];
   for (int r = 0; r < 3; ++r) {
     double x = T[4 * r + 3];
-    for (int c = 0; c < 3; ++c) x += T[4 * r + c] * voxel * place[c];
+    for (int c = 0; c < 3; ++c) x += T[4 * r + c] * (place[c] + origin[c]);
     p[r] = (float)x;
   }
   if (!(p[2] > 1e-6f)) return;

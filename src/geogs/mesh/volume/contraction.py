@@ -1,0 +1,73 @@
+"""Space drawn together far from the cameras, so that one grid suits what is near and what is far.
+
+Depth that two views tell is known the worse the farther away it is, by the square of the distance.
+So are the voxels of a grid in contracted space large: scene contraction (Barron et al. 2022).
+"""
+
+import math
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+NEAREST_TO_RIM = 1e-6
+"""Part of the radius that contracted points keep from the sphere that stands for infinity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contraction:
+    """Points x of the world and contracted ones y, which are the same within a ball.
+
+    Beyond its radius R, of distances from its centre, |y| = R (2 - R / |x|): all of the world lies
+    within 2 R. A step along the way from the centre is (|x| / R)^2 times as long in the world, one
+    across it less.
+    """
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World frame."""
+    radius: float = math.inf
+    """Map units; where it is infinite nothing is contracted."""
+
+    def __bool__(self) -> bool:
+        """Whether anything is contracted."""
+        return math.isfinite(self.radius)
+
+    def contracted(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Where points of the world lie in contracted space."""
+        if not self:
+            return points
+        away, distance = self._away(points)
+        outer = self.radius / distance.clamp(min=self.radius)
+        return points + away * (outer * (2 - outer) - 1)
+
+    def expanded(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Where contracted points lie in the world; those at infinity or beyond are very far."""
+        if not self:
+            return points
+        away, distance = self._away(points)
+        held = (distance / self.radius).clamp(1, 2 - NEAREST_TO_RIM)
+        return points + away * (1 / (held * (2 - held)) - 1)
+
+    def growth(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"] | float:
+        """Times longer than in contracted space steps away from the centre are at world points."""
+        if not self:
+            return 1.0
+        return (self._away(points)[1] / self.radius)[..., 0].clamp(min=1).square()
+
+    def balls(
+        self, points: Float[Tensor, "*n 3"], radius: float
+    ) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n"] | float]:
+        """Centres and radii of balls of the world that have all of balls in contracted space."""
+        if not self:
+            return points, radius
+        middle = self.expanded(points)
+        outermost = (self._away(points)[1][..., 0] + radius) / self.radius
+        return middle, radius / (2 - outermost.clamp(1, 2 - NEAREST_TO_RIM)).square()
+
+    def _away(self, points: Float[Tensor, "*n 3"]) -> tuple[Tensor, Float[Tensor, "*n 1"]]:
+        away = points - points.new_tensor(self.centre)
+        return away, away.norm(dim=-1, keepdim=True)
+
+
+UNCONTRACTED = Contraction()
+"""The world as it is."""
