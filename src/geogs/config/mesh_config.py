@@ -11,7 +11,8 @@ class MeshConfig(Settings, group="mesh"):
     """Surface extraction."""
 
     voxel: Annotated[float | None, Range(1e-6, 1e6), Basic()] = None
-    """Voxel size in map units; chosen from depth, budget and memory limit if none is given."""
+    """Voxel size in map units, larger in a far background; chosen from depth, budget and memory
+    limit if none is given."""
     truncation: Annotated[float, Range(2, 16)] = 4.0
     """Voxels in front of and behind a surface in which distances are averaged."""
     min_weight: Positive = 1.5
