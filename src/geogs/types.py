@@ -136,7 +136,7 @@ class FoundLens:
     """OpenCV's k1 and k2 that all matches found in images that were taken for those of a pinhole,
     and its focal length.
 
-    A ray x, y was seen at focal (1 + k1 r^2 + k2 r^4) times that.
+    A ray x, y was seen at focal (1 + k1 r^2 + k2 r^4) times that, about a principal point.
     """
 
     k1: float
@@ -147,6 +147,15 @@ class FoundLens:
     focal: Positive = 1.0
     """The focal length over what it was taken for; 1 where that was not asked, or is right."""
     deviation_focal: AtLeast0 = 0.0
+    right: float = 0.0
+    down: float = 0.0
+    """Where the principal point lies off what it was taken for, in the focal lengths found."""
+    deviation_centre: AtLeast0 = 0.0
+
+    @property
+    def is_off_centre(self) -> bool:
+        """Whether the principal point was corrected."""
+        return self.right != 0 or self.down != 0
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]

@@ -40,7 +40,8 @@ def test_equations_are_those_of_plain_pytorch(distortion, shared):
     lens = RadialLens(CAMERA, *distortion)
     problem, block = problem_of(lens), LensBlock(lens, GRID.pixels)
     g = torch.Generator().manual_seed(2)
-    more = torch.randn(problem.pixels.shape, generator=g) if "more" in shared else None
+    e, *cells = problem.pixels.shape
+    more = torch.randn(e, 2, *cells, generator=g) if "more" in shared else None
     wanted = lens_reference.equations(problem, block, HUBER, more)
     chosen = [n for n in range(wanted.gradient.shape[1]) if n < 6 or n >= 9 or "lens" in shared]
     known = None if "lens" in shared else block

@@ -1,7 +1,6 @@
 """OpenCV's lens: against its formula written out, and there and back."""
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -99,7 +98,7 @@ BENT = [
 @pytest.mark.parametrize(("distortion", "lens", "pixels"), BENT)
 def test_a_lens_with_another_before_it_is_both_in_turn(distortion, lens, pixels):
     k1, k2 = 0.02, -0.03
-    both = with_bend(CAMERA, distortion, lens, (k1, k2))
+    _, both = with_bend(CAMERA, distortion, lens, (k1, k2))
     assert len(both) == (len(distortion) or 4)
     worst = 0.0
     for x, y in [(0.0, 0.0), (0.3, 0.2), (-0.35, 0.1), (0.1, -0.3), (0.5, 0.4), (-0.6, -0.45)]:
@@ -110,14 +109,18 @@ def test_a_lens_with_another_before_it_is_both_in_turn(distortion, lens, pixels)
     assert worst < pixels
 
 
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.02, -0.03)])
 @pytest.mark.parametrize("distortion", [(), (-0.1, 0.03, 0.001, -0.002)])
-def test_a_lens_of_another_focal_length_shows_rays_where_both_in_turn_do(distortion):
+def test_a_lens_of_another_focal_length_shows_rays_where_both_in_turn_do(distortion, shift):
     k1, k2, focal = 0.04, -0.06, 0.94
-    both = with_bend(CAMERA, distortion, "polynomial", (k1, k2), focal)
-    camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy)
+    camera, both = with_bend(CAMERA, distortion, "polynomial", (k1, k2), focal, shift)
+    assert (camera.fx, camera.fy) == (focal * CAMERA.fx, focal * CAMERA.fy)
+    moved = (camera.cx - CAMERA.cx) / camera.fx, (camera.cy - CAMERA.cy) / camera.fy
+    np.testing.assert_allclose(moved, shift, atol=1e-3)
     for x, y in [(0.0, 0.0), (0.3, 0.2), (-0.35, 0.1), (0.1, -0.3), (0.5, 0.4)]:
         factor = focal * (1 + k1 * (x * x + y * y) + k2 * (x * x + y * y) ** 2)
-        wanted = distorted_pixels(np.array([[x * factor, y * factor]]), CAMERA, distortion)
+        ray = np.array([[x, y]]) * factor + focal * np.array(shift)
+        wanted = distorted_pixels(ray, CAMERA, distortion)
         found = distorted_pixels(np.array([[x, y]]), camera, both)
         np.testing.assert_allclose(found, wanted, atol=0.3)
 

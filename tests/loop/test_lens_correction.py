@@ -65,7 +65,8 @@ class BentFlow(PlantedFlow):
         self.d = true_inverse_depth(self.T, own)
 
     def _pinhole(self, pixels: Tensor) -> Tensor:
-        return pixels + torch.einsum("k,k...->...", self.bend, lens_shapes(CAMERA, pixels))
+        shapes = lens_shapes(CAMERA, pixels)[: len(self.bend)]
+        return pixels + torch.einsum("k,k...->...", self.bend, shapes)
 
     def _match(self, source, target) -> FlowMatch:
         i, j = list(source), list(target)

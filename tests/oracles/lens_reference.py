@@ -67,7 +67,7 @@ def equations(
     block = LensBlock(block.lens, block.pixels.double())
     p, J, Jd = linearised(block, T, i, j, problem.inverse_depth[i].double())
     if further is not None:
-        J = torch.cat([J, further.mT[:, None]], 1)
+        J = torch.cat([J, further.mT], 1)
     r, w = (x.mT for x in weighed_residuals(p, problem.pixels, problem.weight, huber))
     return Equations(
         torch.einsum("ekap,elap,eap->ekl", J, J, w.double()),

@@ -127,6 +127,9 @@ def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
     if found.focal != 1:
         deviation = found.deviation_focal * after.fx
         focal = f"fx {after.fx:.1f} +- {deviation:.1f} instead of {before.fx:.1f}, "
+    if found.is_off_centre:
+        deviation = found.deviation_centre * after.fx
+        focal += f"principal point {after.cx:.1f}, {after.cy:.1f} +- {deviation:.1f}, "
     return (
         f"Lens, by all matches, beside what was said of its distortion ({was}): {focal}"
         f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "

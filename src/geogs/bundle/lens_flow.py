@@ -22,8 +22,8 @@ from geogs.bundle.terms import BundleState
 from geogs.geometry.lie import se3_adjoint
 from geogs.world.grid import SampleGrid
 
-Further = Callable[[BundleProblem], Float[Tensor, "e p 2"]]
-"""By how much one more unknown that all edges share, at size one, moves where cells fall."""
+Further = Callable[[BundleProblem], Float[Tensor, "e o p 2"]]
+"""By how much more unknowns that all edges share, at size one, move where cells fall."""
 
 
 class LensFlow:
@@ -48,10 +48,10 @@ class LensFlow:
         adjoint, edges = se3_adjoint(T_ji), _Edges(self._block(state), problem, T_ji)
         limits = _limits(options.huber)
         slopes = edges.slopes if self._known is None else edges.slopes[:0]
-        further = np.zeros((0, 0, 2), np.float32)
+        further = np.zeros((len(edges.weight), 0, 0, 2), np.float32)
         if self._further is not None:
             further = _float(self._further(problem))
-        shared = len(slopes) + (self._further is not None)
+        shared = len(slopes) + further.shape[1]
         for frame, e in sources_within(problem.source):
             size = 6 * (e.stop - e.start) + shared
             H, g = adjoint.new_zeros(size, size), adjoint.new_zeros(size)

@@ -103,13 +103,13 @@ def linearise_source(
 
     Unknowns are the motions to all targets (6e, left perturbations), then what all edges share: the
     logarithm of the focal length, k1 and k2 where there are ``slopes`` (3, p) of the rays by them,
-    and one that moves where cells fall by ``further`` (e or 0, p, 2). ``limits`` are Huber's, in
+    and those that move where cells fall by ``further`` (e, o, p, 2). ``limits`` are Huber's, in
     deviations, and the least z. Filled are ``hessian`` (m, m) and ``gradient`` (m), the direction
     of descent; ``coupling`` (m, p) with the inverse depths, whose own ``curvature`` (p), and
     ``pull`` (p).
     """
     edges, cells = weight.shape[0], weight.shape[1]
-    shapes, others = len(slopes), min(len(further), 1)
+    shapes, others = len(slopes), further.shape[1]
     count = 6 + shapes + others
     J = np.zeros((count + 1, 2 * _BLOCK), np.float32)
     r, w = np.zeros(2 * _BLOCK, np.float32), np.zeros(2 * _BLOCK, np.float32)
@@ -128,10 +128,10 @@ def linearise_source(
             )  # fmt: skip
             w[size:_BLOCK] = _ZERO
             w[_BLOCK + size :] = _ZERO
-            if others:
+            for k in range(others):
                 for n in range(size):
-                    J[count - 1, n] = further[e, begin + n, 0]
-                    J[count - 1, _BLOCK + n] = further[e, begin + n, 1]
+                    J[6 + shapes + k, n] = further[e, k, begin + n, 0]
+                    J[6 + shapes + k, _BLOCK + n] = further[e, k, begin + n, 1]
             depth = J[count]
             for k in range(count + 1):
                 for n in range(2 * _BLOCK):

@@ -100,19 +100,22 @@ def with_bend(
     lens: LensModel,
     bend: tuple[float, float],
     factor: float = 1.0,
-) -> tuple[float, ...]:
-    """The coefficients of a lens that bends rays by OpenCV's k1 and k2 and stretches them by a
-    factor before it does what it did, for a focal length of so many times the camera's.
+    shift: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Camera, tuple[float, ...]]:
+    """A lens that bends rays by OpenCV's k1 and k2, shifts them, and stretches all that by a factor
+    before it does what it did: the camera, whose focal length is so many times larger and whose
+    principal point lies where the axis is seen, and the coefficients.
 
     As many as there are of it, of a pinhole four: those that put the rays that the image sees
     where both in turn do, by least squares (exactly for a pinhole). Source: Gauss-Newton.
     """
     v, u = (x.reshape(-1) for x in np.mgrid[: camera.height : 16j, : camera.width : 16j])
-    rays = undistorted_rays(np.stack([u, v], 1), camera, distortion, lens) / factor
+    rays = undistorted_rays(np.stack([u, v], 1), camera, distortion, lens) / factor - shift
     square = np.square(rays).sum(1, keepdims=True)
-    wanted = factor * rays * (1 + bend[0] * square + bend[1] * np.square(square))
-    seen = distorted_pixels(wanted, camera, distortion, lens)
-    camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    bent = rays * (1 + bend[0] * square + bend[1] * np.square(square))
+    seen = distorted_pixels(factor * (bent + shift), camera, distortion, lens)
+    ((cx, cy),) = distorted_pixels(factor * np.array([shift]), camera, distortion, lens).tolist()
+    camera = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy, cx=cx, cy=cy)
     found, step = np.array(distortion or (0.0,) * 4), 1e-4
     for _ in range(_FITTING):
         off, columns = seen - distorted_pixels(rays, camera, tuple(found), lens), []
@@ -122,7 +125,7 @@ def with_bend(
             )
             columns.append((high - low).reshape(-1) / (2 * step))
         found = found + np.linalg.lstsq(np.stack(columns, 1), off.reshape(-1), rcond=1e-9)[0]
-    return tuple(found.round(12).tolist())
+    return camera, tuple(found.round(12).tolist())
 
 
 def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:

@@ -14,6 +14,7 @@ from dataclasses import replace
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import (
     FOCAL_LEFT,
+    RADIAL,
     SHAPES,
     STANDARD_ERRORS,
     LensBend,
@@ -44,6 +45,10 @@ keyframes err alike, too: where the lens was known it is 1 to 10, where it was n
 FOCAL_EVIDENCE = 4.0
 """Deviations from which on the focal length is believed to be off, too, where k1 and k2 are. Where
 it was given it is 0 to 2.2 (docs/lens.md)."""
+CENTRE_EVIDENCE = 36.0
+"""Square of the principal point in its deviations from which on it is believed to be off, where
+nobody told of the lens. In rendered rooms it is below 5 where it is the middle, and 80 and more
+where it lies 3 % of the height off it (docs/lens.md)."""
 FOCAL_DOUBT = 0.05
 """Deviation of the focal length, as a part of it, from which on matches do not overrule one that
 was given: what they know that badly k1 and k2 explain as well."""
@@ -70,8 +75,9 @@ def correct_lens(
     believed however little it is; so is it at the end, and the focal length with it, where that was
     but found in the video or guessed (``KeyframeTable.focal_deviation``): the sizes are expected to
     be about what the images were taken for then
-    (:func:`~geogs.bundle.uncertainty.lens_error.lens_prior`). Not in the world of a saved map,
-    whose keyframes stay as its own adjustment left them.
+    (:func:`~geogs.bundle.uncertainty.lens_error.lens_prior`), and the principal point is corrected
+    as well where the matches are sure of it. Not in the world of a saved map, whose keyframes stay
+    as its own adjustment left them.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = graph.packed
@@ -80,6 +86,7 @@ def correct_lens(
     focal_deviation = keyframes.table.focal_deviation
     is_open = ends and focal_deviation > 0
     is_asked = before.focal != 1 if before else is_open
+    asks_centre = is_open and (before is None or before.is_off_centre)
     rows = _rows_in_doubt(log, keyframes, readout) if ends and left else None
     while left:
         asked = said_of_lens(tracker, list(free_depth), rows)
@@ -89,11 +96,14 @@ def correct_lens(
             break
         said, left = asked.whole, left - 1
         if is_open:
-            taken = focal, bend.k1, bend.k2
+            taken = focal, bend.k1, bend.k2, bend.right, bend.down
             for n, prior in enumerate(lens_prior(focal_deviation)):
                 said = said.told(n, -taken[n], prior)
         if rows is not None:
             said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
+        centre = said.of(slice(RADIAL, SHAPES))
+        if not asks_centre:
+            said = said.without(RADIAL).without(RADIAL)
         if ends and not is_asked and _contradict_focal(said):
             is_asked, left = True, ROUNDS
         if is_asked:
@@ -104,12 +114,17 @@ def correct_lens(
             else:
                 graph.refocus(math.exp(focal))
         else:
-            said = asked.bend if rows is None else said.without(0)
+            said = asked.bend if rows is None and not asks_centre else said.without(0)
         if rows is not None:
             longer += float(said.size[-1])
         if bool((said.size.abs() < CONVERGED * said.deviation).all()):
             left = 0
-        bend = bend.plus(said.size[-2 - (rows is not None) :])
+        first, count = int(is_asked), SHAPES - 1 if asks_centre else RADIAL - 1
+        bend = bend.plus(*said.size[first : first + count].tolist())
+        if not left and asks_centre and not before:
+            found = centre._replace(size=centre.size.new_tensor([bend.right, bend.down]))
+            if found.evidence < CENTRE_EVIDENCE:
+                asks_centre, left, bend = False, ROUNDS, replace(bend, right=0.0, down=0.0)
         _shift(graph, measured, bend, rows, longer)
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
     if said is None:
@@ -120,12 +135,13 @@ def correct_lens(
         log.set_readout(readout + longer, deviation.pop())
     shift_lens(log, keyframes, bend)
     # Matches of different keyframes err alike too (docs/lens.md), here as before the run.
-    *of_focal, k1, k2 = (STANDARD_ERRORS * error for error in deviation)
-    found = FoundLens(bend.k1, bend.k2, k1, k2)
-    if not is_asked:
-        return found
-    open_focal = math.hypot(*of_focal, FOCAL_LEFT * focal)
-    return replace(found, focal=math.exp(focal), deviation_focal=open_focal)
+    deviation = [STANDARD_ERRORS * error for error in deviation]
+    open_focal = math.hypot(deviation.pop(0), FOCAL_LEFT * focal) if is_asked else 0.0
+    k1, k2, *of_centre = deviation
+    return FoundLens(
+        bend.k1, bend.k2, k1, k2, math.exp(focal), open_focal, bend.right, bend.down,
+        max(of_centre, default=0.0),
+    )  # fmt: skip
 
 
 def _contradict_focal(said: LensEstimate) -> bool:

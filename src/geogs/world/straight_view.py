@@ -31,8 +31,10 @@ class StraightView:
     @property
     def seen_by(self) -> Camera:
         """The lens without its distortion."""
-        focal = self.lens.focal
-        return replace(self.camera, fx=focal * self.camera.fx, fy=focal * self.camera.fy)
+        camera, lens = self.camera, self.lens
+        fx, fy = lens.focal * camera.fx, lens.focal * camera.fy
+        cx, cy = camera.cx + lens.right * fx, camera.cy + lens.down * fy
+        return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
 
     @property
     def distortion(self) -> tuple[float, float, float, float]:
@@ -43,7 +45,7 @@ class StraightView:
         """The lens of images that still bend by the other one when they are straightened by this.
 
         k1 and k2 by least squares over the image. Deviations are those of the other, which was
-        found last, and of both focal lengths.
+        found last, and of both focal lengths. Principal points add up, to first order.
         """
         camera, lens = self.camera, self.lens
         x = max(camera.cx, camera.width - 1 - camera.cx) / camera.fx
@@ -55,7 +57,10 @@ class StraightView:
         (k1, k2), *_ = np.linalg.lstsq(np.stack([r**3, r**5], 1), seen / focal - r, rcond=None)
         deviation = float(np.hypot(lens.deviation_focal, other.deviation_focal))
         own = other.deviation_k1, other.deviation_k2
-        return FoundLens(float(k1), float(k2), *own, focal, deviation)
+        right, down = lens.right / other.focal + other.right, lens.down / other.focal + other.down
+        return FoundLens(
+            float(k1), float(k2), *own, focal, deviation, right, down, other.deviation_centre
+        )
 
     # --- points ----------------------------------------------------------------------------
 
@@ -72,7 +77,7 @@ class StraightView:
         as beyond where a polynomial turns back."""
         camera, seen_by = self.camera, self.seen_by
         flat = pixels.reshape(-1, 2).double().cpu().numpy()
-        plane = (flat - (camera.cx, camera.cy)) / (seen_by.fx, seen_by.fy)
+        plane = (flat - (seen_by.cx, seen_by.cy)) / (seen_by.fx, seen_by.fy)
         bent, straight = self._radii
         radius = np.hypot(plane[:, 0], plane[:, 1])
         factor = np.interp(radius, bent, straight / np.maximum(bent, 1e-12), right=np.nan)

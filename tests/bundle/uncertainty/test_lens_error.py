@@ -15,7 +15,8 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import (
     FOCAL_LEFT,
     LEAST,
-    PRIOR,
+    RADIAL,
+    SHAPES,
     LensBend,
     LensEvidence,
     lens_evidence,
@@ -53,7 +54,8 @@ def walk(bend: tuple[float, ...] = (0.0, 0.0, 0.0)) -> tuple[SampleGrid, BundleP
 
 def pinhole(pixels: Tensor, bend: tuple[float, ...]) -> Tensor:
     """Where a pinhole would have seen what a lens shows at pixels."""
-    return pixels + torch.einsum("k,k...->...", torch.tensor(bend), lens_shapes(CAMERA, pixels))
+    shapes = lens_shapes(CAMERA, pixels)[: len(bend)]
+    return pixels + torch.einsum("k,k...->...", torch.tensor(bend), shapes)
 
 
 def rays(pixels: Tensor) -> Tensor:
@@ -86,9 +88,15 @@ def test_matches_tell_what_they_do_wherever_they_lie():
 def test_a_focal_length_that_is_off_is_told_beside_the_bend():
     all_ = evidence(*walk((0.004, 0.01, -0.02)))
     solved = torch.linalg.solve(all_.information.sum(0), all_.gradient.sum(0))
-    torch.testing.assert_close(
-        solved, torch.tensor([0.004, 0.01, -0.02]).double(), atol=3e-4, rtol=0.04
-    )
+    wanted = torch.tensor([0.004, 0.01, -0.02, 0.0, 0.0]).double()
+    torch.testing.assert_close(solved, wanted, atol=3e-4, rtol=0.04)
+
+
+def test_a_principal_point_that_is_off_is_told_beside_the_bend():
+    off = 0.002, 0.01, -0.02, 0.02, -0.03
+    said = evidence(*walk(off)).whole
+    torch.testing.assert_close(said.size, torch.tensor(off).double(), atol=1.5e-3, rtol=0.06)
+    assert said.of(slice(RADIAL, SHAPES)).evidence > 8
 
 
 def test_a_readout_that_is_off_is_told_beside_the_lens():
@@ -106,14 +114,14 @@ def test_a_readout_that_is_off_is_told_beside_the_lens():
     assert found is not None
     assert not found.depth_moves.numel()  # nobody asked
     said = found.whole
-    wanted = torch.tensor([0.004, 0.01, -0.02, 0.03]).double()
+    wanted = torch.tensor([0.004, 0.01, -0.02, 0.0, 0.0, 0.03]).double()
     torch.testing.assert_close(said.size, wanted, atol=1e-3, rtol=0.06)
     # A size that was known before: against the sum of both normal equations.
-    told = said.told(3, 0.02, 0.01)
+    told = said.told(SHAPES, 0.02, 0.01)
     information = torch.linalg.inv(said.covariance)
     right = information @ said.size
-    information[3, 3] += 1e4
-    right[3] += 1e4 * 0.02
+    information[SHAPES, SHAPES] += 1e4
+    right[SHAPES] += 1e4 * 0.02
     torch.testing.assert_close(told.size, torch.linalg.solve(information, right))
     torch.testing.assert_close(told.covariance, torch.linalg.inv(information))
     torch.testing.assert_close(said.without(0).size, said.told(0, 0.0, 1e-12).size[1:])
@@ -133,8 +141,8 @@ def test_poses_and_depths_move_by_what_the_lens_does_to_them():
     size = 0.001
     grid, straight = walk()
     found = evidence(grid, straight)
-    for n in range(3):
-        bend = tuple(size * (k == n) for k in range(3))
+    for n in range(SHAPES):
+        bend = tuple(size * (k == n) for k in range(SHAPES))
         solved = DenseBundle(grid).solve(
             replace(walk(bend)[1], T_cw=straight.T_cw, inverse_depth=straight.inverse_depth), SOLVED
         )
@@ -174,10 +182,10 @@ def test_what_is_said_of_poses_is_the_mean_square_over_lenses(readout, guess):
     """Against lenses drawn by what is known of them, each seen with noise, and what they do; and
     readouts drawn by what is doubted of them."""
     g = torch.Generator().manual_seed(0)
-    k = 4 if readout else 3
+    k = SHAPES + bool(readout)
     moves = torch.randn(12, k, generator=g, dtype=torch.float64)
     prior = torch.tensor([*lens_prior(guess), *readout[:1]]).double()
-    noise = torch.tensor([0.02, 0.02, 0.2, *readout[1:]]).double()
+    noise = torch.tensor([0.01, 0.02, 0.2, 0.01, 0.01, *readout[1:]]).double()
     count = 40
     each = torch.diag(1 / noise.square())[None].expand(count, k, k) / count
     said, focal = torch.zeros(12, dtype=torch.float64), 0.0
@@ -198,23 +206,20 @@ def test_what_is_said_of_poses_is_the_mean_square_over_lenses(readout, guess):
 
 
 def test_no_size_is_said_to_be_known_better_than_least():
-    each = 1e12 * torch.eye(3).double().expand(2, 3, 3)
-    found = LensEvidence(
-        each, torch.zeros(2, 3).double(), torch.eye(3).double(), torch.eye(3)[None]
-    )
+    moves = torch.eye(SHAPES).double()
+    each = 1e12 * moves.expand(2, SHAPES, SHAPES)
+    found = LensEvidence(each, torch.zeros(2, SHAPES).double(), moves, moves[None])
     assert found.whole.deviation.tolist() == pytest.approx(LEAST, rel=1e-5)
-    assert found.bend.deviation.tolist() == pytest.approx(LEAST[1:], rel=1e-5)
+    assert found.bend.deviation.tolist() == pytest.approx(LEAST[1:RADIAL], rel=1e-5)
     assert float(found.considered().covariance.max()) < 1e-11  # which moves no pose
 
 
 def test_without_evidence_the_lens_is_as_unsure_as_before():
-    moves = torch.eye(3).double()
-    found = LensEvidence(
-        torch.zeros(2, 3, 3).double(), torch.zeros(2, 3).double(), moves, moves[None]
-    )
-    wanted = torch.diag(torch.tensor(PRIOR).double().square())
+    moves, nothing = torch.eye(SHAPES).double(), torch.zeros(2, SHAPES).double()
+    found = LensEvidence(torch.zeros(2, SHAPES, SHAPES).double(), nothing, moves, moves[None])
+    wanted = torch.diag(torch.tensor(lens_prior()).double().square())
     # Nothing is said of it, whatever is estimated.
     assert float((found.considered().covariance - wanted).abs().max()) < 1e-3 * float(wanted.max())
     more = found.considered(0.95).covariance - found.considered().covariance
     left = (FOCAL_LEFT * math.log(0.95)) ** 2
-    assert torch.allclose(more, torch.diag(torch.tensor([left, 0, 0]).double()))
+    assert torch.allclose(more, torch.diag(torch.tensor([left, 0, 0, 0, 0]).double()))

@@ -22,6 +22,7 @@ from geogs.io.sources.frame_source import Source
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.threads import worker_count
 from geogs.types import FoundFrames, FoundLens, Frame, Trajectory, Uncertainty
+from geogs.world.straight_view import StraightView
 
 AROUND = 10
 """Frames with a place before each lost one, and as many after it, about which it is looked for."""
@@ -137,11 +138,13 @@ def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
 
 def as_seen(camera: Camera, lens: FoundLens | None) -> Calibration:
     """What images are seen by that were taken for those of a pinhole, with what was found since."""
-    focal, bend = (1.0, ()) if lens is None else (lens.focal, (lens.k1, lens.k2, 0.0, 0.0))
+    bend: tuple[float, ...] = ()
+    if lens is not None:
+        view = StraightView(camera, lens)
+        camera, bend = view.seen_by, view.distortion
     return Calibration(
-        focal * camera.fx, focal * camera.fy, camera.cx, camera.cy, bend,
-        width=camera.width, height=camera.height,
-    )  # fmt: skip
+        camera.fx, camera.fy, camera.cx, camera.cy, bend, width=camera.width, height=camera.height
+    )
 
 
 def _read(video: Source, numbers: Collection[int]) -> list[Frame]:

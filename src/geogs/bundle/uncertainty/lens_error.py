@@ -10,7 +10,7 @@ Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bier
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -33,17 +33,21 @@ from geogs.bundle.uncertainty.thinned import AnyProblem, ThinnedProblem
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
 
-SHAPES = 3
-"""Of the error of a pixel x off the axis: x, x |x|^2, x |x|^4, for the logarithm of the focal
-length, and OpenCV's k1 and k2."""
+RADIAL = 3
+"""Shapes of the error of a pixel x off the axis: x, x |x|^2, x |x|^4, for the logarithm of the
+focal length, and OpenCV's k1 and k2."""
+SHAPES = RADIAL + 2
+"""And one along either side of the image, for the principal point, in focal lengths."""
 Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
 """What is to be added to where cells of a problem's edges were found for a readout that is longer
 by a part of it: one shape more."""
-LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001), 0.005
+LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001, 0.001, 0.002), 0.005
 """No size is known better, however many matches agree: half of what they say of lenses that have no
 error (docs/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
-"""Deviations of the sizes before any match is asked."""
+"""Deviations of the radial sizes before any match is asked."""
+CENTRE, GIVEN_CENTRE = 0.02, 0.002
+"""Of the principal point, of a lens that nobody told of and of one that was measured."""
 STANDARD_ERRORS = 3.0
 """Standard errors of the matches' own estimate that are taken for a deviation of the lens: matches
 of different keyframes err alike, too. Errors are 1 to 7 of them in rendered rooms."""
@@ -52,18 +56,21 @@ FOCAL_LEFT = 0.05
 to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
 
 
-def lens_prior(focal_deviation: float = 0.0) -> tuple[float, float, float]:
+def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
     """Deviations of the sizes before any match is asked, of a focal length that is known to a
-    relative ``focal_deviation``, which may be a guess."""
-    return max(focal_deviation, PRIOR[0]), PRIOR[1], PRIOR[2]
+    relative ``focal_deviation``, which may be a guess; 0 where somebody said it."""
+    centre = CENTRE if focal_deviation > 0 else GIVEN_CENTRE
+    return max(focal_deviation, PRIOR[0]), PRIOR[1], PRIOR[2], centre, centre
 
 
-def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "3 *b 2"]:
+def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "5 *b 2"]:
     """By how much a pinhole's pixel lies off what is seen, for each size of one, to first order."""
     centre = pixels.new_tensor([camera.cx, camera.cy])
     off = pixels - centre
     square = (off / pixels.new_tensor([camera.fx, camera.fy])).square().sum(-1, keepdim=True)
-    return torch.stack([-off, -off * square, -off * square.square()])
+    right, down = torch.zeros_like(off), torch.zeros_like(off)
+    right[..., 0], down[..., 1] = camera.fx, camera.fy
+    return torch.stack([-off, -off * square, -off * square.square(), -right, -down])
 
 
 def shape_shifts(
@@ -71,7 +78,7 @@ def shape_shifts(
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     at: CellProjection,
-) -> Float[Tensor, "3 e p 2"]:
+) -> Float[Tensor, "5 e p 2"]:
     """What is to be added to where cells were found, for each size of one.
 
     What a cell shows lies off it, and so does what is found in the target; the former is carried
@@ -92,10 +99,15 @@ class LensBend:
     k2: float = 0.0
     focal: float = 0.0
     """Logarithm of the focal length over what it is taken for."""
+    right: float = 0.0
+    down: float = 0.0
+    """Where the principal point lies off what it is taken for, in focal lengths."""
 
-    def plus(self, size: Float[Tensor, "2"]) -> "LensBend":
-        """With k1 and k2 added to."""
-        return LensBend(self.k1 + float(size[0]), self.k2 + float(size[1]), self.focal)
+    def plus(self, k1: float, k2: float, right: float = 0.0, down: float = 0.0) -> "LensBend":
+        """With sizes added to."""
+        return replace(
+            self, k1=self.k1 + k1, k2=self.k2 + k2, right=self.right + right, down=self.down + down
+        )
 
     def of_matches(
         self,
@@ -106,7 +118,8 @@ class LensBend:
     ) -> Float[Tensor, "e p 2"]:
         """What is to be added to where cells were found, as if a pinhole had seen both views."""
         shift = shape_shifts(camera, rays, T_ji, project(camera, rays, T_ji, inverse_depth))
-        return self.focal * shift[0] + self.k1 * shift[1] + self.k2 * shift[2]
+        size = shift.new_tensor([self.focal, self.k1, self.k2, self.right, self.down])
+        return torch.einsum("k,kepc->epc", size, shift)
 
 
 @dataclass(frozen=True)
@@ -134,9 +147,9 @@ class LensEvidence:
 
     @property
     def bend(self) -> "LensEstimate":
-        """Of k1 and k2, the focal length being right."""
-        k = slice(1, SHAPES)
-        return _estimate(self.information[:, k, k], self.gradient[:, k]).floored(LEAST[1:])
+        """Of k1 and k2, focal length and principal point being right."""
+        k = slice(1, RADIAL)
+        return _estimate(self.information[:, k, k], self.gradient[:, k]).floored(LEAST[1:RADIAL])
 
     @property
     def whole(self) -> "LensEstimate":
@@ -205,6 +218,10 @@ class LensEstimate(NamedTuple):
         """With no size known better than so."""
         floor = torch.diag(self.size.new_tensor(least).square())
         return LensEstimate(self.size, self.covariance + floor)
+
+    def of(self, sizes: slice) -> "LensEstimate":
+        """Some of the sizes, whatever the others are."""
+        return LensEstimate(self.size[sizes], self.covariance[sizes, sizes])
 
     @property
     def evidence(self) -> float:
@@ -292,13 +309,15 @@ def _reduced(
     """Each source in order. What is to be added to a match is what the lens takes off where its
     cell falls: so are the signs of what joins sizes and poses or depths."""
 
-    def fallen(part: BundleProblem) -> Float[Tensor, "e p 2"]:
-        assert rows is not None
+    def fallen(part: BundleProblem) -> Float[Tensor, "e o p 2"]:
         T_ji = relative_motion(part.T_cw, part.source, part.target)
         at = project(thinned.camera, thinned.rays, T_ji, part.inverse_depth[part.source])
-        return -rows(part, thinned.rays, at)
+        moved = [*shape_shifts(thinned.camera, thinned.rays, T_ji, at)[RADIAL:]]
+        if rows is not None:
+            moved.append(rows(part, thinned.rays, at))
+        return -torch.stack(moved, 1)
 
-    flow = LensFlow(further=None if rows is None else fallen)
+    flow = LensFlow(further=fallen)
     for part in thinned.parts(options):
         state = BundleState(part.T_cw, part.inverse_depth, thinned.lens)
         for source in linearised_sources(flow, part, state, options):

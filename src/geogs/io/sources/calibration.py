@@ -133,18 +133,23 @@ class Calibration:
 
     def with_lens(self, found: FoundLens) -> "Calibration":
         """The calibration with what images straightened by it bend, once the size is known."""
-        bend, factor = (found.k1, found.k2), found.focal
-        distortion = with_bend(self.camera(), self.distortion, self.lens, bend, factor)
+        bend, shift = (found.k1, found.k2), (found.right, found.down)
+        camera, distortion = with_bend(
+            self.camera(), self.distortion, self.lens, bend, found.focal, shift
+        )
         origin = f"{self.origin}; bent as all matches say, by k1 {found.k1:.4f}, k2 {found.k2:.4f}"
-        bent = replace(self, distortion=distortion, origin=origin)
-        if factor == 1:
+        if found.is_off_centre:
+            off = camera.cx - self.cx, camera.cy - self.cy
+            origin = f"{origin}, principal point moved by {off[0]:.1f}, {off[1]:.1f} pixels"
+        bent = replace(self, cx=camera.cx, cy=camera.cy, distortion=distortion, origin=origin)
+        if found.focal == 1:
             return bent
-        fx, own = factor * self.fx, (found.deviation_k1, found.deviation_k2)
+        own = found.deviation_k1, found.deviation_k2
         said = replace(self.refinement or FocalRefinement(), deviations=own, failure=None)
         return replace(
-            bent, fx=fx, fy=factor * self.fy, is_guess=False, is_nominal=False,
-            origin=f"{origin}, fx times {factor:.4f}",
-            refinement=replace(said, deviation=found.deviation_focal * fx),
+            bent, fx=camera.fx, fy=camera.fy, is_guess=False, is_nominal=False,
+            origin=f"{origin}, fx times {found.focal:.4f}",
+            refinement=replace(said, deviation=found.deviation_focal * camera.fx),
         )  # fmt: skip
 
     def _size(self) -> tuple[int, int]:
