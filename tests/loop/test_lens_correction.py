@@ -40,12 +40,19 @@ def forward(turn: float = 0.08) -> Tensor:
 class BentFlow(PlantedFlow):
     """Exact matches between images of a lens."""
 
-    def __init__(self, T: Tensor, bend: tuple[float, float], focal: float = 0.0) -> None:
-        """``focal``: by which part of what they are taken for the images' focal length is less."""
+    def __init__(
+        self,
+        T: Tensor,
+        bend: tuple[float, float],
+        focal: float = 0.0,
+        centre: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """``focal``: by which part of what they are taken for the images' focal length is less;
+        ``centre``: where their principal point is off, in focal lengths."""
         super().__init__(GRID, T, torch.empty(0), 0.0)
         self.is_straight, self.left = False, (0.0, 0.0)
         """``left``: what straight images still bend."""
-        self._see(torch.tensor([focal, *bend]))
+        self._see(torch.tensor([focal, *bend, *centre]))
 
     def encode(self, image: np.ndarray) -> int:
         """The number that an image stands for; from the first on that is straightened, all are."""
@@ -86,9 +93,11 @@ def image_of(number: int) -> np.ndarray:
     return np.dstack([np.full_like(NOISE, number), np.zeros_like(NOISE), NOISE])
 
 
-def tracker_of(bend: tuple[float, float], focal: float = 0.0) -> tuple[Tracker, Tensor]:
+def tracker_of(
+    bend: tuple[float, float], focal: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Tracker, Tensor]:
     T = forward(0.3 if focal else 0.08)  # what tells a focal length is rotation
-    flow = BentFlow(T, bend, focal)
+    flow = BentFlow(T, bend, focal, centre)
     tracker = lone_tracker(CAMERA, operator=flow)
     for n in range(COUNT):
         state = tracker.keyframes.add(n, n / 10, image_of(n), n, T[n].clone())
@@ -226,6 +235,35 @@ def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypat
     lens = tracker.keyframes.table.lens
     assert lens is not None
     assert lens.focal == pytest.approx(1 / 1.03, abs=0.01)
+    assert (lens.k1, lens.k2) == pytest.approx((0.02, -0.03), abs=0.006)
+
+
+def test_a_principal_point_is_found_where_nobody_told_of_the_lens():
+    """Off by 0.04 focal lengths, of which straight images have none left."""
+    bend, centre = (0.02, -0.03), (0.01, -0.04)
+    tracker, _ = tracker_of(bend, -0.03, centre)
+    global_bundle(tracker, ends=True)
+    unsaid = tracker.keyframes.table.lens
+    assert unsaid is None or not unsaid.is_off_centre  # somebody said the lens
+    tracker, _ = tracker_of(bend, -0.03, centre)
+    tracker.keyframes.table.focal_deviation = 0.01
+    global_bundle(tracker, ends=True)
+    lens = tracker.keyframes.table.lens
+    assert lens is not None
+    assert (lens.right, lens.down) == pytest.approx(centre, abs=0.006)
+    assert 0 < lens.deviation_centre < 0.02
+    assert lens.focal == pytest.approx(1 / 1.03, abs=0.012)
+    straight = tracker.keyframes[3].image
+    assert np.array_equal(straight, StraightView(CAMERA, lens).image(image_of(3)))
+
+
+def test_a_principal_point_that_is_hardly_off_stays_the_middle():
+    tracker, _ = tracker_of((0.02, -0.03), -0.03, (0.0005, 0.0))
+    tracker.keyframes.table.focal_deviation = 0.01
+    global_bundle(tracker, ends=True)
+    lens = tracker.keyframes.table.lens
+    assert lens is not None
+    assert not lens.is_off_centre
     assert (lens.k1, lens.k2) == pytest.approx((0.02, -0.03), abs=0.006)
 
 

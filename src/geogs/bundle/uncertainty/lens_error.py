@@ -46,7 +46,7 @@ LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001, 0.001, 0.002), 0.005
 error (docs/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Deviations of the radial sizes before any match is asked."""
-CENTRE, GIVEN_CENTRE = 0.02, 0.002
+CENTRE, GIVEN_CENTRE = 0.03, 0.002
 """Of the principal point, of a lens that nobody told of and of one that was measured."""
 STANDARD_ERRORS = 3.0
 """Standard errors of the matches' own estimate that are taken for a deviation of the lens: matches
