@@ -94,16 +94,15 @@ def correct_lens(
             break
         if said is None and not (before or is_open) and asked.bend.evidence < EVIDENCE:
             break
-        said, left = asked.whole, left - 1
+        said, left = asked.whole(asks_centre), left - 1
+        shapes = SHAPES if asks_centre else RADIAL
         if is_open:
             taken = focal, bend.k1, bend.k2, bend.right, bend.down
-            for n, prior in enumerate(lens_prior(focal_deviation)):
+            for n, prior in enumerate(lens_prior(focal_deviation)[:shapes]):
                 said = said.told(n, -taken[n], prior)
         if rows is not None:
-            said = said.told(SHAPES, 1 - readout - longer, rows.doubt)
-        centre = said.of(slice(RADIAL, SHAPES))
-        if not asks_centre:
-            said = said.without(RADIAL).without(RADIAL)
+            said = said.told(shapes, 1 - readout - longer, rows.doubt)
+        centre = said.of(slice(RADIAL, shapes))
         if ends and not is_asked and _contradict_focal(said):
             is_asked, left = True, ROUNDS
         if is_asked:
@@ -119,8 +118,8 @@ def correct_lens(
             longer += float(said.size[-1])
         if bool((said.size.abs() < CONVERGED * said.deviation).all()):
             left = 0
-        first, count = int(is_asked), SHAPES - 1 if asks_centre else RADIAL - 1
-        bend = bend.plus(*said.size[first : first + count].tolist())
+        first = int(is_asked)
+        bend = bend.plus(*said.size[first : first + shapes - 1].tolist())
         if not left and asks_centre and not before:
             found = centre._replace(size=centre.size.new_tensor([bend.right, bend.down]))
             if found.evidence < CENTRE_EVIDENCE:

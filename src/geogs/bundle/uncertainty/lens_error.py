@@ -38,6 +38,8 @@ RADIAL = 3
 focal length, and OpenCV's k1 and k2."""
 SHAPES = RADIAL + 2
 """And one along either side of the image, for the principal point, in focal lengths."""
+CENTRES = range(RADIAL, SHAPES)
+"""Which of them those are."""
 Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
 """What is to be added to where cells of a problem's edges were found for a readout that is longer
 by a part of it: one shape more."""
@@ -151,11 +153,12 @@ class LensEvidence:
         k = slice(1, RADIAL)
         return _estimate(self.information[:, k, k], self.gradient[:, k]).floored(LEAST[1:RADIAL])
 
-    @property
-    def whole(self) -> "LensEstimate":
-        """Of all sizes together."""
-        least = (*LEAST, LEAST_OF_READOUT)[: self.gradient.shape[1]]
-        return _estimate(self.information, self.gradient).floored(least)
+    def whole(self, with_centre: bool = True) -> "LensEstimate":
+        """Of all sizes together; but for those of a principal point that is right."""
+        asked = [n for n in range(self.gradient.shape[1]) if with_centre or n not in CENTRES]
+        information = self.information[:, asked][:, :, asked]
+        least = tuple((*LEAST, LEAST_OF_READOUT)[n] for n in asked)
+        return _estimate(information, self.gradient[:, asked]).floored(least)
 
     def considered(
         self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
