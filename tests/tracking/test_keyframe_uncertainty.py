@@ -51,10 +51,15 @@ def test_a_bent_walk_strains_its_matches():
     assert float(after.median()) > float(before.median()) + 0.5
 
 
+def know_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))
+    monkeypatch.setattr(lens_error, "GIVEN_CENTRE", 1e-9)
+
+
 def test_errors_that_all_matches_have_in_common_are_foretold(monkeypatch):
     """Errors of either half of the image in all keyframes, several times as large as usual."""
     flow_size, place_size = 0.5, 1.0
-    monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))  # the lens is known
+    know_the_lens(monkeypatch)
     monkeypatch.setattr(room, "USUAL_RESIDUAL", np.inf)
     monkeypatch.setattr(marginals, "PLACES", (2, 1))
     monkeypatch.setattr(marginals, "COMMON_FLOW", flow_size)
@@ -83,7 +88,7 @@ def test_errors_that_all_matches_have_in_common_are_foretold(monkeypatch):
 def test_depths_are_as_unsure_as_lens_and_common_errors_leave_them(monkeypatch):
     tracker = measured(14)
     unsure = keyframe_uncertainty(tracker).depth
-    monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))
+    know_the_lens(monkeypatch)
     lens_known = keyframe_uncertainty(tracker).depth
     monkeypatch.setattr(marginals, "COMMON_FLOW", 0.0)
     monkeypatch.setattr(marginals, "COMMON_PLACE", 0.0)
@@ -117,7 +122,7 @@ def test_parts_of_a_long_walk_follow_each_other(monkeypatch):
 def test_strain_makes_matches_as_much_less_sure_and_the_lens_no_less(monkeypatch):
     tracker = measured(6)
     residual = matches_alone(tracker).normalised_residual.numpy() / USUAL_RESIDUAL
-    monkeypatch.setattr(lens_error, "PRIOR", (1e-9, 1e-9, 1e-9))
+    know_the_lens(monkeypatch)
     strained = keyframe_uncertainty(tracker)
     monkeypatch.setattr(room, "USUAL_RESIDUAL", np.inf)
     calm = keyframe_uncertainty(tracker)
