@@ -3,10 +3,38 @@
 import numpy as np
 from numba import njit
 
+from geogs.kernel_parts import inlined
+
+_FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
 _ONE, _TWO, _NEAREST = np.float32(1), np.float32(2), np.float32(1e-6)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**inlined(_FAST))
+def _average(x, y, z, slot, j, table, truncation, width, height, distance, weight):
+    """Update a voxel whose u z, v z and z are given."""
+    if not z > _NEAREST:
+        return
+    inverse = _ONE / z
+    u, v = x * inverse, y * inverse
+    column, row = np.rint(u), np.rint(v)
+    if not (column >= 0 and row >= 0 and column < width and row < height):
+        return
+    pixel = np.int64(row) * width + np.int64(column)
+    plane = table[pixel]
+    surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
+    ahead = (_ONE / surface - z) / truncation[pixel]
+    if not ahead > -_ONE:
+        return
+    gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)
+    if not gain > 0:
+        return
+    new = weight[slot, j] + gain
+    change = min(ahead, _ONE) - distance[slot, j]
+    distance[slot, j] += change * (gain / new)
+    weight[slot, j] = new
+
+
+@njit(**_FAST)
 def average_in(slots, block, local, table, truncation, width, height, distance, weight):
     """Update the voxels of some blocks (k,) of ``distance`` and ``weight`` (blocks, voxels).
 
@@ -20,7 +48,7 @@ def average_in(slots, block, local, table, truncation, width, height, distance, 
             _average(x, y, z, slots[k], j, table, truncation, width, height, distance, weight)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**_FAST)
 def average_in_contracted(
     slots, block, local, corner, step, middle, radius,
     table, truncation, width, height, distance, weight,
@@ -48,28 +76,3 @@ def average_in_contracted(
                 y = middle[1] + stretch * (y - middle[1])
                 z = middle[2] + stretch * (z - middle[2])
             _average(x, y, z, slots[k], j, table, truncation, width, height, distance, weight)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _average(x, y, z, slot, j, table, truncation, width, height, distance, weight):
-    """Update a voxel whose u z, v z and z are given."""
-    if not z > _NEAREST:
-        return
-    inverse = _ONE / z
-    u, v = x * inverse, y * inverse
-    column, row = np.rint(u), np.rint(v)
-    if not (column >= 0 and row >= 0 and column < width and row < height):
-        return
-    pixel = np.int64(row) * width + np.int64(column)
-    plane = table[pixel]
-    surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
-    ahead = (_ONE / surface - z) / truncation[pixel]
-    if not ahead > -_ONE:
-        return
-    gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)
-    if not gain > 0:
-        return
-    new = weight[slot, j] + gain
-    change = min(ahead, _ONE) - distance[slot, j]
-    distance[slot, j] += change * (gain / new)
-    weight[slot, j] = new
