@@ -11,7 +11,8 @@ _ONE, _TWO, _NEAREST = np.float32(1), np.float32(2), np.float32(1e-6)
 
 @njit(**inlined(_FAST))
 def _average(x, y, z, slot, j, table, truncation, width, height, distance, weight):
-    """Update a voxel whose u z, v z and z are given."""
+    """Update a voxel whose u z, v z and z are given, as :func:`average_in` does: calls for each voxel
+    cost that one two thirds of its speed."""
     if not z > _NEAREST:
         return
     inverse = _ONE / z
@@ -42,10 +43,30 @@ def average_in(slots, block, local, table, truncation, width, height, distance, 
     ``table`` (pixels, 4) and ``truncation`` (pixels), in map units, are those of ``PixelPlanes``.
     """
     for k in range(len(slots)):
+        slot = slots[k]
         for j in range(local.shape[1]):
-            x, y = block[k, 0] + local[0, j], block[k, 1] + local[1, j]
             z = block[k, 2] + local[2, j]
-            _average(x, y, z, slots[k], j, table, truncation, width, height, distance, weight)
+            if not z > _NEAREST:
+                continue
+            inverse = _ONE / z
+            u = (block[k, 0] + local[0, j]) * inverse
+            v = (block[k, 1] + local[1, j]) * inverse
+            column, row = np.rint(u), np.rint(v)
+            if not (column >= 0 and row >= 0 and column < width and row < height):
+                continue
+            pixel = np.int64(row) * width + np.int64(column)
+            plane = table[pixel]
+            surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
+            ahead = (_ONE / surface - z) / truncation[pixel]
+            if not ahead > -_ONE:
+                continue
+            gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)
+            if not gain > 0:
+                continue
+            new = weight[slot, j] + gain
+            change = min(ahead, _ONE) - distance[slot, j]
+            distance[slot, j] += change * (gain / new)
+            weight[slot, j] = new
 
 
 @njit(**_FAST)
