@@ -11,8 +11,10 @@ _ONE, _TWO, _NEAREST = np.float32(1), np.float32(2), np.float32(1e-6)
 
 @njit(**inlined(_FAST))
 def _average(x, y, z, slot, j, table, truncation, width, height, distance, weight):
-    """Update a voxel whose u z, v z and z are given, as :func:`average_in` does, which calls nothing
-    for each of its voxels: that takes three times as long."""
+    """Update a voxel whose u z, v z and z are given.
+
+    It is the inside of :func:`average_in`, which calls nothing: calls take three times as long.
+    """
     if not z > _NEAREST:
         return
     inverse = _ONE / z
