@@ -300,7 +300,7 @@ class SparseTsdf:
         truncation: Float[Tensor, "p"],
     ) -> None:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
-        from geogs.mesh.volume.tsdf_kernels import average_in, average_in_contracted
+        from geogs.mesh.volume.tsdf_kernels import average_in
 
         centre = T_cw.new_tensor(self.contraction.centre)[:, None]
         projection, corner = camera.matrix() @ T_cw[:3], self._coordinates[slots].double().mT
@@ -314,13 +314,10 @@ class SparseTsdf:
 
         def update(chunk: int) -> None:
             some = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
-            view = planes, reach, camera.width, camera.height, distance, weight
-            if self.contraction:
-                average_in_contracted(
-                    number[some], block[some], local, apart[some], away, middle, radius, *view
-                )
-            else:
-                average_in(number[some], block[some], local, *view)
+            average_in(
+                number[some], block[some], local, apart[some], away, middle, radius, planes, reach,
+                camera.width, camera.height, distance, weight,
+            )  # fmt: skip
 
         run_chunks(update, -(-len(slots) // _CHUNK), worker_count())
 

@@ -3,56 +3,42 @@
 import numpy as np
 from numba import njit
 
-from geogs.kernel_parts import inlined
-
-_FAST = {"cache": True, "nogil": True, "error_model": "numpy"}
 _ONE, _TWO, _NEAREST = np.float32(1), np.float32(2), np.float32(1e-6)
 
 
-@njit(**inlined(_FAST))
-def _average(x, y, z, slot, j, table, truncation, width, height, distance, weight):
-    """Update a voxel whose u z, v z and z are given.
-
-    It is the inside of :func:`average_in`, which calls nothing: calls take three times as long.
-    """
-    if not z > _NEAREST:
-        return
-    inverse = _ONE / z
-    u, v = x * inverse, y * inverse
-    column, row = np.rint(u), np.rint(v)
-    if not (column >= 0 and row >= 0 and column < width and row < height):
-        return
-    pixel = np.int64(row) * width + np.int64(column)
-    plane = table[pixel]
-    surface = plane[0] + plane[1] * (u - column) + plane[2] * (v - row)
-    ahead = (_ONE / surface - z) / truncation[pixel]
-    if not ahead > -_ONE:
-        return
-    gain = plane[3] * min(_TWO + _TWO * ahead, _ONE)
-    if not gain > 0:
-        return
-    new = weight[slot, j] + gain
-    change = min(ahead, _ONE) - distance[slot, j]
-    distance[slot, j] += change * (gain / new)
-    weight[slot, j] = new
-
-
-@njit(**_FAST)
-def average_in(slots, block, local, table, truncation, width, height, distance, weight):
+@njit(cache=True, nogil=True, error_model="numpy")
+def average_in(
+    slots, block, local, corner, step, middle, radius,
+    table, truncation, width, height, distance, weight,
+):  # fmt: skip
     """Update the voxels of some blocks (k,) of ``distance`` and ``weight`` (blocks, voxels).
 
     ``block`` (k, 3) and ``local`` (3, voxels) add up to a voxel's u z, v z and z in the image;
+    ``corner`` (k, 3) and ``step`` (3, voxels) to where it lies from the centre of a ``Contraction``
+    with a ``radius``, which may be infinite, and which is at ``middle`` (3) as the former are.
     ``table`` (pixels, 4) and ``truncation`` (pixels), in map units, are those of ``PixelPlanes``.
     """
+    is_contracted = np.isfinite(radius)
     for k in range(len(slots)):
         slot = slots[k]
         for j in range(local.shape[1]):
+            x, y = block[k, 0] + local[0, j], block[k, 1] + local[1, j]
             z = block[k, 2] + local[2, j]
+            if is_contracted:
+                a, b = corner[k, 0] + step[0, j], corner[k, 1] + step[1, j]
+                c = corner[k, 2] + step[2, j]
+                away = np.sqrt(a * a + b * b + c * c) / radius
+                if not away < _TWO - _NEAREST:
+                    continue
+                if away > _ONE:
+                    stretch = _ONE / (away * (_TWO - away))
+                    x = middle[0] + stretch * (x - middle[0])
+                    y = middle[1] + stretch * (y - middle[1])
+                    z = middle[2] + stretch * (z - middle[2])
             if not z > _NEAREST:
                 continue
             inverse = _ONE / z
-            u = (block[k, 0] + local[0, j]) * inverse
-            v = (block[k, 1] + local[1, j]) * inverse
+            u, v = x * inverse, y * inverse
             column, row = np.rint(u), np.rint(v)
             if not (column >= 0 and row >= 0 and column < width and row < height):
                 continue
@@ -69,33 +55,3 @@ def average_in(slots, block, local, table, truncation, width, height, distance, 
             change = min(ahead, _ONE) - distance[slot, j]
             distance[slot, j] += change * (gain / new)
             weight[slot, j] = new
-
-
-@njit(**_FAST)
-def average_in_contracted(
-    slots, block, local, corner, step, middle, radius,
-    table, truncation, width, height, distance, weight,
-):  # fmt: skip
-    """As :func:`average_in`, of voxels in a ``Contraction`` with a ``radius``.
-
-    ``corner`` (k, 3) and ``step`` (3, voxels) add up to where a voxel lies from its centre, which
-    is at ``middle`` (3) as ``block`` and ``local`` are.
-    """
-    for k in range(len(slots)):
-        for j in range(local.shape[1]):
-            a, b, c = (
-                corner[k, 0] + step[0, j],
-                corner[k, 1] + step[1, j],
-                corner[k, 2] + step[2, j],
-            )
-            away = np.sqrt(a * a + b * b + c * c) / radius
-            if not away < _TWO - _NEAREST:
-                continue
-            x, y = block[k, 0] + local[0, j], block[k, 1] + local[1, j]
-            z = block[k, 2] + local[2, j]
-            if away > _ONE:
-                stretch = _ONE / (away * (_TWO - away))
-                x = middle[0] + stretch * (x - middle[0])
-                y = middle[1] + stretch * (y - middle[1])
-                z = middle[2] + stretch * (z - middle[2])
-            _average(x, y, z, slots[k], j, table, truncation, width, height, distance, weight)
