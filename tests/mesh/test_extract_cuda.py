@@ -21,7 +21,7 @@ from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.mesh.volume import tsdf
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes, widest
-from geogs.mesh.volume.tsdf import SparseTsdf, blocks_seen, pixel_growth
+from geogs.mesh.volume.tsdf import SparseTsdf, blocks_seen
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()
@@ -65,10 +65,9 @@ def test_kernel_updates_voxels_like_torch(monkeypatch, contraction):
     for view in views(camera, 3):
         expected.integrate(view.depth, view.weight, camera, view.T_cw)
         valid = view.valid()
-        planes = PixelPlanes.of(view.depth, valid, camera)
+        planes = PixelPlanes.of(view.depth, valid, camera).grown(view.T_cw, contraction)
         tested._allocate(blocks_seen(planes, view.T_cw, 0.09, 3.0, contraction))
-        growth = pixel_growth(planes, view.T_cw, contraction)
-        table, truncation = planes.table(view.weight), planes.truncation(0.27 * growth)
+        table, truncation = planes.table(view.weight), planes.truncation(0.27)
         far = torch.where(valid, view.depth, 0.0).amax() + widest(0.27 * 4)
         tested.update_by_kernel(table, truncation, camera, view.T_cw, far)
     assert (tested.coordinates == expected.coordinates).all()

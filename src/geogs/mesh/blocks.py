@@ -38,7 +38,7 @@ def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a view lies, with its band."""
     valid = view.valid() & (view.depth <= plan.max_depth)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
-    planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
+    planes = PixelPlanes.of(view.depth.float(), valid, view.camera).grown(T_cw, plan.contraction)
     return blocks_seen(planes, T_cw, plan.voxel, plan.truncation, plan.contraction)
 
 
@@ -78,8 +78,8 @@ def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> b
     middle, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
     centre, reach = plan.contraction.balls(torch.from_numpy(middle)[None], radius)
     point = centre @ T_cw[:3, :3].double().mT + T_cw[:3, 3].double()
-    far = plan.max_depth + widest(plan.truncation * plan.voxel)
-    return bool(meets_frustum(point, reach, camera, math.inf if plan.contraction else far))
+    band = math.inf if plan.contraction else widest(plan.truncation * plan.voxel)
+    return bool(meets_frustum(point, reach, camera, plan.max_depth + band))
 
 
 @on_one_torch_thread
@@ -116,7 +116,7 @@ def expanded_mesh(mesh: Mesh, contraction: Contraction) -> Mesh:
     """The mesh of the world that one of contracted space stands for, with its colours."""
     if not contraction:
         return mesh
-    vertices = contraction.expanded(torch.from_numpy(mesh.vertices).double()).float().numpy()
+    vertices = contraction.expanded(torch.from_numpy(mesh.vertices)).numpy()
     return replace(Mesh.from_triangles(vertices, mesh.faces), colours=mesh.colours)
 
 

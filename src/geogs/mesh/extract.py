@@ -196,9 +196,12 @@ class _Surface:
         """The surface of the world that one of contracted space stands for."""
         if not contraction:
             return self
-        vertices = contraction.expanded(self.vertices.double()).float()
-        normals = TensorMesh(vertices, self.faces.long()).normals()
-        return _Surface(vertices, self.faces, normals)
+        return _Surface.of(contraction.expanded(self.vertices), self.faces)
+
+    @staticmethod
+    def of(vertices: Float[Tensor, "n 3"], faces: Int[Tensor, "m 3"]) -> "_Surface":
+        """With the normals of its faces."""
+        return _Surface(vertices, faces, TensorMesh(vertices, faces.long()).normals())
 
 
 def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
@@ -223,8 +226,7 @@ def _merged_mesh(
     few = merged(surface.vertices, surface.faces, config.detail * plan.voxel)
     if few is not None:
         vertices = denoised(few.position, few.faces, config.smoothing * plan.voxel).float()
-        normals = TensorMesh(vertices, few.faces.long()).normals()
-        surface = _Surface(vertices, few.faces, normals)
+        surface = _Surface.of(vertices, few.faces)
         seen = None if seen is None else few.means(*seen)
     colours = None if seen is None else filled(surface.vertices, *seen).cpu().numpy()
     world = surface.expanded(plan.contraction)

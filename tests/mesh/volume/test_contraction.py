@@ -13,7 +13,7 @@ from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
-from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf, pixel_growth
+from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
 
 CAMERA = Camera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
 SPACE = Contraction((0.3, -0.2, 0.5), 2.0)
@@ -46,7 +46,7 @@ def test_what_is_contracted_is_expanded_to_where_it_was():
 
 def test_steps_grow_as_the_derivative_says():
     points = scattered(60)
-    grown = torch.as_tensor(SPACE.growth(points))
+    grown = SPACE.growth(points)
     for point, growth in zip(SPACE.contracted(points), grown, strict=True):
         jacobian = torch.autograd.functional.jacobian(SPACE.expanded, point)
         assert isinstance(jacobian, torch.Tensor)
@@ -80,7 +80,8 @@ def test_each_voxel_is_averaged_where_it_lies_in_the_world():
     volume = SparseTsdf(0.05, 3.0, contraction=SPACE)
     volume.integrate(depth, weight, camera, T_cw)
     planes = PixelPlanes.of(depth, depth > 0, camera)
-    reach = planes.truncation(0.15 * pixel_growth(planes, T_cw, SPACE)).view_as(depth)
+    at = (rays / planes.inverse[..., None] - T_cw[:3, 3]) @ T_cw[:3, :3]
+    reach = planes.truncation(0.15).view_as(depth) * SPACE.growth(at)
     random, seen, far = np.random.default_rng(5), 0, 0
     for number in random.integers(0, len(volume), 300):
         inner = random.integers(0, BLOCK, 3)

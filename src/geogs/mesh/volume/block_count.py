@@ -13,14 +13,7 @@ from torch import Tensor
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
-from geogs.mesh.volume.tsdf import (
-    HALF,
-    LIMIT,
-    band_blocks,
-    footprints_in_world,
-    pack,
-    unpack,
-)
+from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, followed, pack, unpack
 
 COARSER = 1.1
 """Times larger are the voxels that are tried next."""
@@ -43,8 +36,8 @@ def fitting_voxel(
     """
     cells = torch.empty(0, dtype=torch.long, device=views[0].depth.device)
     for view in views:
-        new = contraction.contracted(_surface(view, voxel, max_depth, contraction))
-        cells = torch.unique(torch.cat([cells, _cells(new, voxel)]))
+        new = _cells(_surface(view, voxel, max_depth, contraction), voxel)
+        cells = torch.unique(torch.cat([cells, new]))
         while len(cells) > _CELLS_PER_BLOCK * most:
             points = _centres(cells, voxel)
             voxel *= COARSER
@@ -64,11 +57,11 @@ def fitting(
 def _surface(
     view: DepthMapView, voxel: float, max_depth: float, contraction: Contraction
 ) -> Float[Tensor, "n 3"]:
-    """World points along the footprints of the pixels, half a block apart or less."""
+    """Points of contracted space along the footprints of the pixels."""
     valid = view.valid() & (view.depth <= max_depth)
-    planes = PixelPlanes.of(view.depth.float(), valid, view.camera)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
-    return footprints_in_world(planes, T_cw, voxel, contraction)
+    planes = PixelPlanes.of(view.depth.float(), valid, view.camera).grown(T_cw, contraction)
+    return followed(planes, T_cw, voxel, contraction)
 
 
 def _cells(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:

@@ -41,17 +41,18 @@ class Contraction:
         return points + away * (outer * (2 - outer) - 1)
 
     def expanded(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Where contracted points lie in the world; those at infinity or beyond are very far."""
+        """Where contracted points lie in the world; those at infinity or beyond are very far.
+
+        Computed in float64, given as the points are.
+        """
         if not self:
             return points
-        away, distance = self._away(points)
+        away, distance = self._away(points.double())
         held = (distance / self.radius).clamp(1, 2 - NEAREST_TO_RIM)
-        return points + away * (1 / (held * (2 - held)) - 1)
+        return (points + away * (1 / (held * (2 - held)) - 1)).to(points)
 
-    def growth(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"] | float:
+    def growth(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Times longer than in contracted space steps away from the centre are at world points."""
-        if not self:
-            return 1.0
         return (self._away(points)[1] / self.radius)[..., 0].clamp(min=1).square()
 
     def balls(

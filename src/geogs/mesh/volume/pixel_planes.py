@@ -4,7 +4,7 @@ On a surface seen at a slant a footprint is longer than a voxel, and a distance 
 many times that from the surface. Both follow from how inverse depth goes on around a pixel.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import minmod_slopes
+from geogs.mesh.volume.contraction import Contraction
 
 LEAST_BAND = 0.5
 """Fraction of the truncation that the band around a surface has along the normal at least, to
@@ -41,6 +42,8 @@ class PixelPlanes:
     valid: Bool[Tensor, "h w"]
     """Where there is a depth."""
     camera: Camera
+    growth: Float[Tensor, "h w"] | float = 1.0
+    """Times larger than it is given what is to be as long as voxels is there."""
 
     @staticmethod
     def of(
@@ -57,20 +60,23 @@ class PixelPlanes:
         weight = torch.where(self.valid, weight, 0.0)
         return torch.stack([self.inverse, self.right, self.down, weight], -1).flatten(0, 1)
 
-    def points(self) -> Float[Tensor, "h w 3"]:
-        """Points of the camera's frame, one for each pixel."""
+    def grown(self, T_cw: Float[Tensor, "4 4"], contraction: Contraction) -> "PixelPlanes":
+        """In a world whose voxels grow, seen from a pose."""
+        if not contraction:
+            return self
         rays = self.camera.rays(torch.float64, self.inverse.device)
-        return rays / self.inverse[..., None]
+        points = (rays / self.inverse[..., None] - T_cw[:3, 3]) @ T_cw[:3, :3]
+        return replace(self, growth=contraction.growth(points).to(self.inverse))
 
-    def truncation(self, shortest: Float[Tensor, "h w"] | float) -> Float[Tensor, "p"]:
+    def truncation(self, shortest: float) -> Float[Tensor, "p"]:
         """Truncation along the optical axis, map units, by rows.
 
         ``shortest``, but wider where that would leave less than :data:`LEAST_BAND` of it along the
         normal.
         """
-        return (shortest * (LEAST_BAND / self._incidence()).clamp(min=1)).flatten()
+        return (shortest * self.growth * (LEAST_BAND / self._incidence()).clamp(min=1)).flatten()
 
-    def footprints(self, spacing: Float[Tensor, "h w"] | float) -> Float[Tensor, "n 3"]:
+    def footprints(self, spacing: float) -> Float[Tensor, "n 3"]:
         """Points of the camera's frame along the footprints of the pixels with a depth, ``spacing``
         (map units) apart or less.
 
@@ -80,7 +86,7 @@ class PixelPlanes:
         valid, camera, device = self.valid, self.camera, self.inverse.device
         steepest = torch.maximum(*(slope.abs() for slope in self.slant))
         length = steepest / self.inverse.square()
-        count = (length / spacing).ceil().clamp(1, _MOST_SAMPLES)[valid].long()
+        count = (length / (spacing * self.growth)).ceil().clamp(1, _MOST_SAMPLES)[valid].long()
         v, u = valid.nonzero().unbind(1)
         pixel = torch.arange(len(count), device=device).repeat_interleave(count)
         number = torch.arange(len(pixel), device=device) - (count.cumsum(0) - count)[pixel]

@@ -84,27 +84,17 @@ def blocks_seen(
     contraction: Contraction,
 ) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a depth map lies, with its band."""
-    points = footprints_in_world(planes, T_cw, voxel, contraction)
-    return band_blocks(contraction.contracted(points), voxel, truncation)
+    return band_blocks(followed(planes, T_cw, voxel, contraction), voxel, truncation)
 
 
-def footprints_in_world(
+def followed(
     planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], voxel: float, contraction: Contraction
 ) -> Float[Tensor, "n 3"]:
-    """World points along the footprints of the pixels of a depth map, half a block apart or less,
-    so that a floor that is seen at a slant has no gaps between the rows of the image."""
-    points = planes.footprints(voxel * HALF * pixel_growth(planes, T_cw, contraction)).double()
-    return (points - T_cw[:3, 3]) @ T_cw[:3, :3]
-
-
-def pixel_growth(
-    planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], contraction: Contraction
-) -> Float[Tensor, "h w"] | float:
-    """Times larger than near the centre of a contraction voxels are where the pixels show."""
-    if not contraction:
-        return 1.0
-    growth = contraction.growth((planes.points() - T_cw[:3, 3]) @ T_cw[:3, :3])
-    return growth.to(planes.inverse) if isinstance(growth, Tensor) else growth
+    """Points of contracted space along the footprints of the pixels of a depth map, half a block
+    apart or less, so that a floor that is seen at a slant has no gaps between the rows of the
+    image."""
+    points = planes.footprints(voxel * HALF).double()
+    return contraction.contracted((points - T_cw[:3, 3]) @ T_cw[:3, :3])
 
 
 def meets_frustum(
@@ -219,14 +209,12 @@ class SparseTsdf:
         if not bool(valid.any()):
             return
         T_cw = T_cw.to(self.device, torch.float64)
-        planes = PixelPlanes.of(depth, valid, camera)
+        planes = PixelPlanes.of(depth, valid, camera).grown(T_cw, self.contraction)
         seen = blocks_seen(planes, T_cw, self.voxel, self.truncation, self.contraction)
         self._allocate(self._kept(seen))
         if not len(self):
             return
-        growth = pixel_growth(planes, T_cw, self.contraction)
-        table = planes.table(weight)
-        truncation = planes.truncation(self.truncation * self.voxel * growth)
+        table, truncation = planes.table(weight), planes.truncation(self.truncation * self.voxel)
         far = torch.where(valid, depth + truncation.view_as(depth), 0.0).amax()
         if self.device.type == "cuda":
             self.update_by_kernel(table, truncation, camera, T_cw, far)
