@@ -47,8 +47,8 @@ FOCAL_EVIDENCE = 4.0
 it was given it is 0 to 2.2 (docs/lens.md)."""
 CENTRE_EVIDENCE = 36.0
 """Square of the principal point in its deviations from which on it is believed to be off, where
-nobody told of the lens. In rendered rooms it is below 5 where it is the middle, and 80 and more
-where it lies 3 % of the height off it (docs/lens.md)."""
+nobody told of the lens. Where rendered rooms have it in the middle it came out within a deviation
+of that, where it lies 3 % of the height off it, nine and more away (docs/lens.md)."""
 FOCAL_DOUBT = 0.05
 """Deviation of the focal length, as a part of it, from which on matches do not overrule one that
 was given: what they know that badly k1 and k2 explain as well."""
@@ -102,7 +102,6 @@ def correct_lens(
                 said = said.told(n, -taken[n], prior)
         if rows is not None:
             said = said.told(shapes, 1 - readout - longer, rows.doubt)
-        centre = said.of(slice(RADIAL, shapes))
         if ends and not is_asked and _contradict_focal(said):
             is_asked, left = True, ROUNDS
         if is_asked:
@@ -121,8 +120,8 @@ def correct_lens(
         first = int(is_asked)
         bend = bend.plus(*said.size[first : first + shapes - 1].tolist())
         if not left and asks_centre and not before:
-            found = centre._replace(size=centre.size.new_tensor([bend.right, bend.down]))
-            if found.evidence < CENTRE_EVIDENCE:
+            found = said.size.new_tensor([bend.right, bend.down])
+            if said.of(slice(RADIAL, SHAPES))._replace(size=found).evidence < CENTRE_EVIDENCE:
                 asks_centre, left, bend = False, ROUNDS, replace(bend, right=0.0, down=0.0)
         _shift(graph, measured, bend, rows, longer)
         graph.adjust(list(graph.edges), free_pose, free_depth, options)

@@ -9,7 +9,7 @@ Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bier
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -38,8 +38,6 @@ RADIAL = 3
 focal length, and OpenCV's k1 and k2."""
 SHAPES = RADIAL + 2
 """And one along either side of the image, for the principal point, in focal lengths."""
-CENTRES = range(RADIAL, SHAPES)
-"""Which of them those are."""
 Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Tensor, "e p 2"]]
 """What is to be added to where cells of a problem's edges were found for a readout that is longer
 by a part of it: one shape more."""
@@ -80,8 +78,9 @@ def shape_shifts(
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     at: CellProjection,
-) -> Float[Tensor, "5 e p 2"]:
-    """What is to be added to where cells were found, for each size of one.
+    sizes: Float[Tensor, "m 5"],
+) -> Float[Tensor, "m e p 2"]:
+    """What is to be added to where cells were found, for each of some errors of these sizes.
 
     What a cell shows lies off it, and so does what is found in the target; the former is carried
     over at the cell's own depth. The latter is taken where the cell falls (``at``): where it was
@@ -89,7 +88,9 @@ def shape_shifts(
     """
     own = at.pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
     own = own + at.pixels.new_tensor([camera.cx, camera.cy])
-    there, here = lens_shapes(camera, at.pixels), lens_shapes(camera, own)
+    there, here = (
+        torch.einsum("mk,k...->m...", sizes, lens_shapes(camera, p)) for p in (at.pixels, own)
+    )
     return there - carried_over(camera, T_ji, at, here[:, None].expand_as(there))
 
 
@@ -119,9 +120,9 @@ class LensBend:
         inverse_depth: Float[Tensor, "e p"],
     ) -> Float[Tensor, "e p 2"]:
         """What is to be added to where cells were found, as if a pinhole had seen both views."""
-        shift = shape_shifts(camera, rays, T_ji, project(camera, rays, T_ji, inverse_depth))
-        size = shift.new_tensor([self.focal, self.k1, self.k2, self.right, self.down])
-        return torch.einsum("k,kepc->epc", size, shift)
+        at = project(camera, rays, T_ji, inverse_depth)
+        sizes = at.pixels.new_tensor([[self.focal, self.k1, self.k2, self.right, self.down]])
+        return shape_shifts(camera, rays, T_ji, at, sizes)[0]
 
 
 @dataclass(frozen=True)
@@ -150,15 +151,19 @@ class LensEvidence:
     @property
     def bend(self) -> "LensEstimate":
         """Of k1 and k2, focal length and principal point being right."""
-        k = slice(1, RADIAL)
-        return _estimate(self.information[:, k, k], self.gradient[:, k]).floored(LEAST[1:RADIAL])
+        return self._of(range(1, RADIAL))
 
     def whole(self, with_centre: bool = True) -> "LensEstimate":
         """Of all sizes together; but for those of a principal point that is right."""
-        asked = [n for n in range(self.gradient.shape[1]) if with_centre or n not in CENTRES]
-        information = self.information[:, asked][:, :, asked]
-        least = tuple((*LEAST, LEAST_OF_READOUT)[n] for n in asked)
-        return _estimate(information, self.gradient[:, asked]).floored(least)
+        every = range(self.gradient.shape[1])
+        return self._of([n for n in every if with_centre or not RADIAL <= n < SHAPES])
+
+    def _of(self, asked: Sequence[int]) -> "LensEstimate":
+        """Of some sizes, the others being right."""
+        sizes = list(asked)
+        information = self.information[:, sizes][:, :, sizes]
+        least = tuple((*LEAST, LEAST_OF_READOUT)[n] for n in sizes)
+        return _estimate(information, self.gradient[:, sizes]).floored(least)
 
     def considered(
         self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
@@ -315,7 +320,8 @@ def _reduced(
     def fallen(part: BundleProblem) -> Float[Tensor, "e o p 2"]:
         T_ji = relative_motion(part.T_cw, part.source, part.target)
         at = project(thinned.camera, thinned.rays, T_ji, part.inverse_depth[part.source])
-        moved = [*shape_shifts(thinned.camera, thinned.rays, T_ji, at)[RADIAL:]]
+        centre = torch.eye(SHAPES).to(at.pixels)[RADIAL:]
+        moved = [*shape_shifts(thinned.camera, thinned.rays, T_ji, at, centre)]
         if rows is not None:
             moved.append(rows(part, thinned.rays, at))
         return -torch.stack(moved, 1)
