@@ -168,6 +168,13 @@ def test_a_video_without_texture_or_images_tells_nothing():
     assert find_readout(none, RollingCamera(CAMERA)) == FoundReadout()
 
 
+def test_images_that_are_alike_to_the_bit_tell_nothing():
+    seen = rolling_image(hand_held, 0.0, 0.0)
+    clip = [Frame(k, k / RATE, seen) for k in range(CLIP)]
+    still = FollowedClips(lambda first: (clip for _ in range(3 - first)))
+    assert find_readout(still, RollingCamera(CAMERA)) == FoundReadout()
+
+
 def clips(readout: float) -> list[list]:
     return [
         [

@@ -260,6 +260,8 @@ def _verdict(state: _AdjustedClips, focal: float) -> FoundReadout:
     if len(parts) < LEAST_CLIPS or by_fewer is None:
         return FoundReadout(clips=len(parts))
     error = float(np.hypot(_standard_error(parts, lens), TREMOR * readout))
+    if error == 0:  # Images that are alike to the bit: nothing moves, so nothing is told.
+        return FoundReadout()
     error = float(np.hypot(error, BETWEEN * by_fewer.size**2 / max(abs(readout), error)))
     confident = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = confident and SHORTEST <= readout <= LONGEST
