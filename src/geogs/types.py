@@ -104,6 +104,8 @@ class Frame(ShortRepr):
     """How its rows were rectified; none of a global shutter."""
     left: int | None = None
     """Images of its recording that are still to come; none where that is not known."""
+    mask: Bool[np.ndarray, "h w"] | None = None
+    """Pixels that may show the scene; none where all do."""
 
 
 @dataclass(frozen=True, slots=True)

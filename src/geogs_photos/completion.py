@@ -30,7 +30,9 @@ def place_lost(
 ) -> FoundFrames:
     """As asked of it in ``geogs.application.structure_from_motion.photos.place_lost``."""
     features = thread_map(
-        lambda frame: find_features(frame.image), frames, lambda f: progress("features", f)
+        lambda frame: find_features(frame.image, frame.mask),
+        frames,
+        lambda f: progress("features", f),
     )
     shown = [k for k, some in enumerate(features) if len(some) >= FEWEST_FEATURES]
     known = {place + 1: T for place, k in enumerate(shown) if (T := T_cw[k]) is not None}

@@ -41,7 +41,7 @@ class Localiser:
         near = self._near(frame.index)
         positions = np.concatenate([self._positions[k] for k in near])
         descriptors = np.concatenate([self._descriptors[k] for k in near])
-        features = find_features(frame.image)
+        features = find_features(frame.image, frame.mask)
         if len(features) < LEAST_INLIERS or len(positions) < LEAST_INLIERS:
             return None
         own, known = matches_to_points(features.descriptors, descriptors, positions)

@@ -56,7 +56,9 @@ def place_frames(
         is_guess=not (is_known or is_found),
     )  # fmt: skip
     features = thread_map(
-        lambda frame: find_features(frame.image), chosen.frames, lambda f: progress("features", f)
+        lambda frame: find_features(frame.image, frame.mask),
+        chosen.frames,
+        lambda f: progress("features", f),
     )
     pairs, count = frame_pairs(features, seed, progress), len(chosen.frames)
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]

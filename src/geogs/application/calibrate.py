@@ -1,4 +1,4 @@
-"""Before a run: focal length and shutter that nobody gave, from the video itself."""
+"""Before a run: focal length, shutter and mask that nobody gave, from the video itself."""
 
 import math
 from collections.abc import Callable
@@ -7,6 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
+import cv2
+import numpy as np
 import torch
 
 from geogs.application.interrupt import Stop
@@ -23,6 +25,26 @@ if TYPE_CHECKING:
 
 F = TypeVar("F")
 Report = Callable[[float], None]
+
+
+def without_overlay(source: Source, progress: RunProgress | None = None) -> Source:
+    """The source without what all its images show at the same place while all else moves, if nobody
+    gave a mask: a time stamp, a logo, a bonnet."""
+    if not source.is_overlay_open:
+        return source
+    from geogs.io.sources.static_overlay import IMAGES, static_overlay
+
+    images = source.spread(IMAGES)
+    found = static_overlay([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
+    if found is None:
+        return source
+    if progress is not None:
+        progress.write(
+            f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
+            "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
+        )
+    whole = cv2.resize(found.astype(np.uint8), source.image_size, interpolation=cv2.INTER_NEAREST)
+    return source.without_overlay(whole > 0)
 
 
 def self_calibrated(

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.application.calibrate import self_calibrated, with_shutter_found
+from geogs.application.calibrate import self_calibrated, with_shutter_found, without_overlay
 from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver
@@ -77,6 +77,7 @@ def run(
     with claimed(wanted) as output, compiling(device) as kernels:
         compiled_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
+        opened = without_overlay(opened, progress)
         if (plan := _plan(driver, opened)) is not None:
             progress.plan(plan)
         if settings.offline:
@@ -199,7 +200,7 @@ def resume(
     saved = SavedRun(output)
     settings = continued(saved.metadata, settings or saved.settings, output)
     config, device = settings.config, require_device(settings.device)
-    opened = open_source(settings.source, config.input)
+    opened = without_overlay(open_source(settings.source, config.input))
     source = saved.calibrated(opened)
     with claimed(output) as folder, compiling(device) as kernels:
         compiled_kernels(device)

@@ -42,6 +42,9 @@ class InputConfig(Settings, group="input"):
     """Picture of the source images' size, bright where they show the scene and black where they
     always show something else: a car's bonnet, a robot's arm, a time stamp. Or a folder with one
     for each image, by its name or the number of the frame; where one is missing, all is shown."""
+    mask_overlay: Annotated[bool, Only("run")] = True
+    """Whether what all images show at the same place while all else moves, such as a time stamp, is
+    masked out, where no mask is given."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

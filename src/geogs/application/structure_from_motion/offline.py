@@ -214,7 +214,7 @@ def _place_all(
     for frame in source:
         pose = of.get(frame.index)
         if pose is not None:
-            scene.add(frame.image, pose, None, frame.timestamp)
+            scene.add(frame.image, pose, frame.mask, frame.timestamp)
         else:
             pose = localise(frame)
             scene.localised += pose is not None

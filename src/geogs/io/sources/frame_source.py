@@ -5,6 +5,9 @@ import logging
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from jaxtyping import Bool, UInt8
+
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.live.live_reader import LiveReader
@@ -137,6 +140,8 @@ class Source:
         """Whether frames do not wait until they are asked for; such a recording is read alone."""
         self.is_calibration_open = any(images.is_calibration_open for images in recordings)
         """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        self.is_overlay_open = first.is_overlay_open
+        """Whether nobody gave a mask, and what all images show over the scene may be masked."""
         self.is_shutter_open = first.is_shutter_open
         """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
         self.place = ReadingPlace()
@@ -192,6 +197,23 @@ class Source:
     def with_focal(self, focal: float) -> "Source":
         """The same frames, as a pinhole of that focal length sees them."""
         return Source([images.known_better(focal=focal) for images in self._recordings])
+
+    def without_overlay(self, overlay: Bool[np.ndarray, "h w"]) -> "Source":
+        """The same frames, with what all images as they came show over the scene masked out."""
+        return Source([images.known_better(overlay=overlay) for images in self._recordings])
+
+    def spread(self, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """So many images from all over the recordings, at working size, lens and rows as they came;
+        fewer, or none, where they can only be had by reading all before them."""
+        each = -(-count // len(self._recordings))
+        found = [raw.image for images in self._recordings for raw in images.spread(each)]
+        return [image for image in found if image is not None]
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the upright images as they came."""
+        info = self._recordings[0].reader.info
+        return info.width, info.height
 
     @property
     def rolling_camera(self) -> RollingCamera:
@@ -254,7 +276,8 @@ class Source:
             pose = images.poses.of(raw.timestamp, raw.pose)
             pose = None if pose is None else replace(pose, world=number)
             left = None if images.length is None else max(0, images.length - here.read)
-            yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows, left)
+            mask = self.mask if raw.mask is None else raw.mask
+            yield Frame(index, end, raw.image, follows_cut, raw.depth, pose, raw.rows, left, mask)
             index += 1
         if short := images.why_short(here.read, end - here.shift):
             _log.warning("%s", short)

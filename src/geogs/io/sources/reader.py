@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from geogs.io.sources.calibration import Calibration
 from geogs.threads import ordered_map
@@ -43,6 +43,8 @@ class RawFrame:
     """Name of its file, or number of the frame, by which its mask is found."""
     rows: SeenRows | None = None
     """How those of a working image were rectified; none of a global shutter."""
+    mask: Bool[np.ndarray, "h w"] | None = None
+    """Pixels of a working image that may show the scene, by its own mask; none where all do."""
 
     @property
     def fault(self) -> str:
@@ -96,6 +98,15 @@ class Reader(Protocol):
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
+        ...
+
+
+@runtime_checkable
+class SpreadReader(Protocol):
+    """A reader that gives images from all over without reading those between."""
+
+    def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
+        """An image at each of these places or, of a video, shortly before it."""
         ...
 
 

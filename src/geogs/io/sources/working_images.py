@@ -24,6 +24,7 @@ from geogs.io.sources.pose_priors import chosen_poses
 from geogs.io.sources.reader import (
     RawFrame,
     Reader,
+    SpreadReader,
     of_one_size,
     read_ahead,
     read_side_by_side,
@@ -59,11 +60,13 @@ class WorkingImages:
         shutter: Shutter | None = None,
         focal: float | None = None,
         followed_clips: FollowedClips | None = None,
+        overlay: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
         """``calibration`` of the upright images, where it is known better than the reader's.
 
         ``shutter``, where it is known better than the settings'; ``focal`` of the working images
-        instead of what the settings ask for; ``followed_clips`` of the same recording.
+        instead of what the settings ask for; ``followed_clips`` of the same recording; ``overlay``,
+        true where all of its images show what is no part of the scene.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -102,6 +105,9 @@ class WorkingImages:
         """Pixels of every frame that may show the scene; none where all do."""
         if masks is not None and self._masks is None:
             self.mask = self._straight(read_mask(masks, (info.height, info.width)))
+        elif overlay is not None:
+            self.mask = self._straight(~overlay)
+        self._overlay = overlay
         self.black_is_masked = self._masks is not None
         """Whether pixels of frames that are quite black are masked out."""
         self.is_live = isinstance(reader, LiveReader)
@@ -135,16 +141,35 @@ class WorkingImages:
         calibration: Calibration | None = None,
         shutter: Shutter | None = None,
         focal: float | None = None,
+        overlay: Bool[np.ndarray, "h w"] | None = None,
     ) -> "WorkingImages":
         """The same images with what is given instead of what was known: undistorted by another
-        calibration, rectified by another readout, as a pinhole of another focal length sees them.
+        calibration, rectified by another readout, as a pinhole of another focal length sees them,
+        without what all of them show over the scene.
         """
         info = self.reader.info
         known = calibration.fit(info.width, info.height) if calibration else self.calibration
         return WorkingImages(
             self.reader, self._config, known, shutter or self.shutter, focal or self._focal,
-            self.followed_clips,
+            self.followed_clips, self._overlay if overlay is None else overlay,
         )  # fmt: skip
+
+    def spread(self, count: int) -> Iterator[RawFrame]:
+        """So many images from all over the selection, at working size, lens and rows as they came;
+        fewer, or none, where they can only be had by reading all before them."""
+        config, length = self._config, self.reader.info.length
+        if length is None and self.reader.info.seconds is not None:
+            length = round(self.reader.info.seconds * self.reader.info.fps)
+        if length is None or not isinstance(self.reader, SpreadReader):
+            return iter(())
+        places = np.arange(length)[config.start : config.stop]
+        chosen = places[np.unique(np.linspace(0, len(places) - 1, count).round().astype(int))]
+        return map(self._at_working_size, self.reader.spread(chosen.tolist()))
+
+    @property
+    def is_overlay_open(self) -> bool:
+        """Whether nobody gave a mask, and what all images show over the scene may be masked."""
+        return self._config.mask is None and self._config.mask_overlay and not self.is_live
 
     @property
     def is_shutter_open(self) -> bool:
@@ -219,7 +244,7 @@ class WorkingImages:
                 continue
             valid = self._masks.read(raw.name, (self.reader.info.height, self.reader.info.width))
             straight = None if valid is None else self._straight(valid)
-            yield replace(raw, image=masked_out(raw.image, straight))
+            yield replace(raw, image=masked_out(raw.image, straight), mask=straight)
 
     def _rectified(
         self,

@@ -99,6 +99,11 @@ class ImageList:
         """The files that are read."""
         return [file.path for file in self.files]
 
+    def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
+        """The images at these places."""
+        for start in starts:
+            yield from self.read(start, start + 1, 1)
+
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
         for file in self.files[start:stop:stride]:

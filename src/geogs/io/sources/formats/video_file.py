@@ -3,7 +3,7 @@
 import itertools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,24 @@ class VideoFile:
                         yield RawFrame(label, last, upright, name=str(index))
                 elif is_wanted:
                     yield RawFrame(label, last or 0.0, None)
+
+    def spread(self, starts: Sequence[int]) -> Iterator[RawFrame]:
+        """The images from which these places can be decoded; fewer where a video cannot jump."""
+        with _open(self._path) as container:
+            stream, before = container.streams.video[0], -1
+            first = stream.start_time or 0
+            for start in starts:
+                try:
+                    time = round(start / self.info.fps / float(stream.time_base or 1))
+                    container.seek(first + time, stream=stream)
+                    frame = next(container.decode(stream), None)
+                except (av.error.FFmpegError, StopIteration):
+                    continue
+                if frame is None or frame.pts is None or frame.pts == before:
+                    continue
+                before = frame.pts
+                image = turn_upright(frame.to_ndarray(format="rgb24"), self.info.quarter_turns)
+                yield RawFrame(f"{self.info.name}, near frame {start}", frame.time or 0.0, image)
 
     def _time(self, frame: av.VideoFrame, last: float | None) -> float:
         """The presentation time; raw streams and broken muxers have none that increases."""
