@@ -242,6 +242,8 @@ class Uncertainty(ShortRepr):
     misfit: AtLeast0 = 0.0
     """How many times as long as the usual keyframe's are the residuals of the tenth whose matches
     fit least; 0 where that is not known."""
+    focal_change: AtLeast0 = 0.0
+    """By how much parts of the video want focal lengths that differ, as a part of them."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""

@@ -34,6 +34,7 @@ from geogs_photos.poses import structure_of
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.rolling_rows import with_rows_at_once
 from geogs_photos.upright import upright_rotation
+from geogs_photos.zoom import zooms
 
 MOST_CHANGE = 0.1
 """Relative. Where the focal length ends farther from one that the video told, both cannot be right,
@@ -91,7 +92,8 @@ def place_frames(
         progress("finding the readout", 1.0)
     placed = _placed(best, chosen, entries, is_known)
     placed = replace(placed, deviation=np.hypot(placed.deviation, unsure))
-    if is_found and abs(math.log(placed.calibration.fx / camera.fx)) > MOST_CHANGE:
+    is_other = is_found and abs(math.log(placed.calibration.fx / camera.fx)) > MOST_CHANGE
+    if is_other or zooms(best, placed_images(best)):
         unknown = np.full(len(images), np.inf)
         return replace(placed, deviation=unknown, rotation=unknown, depth=unknown)
     return placed

@@ -56,7 +56,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth, residual = (np.full(len(ids), np.inf) for _ in range(4))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
-    propagated, focal, lens = np.zeros(2), 0.0, tracker.keyframes.table.lens
+    propagated, focal, change, lens = np.zeros(2), 0.0, 0.0, tracker.keyframes.table.lens
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
         found = _marginals(tracker, ids[part], rows)
@@ -64,7 +64,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
             continue
         depth[part] = found.depth_deviation.numpy()
         residual[part] = found.normalised_residual.numpy()
-        focal = max(focal, found.focal_variance)
+        focal, change = max(focal, found.focal_variance), max(change, found.focal_change)
         if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
             T_cw = tracker.keyframes.poses(ids)
             position[:], rotation[:] = deviations_after_alignment(T_cw, found.covariance)
@@ -77,7 +77,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     # it agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
     focal = max(open_, math.sqrt(focal))
-    return Uncertainty(times, position, rotation, depth, focal, misfit(residual))
+    return Uncertainty(times, position, rotation, depth, focal, misfit(residual), change)
 
 
 def misfit(residuals: Float[np.ndarray, "n"]) -> float:
@@ -181,4 +181,5 @@ def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marg
     free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[free[:, None], free]
     depth, residual = found.relative_depth[own], found.normalised_residual[own]
-    return Marginals(covariance, depth, residual, found.focal_variance)
+    change = 0.0 if said is None else said.focal_change
+    return Marginals(covariance, depth, residual, found.focal_variance, change)

@@ -73,6 +73,14 @@ def test_keyframes_that_fit_less_well_than_the_others_are_not_relied_on():
     assert "a tenth of its keyframes fit 1.8 times less well" in found.sentence
 
 
+def test_a_video_that_zooms_is_not_relied_on():
+    good = known(0.001, 0.01)
+    assert verdict(walk(30, 30), walk(5, 5), replace(good, focal_change=0.04)).is_reliable
+    found = verdict(walk(30, 30), walk(5, 5), replace(good, focal_change=0.14))
+    assert not found.is_reliable
+    assert "differ by more than 14%, as where somebody zooms" in found.sentence
+
+
 def test_a_run_without_motion_is_not_reliable():
     still = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)), np.ones(5, bool))
     assert not verdict(still, still, known(0.001, 0.01)).is_reliable

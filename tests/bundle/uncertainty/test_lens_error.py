@@ -136,6 +136,37 @@ def test_a_readout_that_is_off_is_told_beside_the_lens():
     torch.testing.assert_close(said.without(0).size, said.told(0, 0.0, 1e-12).size[1:])
 
 
+def test_the_change_of_the_focal_length_is_that_of_parts_beyond_their_deviations():
+    """Against a plain loop over them."""
+    g = torch.Generator().manual_seed(5)
+    information = 1e4 * (0.5 + torch.rand(30, generator=g, dtype=torch.float64))
+    wanted = torch.linspace(0, 0.3, 30) + 0.002 * torch.randn(30, generator=g)
+    each = torch.zeros(30, SHAPES, SHAPES, dtype=torch.float64)
+    each[:, 0, 0], gradient = information, torch.zeros(30, SHAPES, dtype=torch.float64)
+    gradient[:, 0] = information * wanted
+    sizes, deviations = [], []
+    for first in range(0, 30, 5):
+        i, b = information[first : first + 5], gradient[first : first + 5, 0]
+        size = float(b.sum() / i.sum())
+        sizes.append(size)
+        left = sum(float(y - x * size) ** 2 for x, y in zip(i, b, strict=True))
+        deviations.append((1 / float(i.sum()) + left / float(i.sum()) ** 2) ** 0.5)
+    said = LensEvidence(each, gradient, torch.zeros(180, SHAPES), torch.zeros(30, 0, SHAPES))
+    beyond = sizes[-1] - sizes[0] - 5 * (deviations[-1] ** 2 + deviations[0] ** 2) ** 0.5
+    assert said.focal_change == pytest.approx(beyond, rel=1e-6)
+    assert beyond > 0.02
+    gradient[:, 0] = information * 0.3
+    assert said.focal_change < 1e-9
+    each[:10, 0, 0] = -1.0  # parts that tell nothing have no say
+    gradient[:10, 0] = 1e4
+    assert said.focal_change < 1e-9
+
+
+@pytest.mark.parametrize("bend", [(0.0, 0.0, 0.0), (0.05, 0.01, -0.02)])
+def test_one_lens_that_is_another_than_was_said_is_no_zoom(bend):
+    assert evidence(*walk(bend)).focal_change < 0.01
+
+
 def test_noise_alone_is_no_evidence():
     grid, problem = walk()
     for seed in range(4):

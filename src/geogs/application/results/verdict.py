@@ -22,6 +22,8 @@ and less in rendered videos where it was right (docs/lens.md)."""
 MAX_MISFIT = 1.35
 """Residual of a tenth of the keyframes over that of the others: up to 1.29 in rendered videos that
 were followed rightly, from 1.41 on where tracking had failed (docs/uncertainty.md)."""
+MAX_FOCAL_CHANGE = 0.05
+"""Relative difference of the focal lengths that parts of a video want (docs/uncertainty.md)."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -46,6 +48,8 @@ class Verdict:
     """Median relative deviation of depths, of the best known quarter of what each keyframe sees."""
     focal: float = 0.0
     """Relative deviation of the focal length."""
+    focal_change: float = 0.0
+    """Relative difference of the focal lengths that parts of the video want."""
 
     @property
     def has_shape(self) -> bool:
@@ -99,6 +103,11 @@ def verdict(
             "no camera explains how its first views move, as if much of what they show moves "
             "itself, and nobody said its focal length: give --intrinsics"
         )
+    if known.focal_change > MAX_FOCAL_CHANGE:
+        reasons.append(
+            "parts of the video want focal lengths that differ by more than "
+            f"{known.focal_change:.0%}, as where somebody zooms"
+        )
     if known.misfit > MAX_MISFIT:
         reasons.append(
             f"the matches of a tenth of its keyframes fit {known.misfit:.1f} times less well than "
@@ -112,8 +121,9 @@ def verdict(
             f"{_finely(position)} of the extent of its path, the best known depths to {depth:.1%}."
         )
     return Verdict(
-        not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal
-    )
+        not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal,
+        known.focal_change,
+    )  # fmt: skip
 
 
 def _median(values: np.ndarray) -> float:

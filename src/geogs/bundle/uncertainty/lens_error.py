@@ -56,6 +56,10 @@ FOCAL_LEFT = 0.05
 to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
 
 
+PARTS, SURE = 6, 5.0
+"""Of a video, whose focal lengths are compared; deviations by which they differ by chance."""
+
+
 def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
     """Deviations of the sizes before any match is asked, of a focal length that is known to a
     relative ``focal_deviation``, which may be a guess; 0 where somebody said it."""
@@ -152,6 +156,28 @@ class LensEvidence:
     def bend(self) -> "LensEstimate":
         """Of k1 and k2, focal length and principal point being right."""
         return self._of(range(1, RADIAL))
+
+    @property
+    def focal_change(self) -> float:
+        """By how much parts of the video want focal lengths that differ, as a part of them, beyond
+        what each leaves open; 0 where they agree.
+
+        Each by its own residuals, poses and depths as all want them together. Where somebody zooms
+        these are hard to explain by one lens, however well each part is explained by itself.
+        """
+        parts = torch.tensor_split(torch.arange(len(self.gradient)), PARTS)
+        found = [
+            _estimate(self.information[part, :1, :1], self.gradient[part, :1])
+            for part in parts
+            if len(part) > 1 and bool(self.information[part, 0, 0].sum() > 0)
+        ]
+        if len(found) < 2:
+            return 0.0
+        size = torch.cat([each.size for each in found])
+        deviation = torch.cat([each.deviation for each in found])
+        ends = torch.stack([size.argmax(), size.argmin()])
+        most, least = size[ends].tolist()
+        return max(0.0, most - least - SURE * float(deviation[ends].norm()))
 
     def whole(self, with_centre: bool = True) -> "LensEstimate":
         """Of all sizes together; but for those of a principal point that is right."""

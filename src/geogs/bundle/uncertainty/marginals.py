@@ -72,6 +72,8 @@ class Marginals:
     scene is not as modelled."""
     focal_variance: float = 0.0
     """Of the focal length, as a part of it."""
+    focal_change: float = 0.0
+    """By how much parts of the video want focal lengths that differ, as a part of them."""
 
     @property
     def pose(self) -> Float[Tensor, "n 6 6"]:
