@@ -46,8 +46,8 @@ def with_own_lenses(model: Any, images: Sequence[Any]) -> tuple[Float64[np.ndarr
             adjust_free(parted, ())
         parted.update_point_3d_errors()
         errors.append(parted.compute_mean_reprojection_error())
-    focal = [parted.cameras[number].focal_length for number in range(1, PARTS + 1)]
-    return np.array(focal) / camera.focal_length, errors[1] / errors[0]
+    focal = [parted.cameras[number].mean_focal_length() for number in range(1, PARTS + 1)]
+    return np.array(focal) / camera.mean_focal_length(), errors[1] / errors[0]
 
 
 def _parted(model: Any, images: Sequence[Any], camera: Any) -> Any:

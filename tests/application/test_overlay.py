@@ -28,7 +28,7 @@ def coloured(images: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def test_a_folder_with_one_is_masked(tmp_path):
-    for k, image in enumerate(coloured(with_bonnet(seen(30, 3.0)))):
+    for k, image in enumerate(coloured(with_bonnet(seen(60, 2.0)))):
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), image)
     config = InputConfig(long_edge=WIDTH)
     opened, listener = open_source(tmp_path, config), Listener()
@@ -41,6 +41,8 @@ def test_a_folder_with_one_is_masked(tmp_path):
     assert source.mask[:84].all()
     assert source.with_focal(90.0).mask is not None
     assert next(iter(source)).mask is source.mask
+    short = open_source(tmp_path, InputConfig(long_edge=WIDTH, stop=39))
+    assert without_overlay(short) is short
     kept = open_source(tmp_path, InputConfig(long_edge=WIDTH, mask_overlay=False))
     assert without_overlay(kept) is kept
     whole = tmp_path.parent / "whole.png"
@@ -50,7 +52,7 @@ def test_a_folder_with_one_is_masked(tmp_path):
 
 
 def test_a_selection_that_shows_none_has_none(tmp_path):
-    for k, image in enumerate(coloured(seen(30, 3.0))):
+    for k, image in enumerate(coloured(seen(60, 2.0))):
         cv2.imwrite(str(tmp_path / f"{k:03d}.png"), image)
     source = open_source(tmp_path, InputConfig(long_edge=WIDTH))
     assert without_overlay(source) is source

@@ -32,8 +32,10 @@ def without_overlay(source: Source, progress: RunProgress | None = None) -> Sour
     gave a mask: a time stamp, a logo, a bonnet."""
     if not source.is_overlay_open:
         return source
-    from geogs.io.sources.static_overlay import IMAGES, static_overlay
+    from geogs.io.sources.static_overlay import IMAGES, LEAST_FRAMES, static_overlay
 
+    if source.length is not None and source.length < LEAST_FRAMES:
+        return source
     images = source.spread(IMAGES)
     found = static_overlay([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
     if found is None:

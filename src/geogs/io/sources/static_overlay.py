@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float32, UInt8
 
 IMAGES = 16
 """That are compared, from all over a video."""
+LEAST_FRAMES = 40
+"""Of a video that is asked: in less than a second a camera hardly moves, and what it turns about
+stands still."""
 _LEAST_IMAGES = 8
 _FEW = 0.9
 """Part of the images in which a place has to look the same: of a glitch nothing follows."""
@@ -19,20 +22,21 @@ _BLUR = 1.0
 """Pixels, against noise and the blocks of a codec."""
 _TEXTURE = 4.0
 """Grey levels a pixel from which on a gradient would show that something moves."""
-_MOTION = 0.25
+_MOTION = 0.15
 """Pixels that what stands still may seem to move."""
-_NOISE = 2.0
+_NOISE = 1.5
 """Grey levels that it may change by besides."""
 _CHANGE = 12.0
 """Grey levels by which a pixel changes that plainly shows other things in other images."""
-_LEAST_MOVING = 0.3
-"""Part of the pixels that have to: else the camera rests, and all that it sees stands still."""
+_LEAST_MOVING = 0.4
+"""Part of the pixels that have to: else the camera rests or hardly moves, and what is far away
+stands still as well."""
 _GAP = 0.02
 """Distance between still gradients up to which all between them is still, of the longer side."""
 _DENSE = 0.08
 """Part of the pixels around that have a still gradient, where one counts."""
-_LEAST_AREA = 0.002
-"""Of the image, of a part that stands still."""
+_LEAST_AREA, _LEAST_GRADIENTS = 0.002, 0.001
+"""Of the image, of a part that stands still and of its gradients."""
 _SHARE = 0.05
 """Part of the pixels of what looks the same in all images that still gradients have to be: a sky
 does, too, wherever the camera is."""
@@ -86,5 +90,6 @@ def _parts(
         area = np.bincount(part.ravel(), minlength=count)
         gradients = np.bincount(part[still], minlength=count)
         kept = (area > _LEAST_AREA * still.size) & (gradients > least * area)
+        kept &= gradients > _LEAST_GRADIENTS * still.size
         found |= kept[part] & (closed > 0)
     return found
