@@ -83,7 +83,8 @@ def place_frames(
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
-    unsure = np.zeros(len(images))
+    # Before rows are told apart, which explain much of a zoom.
+    has_zoomed, unsure = zooms(best, images), np.zeros(len(images))
     if is_rolling:
         progress("finding the readout", 0.0)
         times = np.array([frame.timestamp for frame in chosen.frames])
@@ -93,7 +94,7 @@ def place_frames(
     placed = _placed(best, chosen, entries, is_known)
     placed = replace(placed, deviation=np.hypot(placed.deviation, unsure))
     is_other = is_found and abs(math.log(placed.calibration.fx / camera.fx)) > MOST_CHANGE
-    if is_other or zooms(best, placed_images(best)):
+    if is_other or has_zoomed:
         unknown = np.full(len(images), np.inf)
         return replace(placed, deviation=unknown, rotation=unknown, depth=unknown)
     return placed
