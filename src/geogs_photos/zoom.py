@@ -18,7 +18,7 @@ PARTS = 6
 LESS, CHANGE = 0.93, 0.03
 """Part of their distance from where points were seen that is left with these, at most, and the
 least relative difference of their focal lengths: 0.78 and 7 % where somebody zooms by four fifths,
-0.90 and 14 % where by a half in five images, 0.987 and more where nobody does (docs/photographs.md
+0.90 and 14 % where by a half in five images, 0.97 and more where nobody does (docs/uncertainty.md
 has what that leaves)."""
 
 

@@ -54,8 +54,6 @@ of different keyframes err alike, too. Errors are 1 to 7 of them in rendered roo
 FOCAL_LEFT = 0.05
 """What the focal length is off by after its correction, of the correction, whatever matches say: 0
 to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
-
-
 PARTS, SURE = 6, 5.0
 """Of a video, whose focal lengths are compared; deviations by which they differ by chance."""
 

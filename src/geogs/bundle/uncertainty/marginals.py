@@ -6,7 +6,7 @@ the poses do. Source: the block inverse; Rosinol et al. 2023 use it for dense bu
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -90,7 +90,7 @@ class Marginals:
         """With errors that are independent of these."""
         relative = (self.relative_depth.square() + errors.relative_depth).sqrt()
         covariance, focal = self.covariance + errors.covariance, self.focal_variance + errors.focal
-        return Marginals(covariance, relative, self.normalised_residual, focal)
+        return replace(self, covariance=covariance, relative_depth=relative, focal_variance=focal)
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:

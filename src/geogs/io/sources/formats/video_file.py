@@ -85,7 +85,7 @@ class VideoFile:
                     time = round(start / self.info.fps / float(stream.time_base or 1))
                     container.seek(first + time, stream=stream)
                     frame = next(container.decode(stream), None)
-                except (av.error.FFmpegError, StopIteration):
+                except av.error.FFmpegError:
                     continue
                 if frame is None or frame.pts is None or frame.pts == before:
                     continue
