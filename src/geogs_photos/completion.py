@@ -10,13 +10,12 @@ from jaxtyping import Float64
 from geogs.application.structure_from_motion.completion import about
 from geogs.io.sources.calibration import Calibration
 from geogs.stopwatch import StageProgress
-from geogs.threads import thread_map
 from geogs.types import FoundFrames, Frame
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import believed
 from geogs_photos.incremental_mapping import continued, placed_images, world_to_camera
-from geogs_photos.photo_features import find_features
+from geogs_photos.photo_features import frame_features
 from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import FEWEST_FEATURES
 
@@ -29,11 +28,7 @@ def place_lost(
     progress: StageProgress,
 ) -> FoundFrames:
     """As asked of it in ``geogs.application.structure_from_motion.photos.place_lost``."""
-    features = thread_map(
-        lambda frame: find_features(frame.image, frame.mask),
-        frames,
-        lambda f: progress("features", f),
-    )
+    features = frame_features(frames, progress)
     shown = [k for k, some in enumerate(features) if len(some) >= FEWEST_FEATURES]
     known = {place + 1: T for place, k in enumerate(shown) if (T := T_cw[k]) is not None}
     if len(known) in (0, len(shown)):

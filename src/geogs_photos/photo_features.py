@@ -1,10 +1,15 @@
 """SIFT features of photographs, in the form that COLMAP's matching takes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
+
+from geogs.stopwatch import StageProgress
+from geogs.threads import thread_map
+from geogs.types import Frame
 
 MAX_EDGE = 1600
 """Pictures with a longer side are reduced to it before features are looked for, pixels."""
@@ -67,6 +72,15 @@ def find_features(
     keypoints = np.array(rows, np.float32)
     keypoints[:, 3] = np.radians(keypoints[:, 3])
     return PhotoFeatures(keypoints, _root_sift(raw))
+
+
+def frame_features(frames: Sequence[Frame], progress: StageProgress) -> list[PhotoFeatures]:
+    """Features of frames of a video, where their masks say that they show the scene."""
+    return thread_map(
+        lambda frame: find_features(frame.image, frame.mask),
+        frames,
+        lambda fraction: progress("features", fraction),
+    )
 
 
 def _root_sift(raw: Float32[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:

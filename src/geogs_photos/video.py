@@ -16,7 +16,6 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
 from geogs.stopwatch import StageProgress
-from geogs.threads import thread_map
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.fragments import rejoined
@@ -28,7 +27,7 @@ from geogs_photos.incremental_mapping import (
     world_to_camera,
 )
 from geogs_photos.only_turns import only_turns
-from geogs_photos.photo_features import find_features
+from geogs_photos.photo_features import frame_features
 from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import structure_of
 from geogs_photos.pycolmap_library import load_colmap
@@ -56,11 +55,7 @@ def place_frames(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,
         is_guess=not (is_known or is_found),
     )  # fmt: skip
-    features = thread_map(
-        lambda frame: find_features(frame.image, frame.mask),
-        chosen.frames,
-        lambda f: progress("features", f),
-    )
+    features = frame_features(chosen.frames, progress)
     pairs, count = frame_pairs(features, seed, progress), len(chosen.frames)
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
     shared = [SharedCamera(begin, is_known)]

@@ -11,7 +11,6 @@ import pytest
 
 from geogs.application.calibrate import lens_said, refined, self_calibrated
 from geogs.application.interrupt import Interruption
-from geogs.application.progress.run_progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import GUESS, Calibration
 from geogs.io.sources.sniff import open_source
@@ -20,6 +19,7 @@ from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.self_calibration import SelfCalibration
 from geogs.types import FoundLens
+from progress_listener import Listener
 from tracking_scenes import CAMERA, pose, render
 
 
@@ -27,20 +27,6 @@ from tracking_scenes import CAMERA, pose, render
 def _few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stretch, "START_KEYFRAMES", 8)
     monkeypatch.setattr(stretch, "KEYFRAMES", 12)
-
-
-class Listener(RunProgress):
-    """Remembers what it was told."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-        self.stages: set[str] = set()
-
-    def write(self, text: str) -> None:
-        self.said.append(text)
-
-    def stage(self, name: str, fraction: float) -> None:
-        self.stages.add(name)
 
 
 def write_images(folder: Path, poses: list[np.ndarray]) -> Path:

@@ -4,21 +4,11 @@ import cv2
 import numpy as np
 
 from geogs.application.calibrate import without_overlay
-from geogs.application.progress.run_progress import RunProgress
 from geogs.config import InputConfig
 from geogs.io.sources.sniff import open_source
 from io_samples import write_video
 from moving_wall import HEIGHT, WIDTH, seen, with_bonnet
-
-
-class Listener(RunProgress):
-    """Remembers what it was told."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def write(self, text: str) -> None:
-        self.said.append(text)
+from progress_listener import Listener
 
 
 def coloured(images: list[np.ndarray]) -> list[np.ndarray]:

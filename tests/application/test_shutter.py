@@ -9,7 +9,6 @@ import pytest
 from geogs.application.calibrate import self_calibrated, with_shutter_found
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
-from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.summary import source_summary
 from geogs.application.run_settings import RunSettings
 from geogs.config import Config, InputConfig
@@ -21,19 +20,10 @@ from geogs.shutter.shutter import Shutter
 from geogs.tracking.calibration import self_calibration
 from geogs.tracking.calibration.self_calibration import SelfCalibration
 from io_samples import write_images
+from progress_listener import Listener
 
 INTRINSICS = "50,50,31.5,23.5"
 FOUND = FoundReadout(0.0276, 0.0276, 0.0011, 12)
-
-
-class Listener(RunProgress):
-    """Remembers what it was told."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def write(self, text: str) -> None:
-        self.said.append(text)
 
 
 @pytest.fixture

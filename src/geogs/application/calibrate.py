@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import cv2
-import numpy as np
 import torch
 
 from geogs.application.interrupt import Stop
@@ -45,8 +44,7 @@ def without_overlay(source: Source, progress: RunProgress | None = None) -> Sour
             f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
             "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
         )
-    whole = cv2.resize(found.astype(np.uint8), source.image_size, interpolation=cv2.INTER_NEAREST)
-    return source.without_overlay(whole > 0)
+    return source.without_overlay(found)
 
 
 def self_calibrated(

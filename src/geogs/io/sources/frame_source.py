@@ -199,7 +199,7 @@ class Source:
         return Source([images.known_better(focal=focal) for images in self._recordings])
 
     def without_overlay(self, overlay: Bool[np.ndarray, "h w"]) -> "Source":
-        """The same frames, with what all images as they came show over the scene masked out."""
+        """The same frames, without what all images of :meth:`spread` show over the scene."""
         return Source([images.known_better(overlay=overlay) for images in self._recordings])
 
     def spread(self, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
@@ -208,12 +208,6 @@ class Source:
         each = -(-count // len(self._recordings))
         found = [raw.image for images in self._recordings for raw in images.spread(each)]
         return [image for image in found if image is not None]
-
-    @property
-    def image_size(self) -> tuple[int, int]:
-        """Width and height of the upright images as they came."""
-        info = self._recordings[0].reader.info
-        return info.width, info.height
 
     @property
     def rolling_camera(self) -> RollingCamera:

@@ -66,7 +66,7 @@ class WorkingImages:
 
         ``shutter``, where it is known better than the settings'; ``focal`` of the working images
         instead of what the settings ask for; ``followed_clips`` of the same recording; ``overlay``,
-        true where all of its images show what is no part of the scene.
+        true where all of its images at working size show what is no part of the scene.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -116,7 +116,7 @@ class WorkingImages:
         """Whether images come with the depth that a sensor measured."""
 
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
-        """A mask of an image as it came, straightened as that is."""
+        """A mask of an image as it came, or at working size, straightened as images are."""
         grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
         return self._rectifier(grey)[..., 0] > 127
 
