@@ -32,8 +32,12 @@ class SceneMask:
 
         In a straightened image that is none of what the lens did not see.
         """
-        lens = keyframe.table.lens
-        fixed = self.fixed if lens is None else self._straight(keyframe.table.camera, lens)
+        table = keyframe.table
+        fixed = self.fixed
+        if table.lens is not None:
+            view = _view(table.camera, table.lens)
+            own = table.frame_lenses.get(keyframe.id)
+            fixed = self._straight(view if own is None else view.of_frame(own))
         if not self.black_is_masked:
             return fixed
         valid = valid_pixels(keyframe.image)
@@ -41,8 +45,7 @@ class SceneMask:
             valid &= fixed
         return None if valid.all() else valid
 
-    def _straight(self, camera: Camera, lens: FoundLens) -> Bool[np.ndarray, "h w"] | None:
+    def _straight(self, view: StraightView) -> Bool[np.ndarray, "h w"] | None:
         """What straight images show; None where that is all."""
-        view = _view(camera, lens)
         valid = view.is_seen if self.fixed is None else view.is_seen & view.nearest(self.fixed)
         return None if valid.all() else valid

@@ -1,5 +1,6 @@
 """What flows between the parts: frozen records, no behaviour."""
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
@@ -153,11 +154,41 @@ class FoundLens:
     down: float = 0.0
     """Where the principal point lies off what it was taken for, in the focal lengths found."""
     deviation_centre: AtLeast0 = 0.0
+    varies_focal: AtLeast0 = 0.0
+    varies_centre: AtLeast0 = 0.0
+    """What frames have of their own, focal lengths as parts of that and principal points in it;
+    root mean square over the frames, zero where all are alike."""
+
+    @property
+    def varies(self) -> bool:
+        """Whether frames have lenses of their own."""
+        return self.varies_focal > 0 or self.varies_centre > 0
 
     @property
     def is_off_centre(self) -> bool:
         """Whether the principal point was corrected."""
         return self.right != 0 or self.down != 0
+
+    def of_frame(self, own: "FrameLens") -> "FoundLens":
+        """That of a frame which has something of its own."""
+        focal = self.focal * math.exp(own.focal)
+        return replace(self, focal=focal, right=self.right + own.right, down=self.down + own.down)
+
+
+@dataclass(frozen=True)
+class FrameLens:
+    """What the lens of one frame has of its own, beside that of all."""
+
+    focal: float = 0.0
+    """Logarithm of its focal length over that of all."""
+    right: float = 0.0
+    down: float = 0.0
+    """Where its principal point lies off theirs, in focal lengths."""
+
+    def plus(self, other: "FrameLens") -> "FrameLens":
+        """With what was found beside."""
+        right, down = self.right + other.right, self.down + other.down
+        return FrameLens(self.focal + other.focal, right, down)
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]
@@ -244,6 +275,8 @@ class Uncertainty(ShortRepr):
     fit least; 0 where that is not known."""
     focal_change: AtLeast0 = 0.0
     """By how much parts of the video want focal lengths that differ, as a part of them."""
+    lens_change: AtLeast0 = 0.0
+    """Part of the cost of the matches that is left because the lens changes from frame to frame."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""

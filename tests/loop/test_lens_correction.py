@@ -12,9 +12,9 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop import lens_correction
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
-from geogs.loop.straightening import BentImages
+from geogs.loop.straightening import BentImages, FrameViews
 from geogs.tracking.tracker import Tracker, lone_tracker
-from geogs.types import FlowMatch, FoundLens
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
 from geogs.world.straight_view import StraightView
@@ -189,9 +189,9 @@ def test_what_straight_images_still_bend_is_part_of_the_lens(monkeypatch):
     tracker.map.graph.operator.left = 0.01, -0.02
     straightened, straighten = [], BentImages.straighten
 
-    def noted(images: BentImages, lens: FoundLens) -> None:
-        straightened.append(lens)
-        straighten(images, lens)
+    def noted(images: BentImages, views: FrameViews) -> None:
+        straightened.append(views.view.lens)
+        straighten(images, views)
 
     monkeypatch.setattr(BentImages, "straighten", noted)
     global_bundle(tracker, ends=True)

@@ -9,6 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.loop.straightening import (
     BentImages,
+    FrameViews,
     straight_rows,
     straighten_cells,
     straighten_frames,
@@ -62,7 +63,7 @@ def test_cells_are_those_of_the_straight_image():
     keyframe.prior = KeyframePrior(
         DepthKind.METRIC, number.clone(), number.clone(), torch.ones(1), torch.ones(GRID.size)
     )
-    straighten_cells(keyframes, VIEW)
+    straighten_cells(keyframes, FrameViews(VIEW))
     nearest, is_cell = GRID.cells_of(VIEW.bent(GRID.pixels))
     inner = is_cell & (VIEW.bent(GRID.pixels) > 4).all(-1)
     inner &= (VIEW.bent(GRID.pixels) < torch.tensor([155.0, 115.0])).all(-1)
@@ -83,7 +84,7 @@ def test_what_was_found_of_frames_is_as_if_the_pinhole_had_seen_both():
     weight = inside.float()[:, None].expand(-1, 2)
     log = FrameLog([FrameRecord(1, 0.1, 0, torch.eye(4).double())])  # as tracking left it
     log.records[0].observations = [Observation(0, *pack_matches(GRID, bent, weight))]
-    straighten_frames(log, keyframes, VIEW, {1: T})
+    straighten_frames(log, keyframes, FrameViews(VIEW), {1: T})
     (found,) = log.records[0].observations
     kept = found.half_weight[:, 0] > 0
     assert int(kept.sum()) > 0.95 * int(inside.sum()) > 20
@@ -127,7 +128,7 @@ def test_images_are_always_made_of_those_that_were_tracked():
     keyframes[0].sensor_depth = depth
     images = BentImages.of(keyframes)
     for lens in (FoundLens(0.3, 0.0, 0.001, 0.001), VIEW.lens):
-        images.straighten(lens)
+        images.straighten(FrameViews(StraightView(CAMERA, lens)))
         view = StraightView(CAMERA, lens)
         assert np.array_equal(keyframes[0].image, view.image(image))
         assert keyframes[0].encoded == float(view.image(image).mean())

@@ -6,11 +6,12 @@ import torch
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.loop.straightening import BentImages
+from geogs.loop.straightening import BentImages, FrameViews
 from geogs.mapping.view_arrays import MapCameras
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.straight_view import StraightView
 from keyframe_samples import views_of
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -41,7 +42,8 @@ def test_views_have_the_images_that_took_the_places_of_others():
     image = np.random.default_rng(0).integers(1, 255, (48, 64, 3), np.uint8)
     view = views.add(segment.add(0, 0.0, image, None, torch.eye(4, dtype=torch.float64)).id)
     before, segments = view.depth_view.grey.copy(), view.bare_segments
-    BentImages.of(segment).straighten(FoundLens(0.3, 0.1, 0.01, 0.01))
+    view_of_lens = StraightView(CAMERA, FoundLens(0.3, 0.1, 0.01, 0.01))
+    BentImages.of(segment).straighten(FrameViews(view_of_lens))
     views.arrays.forget_images()
     assert np.array_equal(view.depth_view.image, segment[0].image)
     assert not np.array_equal(view.depth_view.image, image)

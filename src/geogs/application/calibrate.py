@@ -152,6 +152,12 @@ def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
     if found.is_off_centre:
         deviation = found.deviation_centre * after.fx
         focal += f"principal point {after.cx:.1f}, {after.cy:.1f} +- {deviation:.1f}, "
+    if found.varies:
+        focal += (
+            f"from image to image the focal length varies by {found.varies_focal:.2%} and the "
+            f"principal point by {found.varies_centre * after.fx:.1f} pixels (focusing, "
+            "stabilisation, or a zoom), "
+        )
     return (
         f"Lens, by all matches, beside what was said of its distortion ({was}): {focal}"
         f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "

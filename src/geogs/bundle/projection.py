@@ -84,7 +84,7 @@ def motion_rows(
 
 def project(
     camera: Camera,
-    rays: Float[Tensor, "p 3"],
+    rays: Float[Tensor, "*c p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
 ) -> CellProjection:

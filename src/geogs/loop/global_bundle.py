@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from geogs.bundle.protocols import BundleOptions
+from geogs.loop.frame_lenses import VaryingLens, correct_frame_lenses
 from geogs.loop.lens_correction import correct_lens
 from geogs.loop.row_correction import correct_rows
 from geogs.loop.straightening import BentImages, straighten
@@ -12,7 +13,6 @@ from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 from geogs.world.edges import Pair
-from geogs.world.straight_view import StraightView
 
 ROUNDS = 4
 """Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
@@ -77,18 +77,27 @@ def global_bundle(
         tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=config.fine_adjustment
     )
     lens = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, readout=readout)
-    images = None
-    if lens is not None and ends:
+    varying = correct_frame_lenses(tracker, free_poses, free, GLOBAL_OPTIONS) if ends else None
+    images, found = None, None if lens is None else VaryingLens(lens, {})
+    if varying is not None:
+        found = varying if found is None else found.followed_by(store.camera, varying)
+    if found is not None and ends:
         images = BentImages.of(store)
-        straighten(tracker, lens, images)
+        straighten(tracker, found.views(store.camera), images)
     if images is not None or (is_open and config.fine_adjustment):
         tracker.map.graph.edges.clear()
         match(config.fine_adjustment)
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
-    if images is not None and lens is not None:
-        rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=lens)
+    if images is not None and found is not None:
+        if varying is not None:
+            more = correct_frame_lenses(tracker, free_poses, free, GLOBAL_OPTIONS, before=found)
+            found = found if more is None else found.followed_by(store.camera, more)
+        rest = None
+        if lens is not None:
+            rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=found.lens)
         if rest is not None:
-            images.straighten(StraightView(store.camera, lens).followed_by(rest))
+            found = found.followed_by(store.camera, VaryingLens(rest, {}))
+        images.straighten(found.views(store.camera))
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:

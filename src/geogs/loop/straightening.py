@@ -5,8 +5,7 @@ can be matched and adjusted once more. Matches between keyframes do not: they ar
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import torch
@@ -21,7 +20,7 @@ from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import seen_by_keyframes, solved_poses
 from geogs.tracking.frames.row_errors import seen_rows
 from geogs.tracking.tracker import Tracker
-from geogs.types import FoundLens, SeenRows
+from geogs.types import FrameLens, SeenRows
 from geogs.world.archive import Archived
 from geogs.world.edges import pack_matches, unpacked_positions
 from geogs.world.frames import FrameLog
@@ -52,46 +51,63 @@ class BentImages:
         pieces = keyframes.table.arrays.pieces
         return BentImages(keyframes, {name: dict(pieces.get(name, {})) for name in names})
 
-    def straighten(self, lens: FoundLens) -> None:
+    def straighten(self, views: "FrameViews") -> None:
         """Have the keyframes' images as the table's pinhole sees them, always made of those that
         were tracked; normals and depths go along pixel by pixel."""
-        arrays, view = self.keyframes.table.arrays, StraightView(self.keyframes.camera, lens)
-        bent, ids = self.pieces["image"], self.keyframes.ids
-        images = ordered_map(lambda id: view.image(bent[id].load()), ids, worker_count())
+        table, bent = self.keyframes.table, self.pieces["image"]
+        arrays, ids = table.arrays, self.keyframes.ids
+        view = {k.id: views.of(k.frame_index) for k in self.keyframes}
+        images = ordered_map(lambda id: view[id].image(bent[id].load()), ids, worker_count())
         for id, image in zip(ids, images, strict=True):
             arrays.put("image", id, image, recent=True)
             arrays.recent("encoded").drop(id)
             for name in ("prior normal", "sensor depth"):
                 if id in self.pieces[name]:
-                    arrays.put(name, id, view.nearest(self.pieces[name][id].load()))
-        self.keyframes.table.lens = lens
+                    arrays.put(name, id, view[id].nearest(self.pieces[name][id].load()))
+        table.lens = views.view.lens
+        own = {k.id: views.own.get(k.frame_index) for k in self.keyframes}
+        table.frame_lenses = {id: lens for id, lens in own.items() if lens is not None}
 
 
-def straighten(tracker: Tracker, lens: FoundLens, images: BentImages) -> None:
+@dataclass(frozen=True)
+class FrameViews:
+    """How frames of a video are straightened, whose lenses may have something of their own."""
+
+    view: StraightView
+    """By the lens of all."""
+    own: Mapping[int, FrameLens] = field(default_factory=dict)
+    """By the indices of the frames."""
+
+    def of(self, frame: int) -> StraightView:
+        """That of a frame."""
+        own = self.own.get(frame)
+        return self.view if own is None else self.view.of_frame(own)
+
+
+def straighten(tracker: Tracker, views: FrameViews, images: BentImages) -> None:
     """Have all that a tracker knows as the pinhole sees it that its images were taken for.
 
     Its graph has no edges then, as their matches are those of images that bend.
     """
-    keyframes, graph = tracker.keyframes, tracker.map.graph
-    view, log = StraightView(keyframes.camera, lens), tracker.map.recorder.log
+    keyframes, graph, log = tracker.keyframes, tracker.map.graph, tracker.map.recorder.log
     poses = solved_poses(log, keyframes)
-    images.straighten(lens)
+    images.straighten(views)
     graph.edges.clear()
     graph.refocus(1.0)
-    straighten_cells(keyframes, view)
-    straighten_frames(log, keyframes, view, poses)
+    straighten_cells(keyframes, views)
+    straighten_frames(log, keyframes, views, poses)
 
 
-def straighten_cells(keyframes: KeyframeSet, view: StraightView) -> None:
+def straighten_cells(keyframes: KeyframeSet, views: FrameViews) -> None:
     """Have what keyframes know of cells where straight images show it.
 
     Depths are interpolated; what a sensor or a prior says of them, and what moves, is that of the
     nearest cell.
     """
     grid = keyframes.grid
-    seen = view.bent(grid.pixels)
-    nearest, is_cell = grid.cells_of(seen)
     for keyframe in keyframes:
+        seen = views.of(keyframe.frame_index).bent(grid.pixels)
+        nearest, is_cell = grid.cells_of(seen)
         fields = torch.stack([keyframe.inverse_depth, keyframe.information], 1)
         depth, information = grid.sample_field(fields, seen).unbind(1)
         keyframe.inverse_depth, keyframe.information = depth.clone(), information.clone()
@@ -108,7 +124,7 @@ def straighten_cells(keyframes: KeyframeSet, view: StraightView) -> None:
 def straighten_frames(
     log: FrameLog,
     keyframes: KeyframeSet,
-    view: StraightView,
+    views: FrameViews,
     T_cw: Mapping[int, Float[Tensor, "4 4"]],
 ) -> None:
     """Have what was found of the frames between straight keyframes where straight frames show it.
@@ -119,20 +135,22 @@ def straighten_frames(
     tracking left the frame. Rows are those that straight pixels were seen in.
     """
     grid = keyframes.grid
-    cells = sparse_cells(grid)
-    shown = view.straight(grid.pixels[cells])
-    is_shown = shown.isfinite().all(-1)
-    shown = torch.where(is_shown[:, None], shown, grid.pixels[cells])
-    camera = grid.camera
-    plane = (shown - shown.new_tensor([camera.cx, camera.cy])) / shown.new_tensor(
-        [camera.fx, camera.fy]
-    )
-    rays = torch.cat([plane, torch.ones_like(plane[:, :1])], 1)
+    cells, camera = sparse_cells(grid), grid.camera
     for part, ids in seen_by_keyframes(log, keyframes):
+        seen = [keyframes[k].frame_index for k in ids]
+        shown = _each(views, seen, grid.pixels[cells].expand(len(ids), -1, 2))
+        is_shown = shown.isfinite().all(-1)
+        shown = torch.where(is_shown[..., None], shown, grid.pixels[cells])
+        plane = (shown - shown.new_tensor([camera.cx, camera.cy])) / shown.new_tensor(
+            [camera.fx, camera.fy]
+        )
+        rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
         T = torch.stack([T_cw[r.index] for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
         depth = keyframes.inverse_depths(ids)
-        found = view.straight(unpacked_positions(grid, torch.stack([o.position for _, o in part])))
-        of_shown = project(camera, rays, T, grid.sample_field(depth.mT, shown).mT)
+        found = unpacked_positions(grid, torch.stack([o.position for _, o in part]))
+        found = _each(views, [r.index for r, _ in part], found)
+        deep = [grid.sample_field(d[:, None], s)[:, 0] for d, s in zip(depth, shown, strict=True)]
+        of_shown = project(camera, rays, T, torch.stack(deep))
         of_cell = project(camera, grid.rays[cells], T, depth[:, cells])
         pixels = found + (of_cell.pixels - of_shown.pixels)
         is_near = (pixels - found).norm(dim=-1) < FARTHEST * camera.long_edge
@@ -143,10 +161,23 @@ def straighten_frames(
         for n, (_, observation) in enumerate(part):
             observation.position, observation.half_weight = position[n], half_weight[n]
             observation.shift = None
-    rows = list(log.rows.values())
-    parts = [rows[at : at + TOGETHER] for at in range(0, len(rows), TOGETHER)]
-    straight = thread_map(partial(straight_rows, view=view), parts)
-    log.rows.update(zip(log.rows, chain.from_iterable(straight), strict=True))
+    indices = sorted(log.rows)
+    size = 1 if views.own else TOGETHER
+    parts = [indices[at : at + size] for at in range(0, len(indices), size)]
+    straight = thread_map(
+        lambda part: straight_rows([log.rows[n] for n in part], views.of(part[0])), parts
+    )
+    log.rows.update(zip(indices, chain.from_iterable(straight), strict=True))
+
+
+def _each(
+    views: FrameViews, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
+) -> Float[Tensor, "e p 2"]:
+    """Where straight images of some frames show what lies at pixels of theirs."""
+    if not views.own:
+        return views.view.straight(pixels)
+    each = zip(frames, pixels, strict=True)
+    return torch.stack([views.of(frame).straight(some) for frame, some in each])
 
 
 def straight_rows(rows: Sequence[SeenRows], view: StraightView) -> list[SeenRows]:

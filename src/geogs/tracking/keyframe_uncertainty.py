@@ -1,25 +1,32 @@
 """How well a tracker knows its keyframes, by what all its matches leave open."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import CellProjection, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.gauge import deviations_after_alignment
-from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence
-from geogs.bundle.uncertainty.marginals import Marginals, common_errors, marginals
+from geogs.bundle.uncertainty.lens_error import LensEvidence, lens_evidence, lens_prior
+from geogs.bundle.uncertainty.marginals import Considered, Marginals, common_errors, marginals
+from geogs.bundle.uncertainty.varying_intrinsics import (
+    FIRST,
+    VaryingEvidence,
+    considered_lenses,
+    varying_evidence,
+)
 from geogs.tracking.frames.pose_filling import rows_in_doubt
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
-from geogs.types import Uncertainty
+from geogs.types import FrameLens, Uncertainty
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
@@ -56,7 +63,8 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     times = np.array([tracker.keyframes[k].timestamp for k in ids], np.float64)
     position, rotation, depth, residual = (np.full(len(ids), np.inf) for _ in range(4))
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
-    propagated, focal, change, lens = np.zeros(2), 0.0, 0.0, tracker.keyframes.table.lens
+    propagated, focal, change, lenses = np.zeros(2), 0.0, 0.0, 0.0
+    lens = tracker.keyframes.table.lens
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
         part = slice(first, first + TOGETHER + 1)
         found = _marginals(tracker, ids[part], rows)
@@ -65,6 +73,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
         depth[part] = found.depth_deviation.numpy()
         residual[part] = found.normalised_residual.numpy()
         focal, change = max(focal, found.focal_variance), max(change, found.focal_change)
+        lenses = max(lenses, found.lens_change)
         if len(ids) <= TOGETHER + 1 and not tracker.segment.fixed:
             T_cw = tracker.keyframes.poses(ids)
             position[:], rotation[:] = deviations_after_alignment(T_cw, found.covariance)
@@ -77,7 +86,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     # it agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
     focal = max(open_, math.sqrt(focal))
-    return Uncertainty(times, position, rotation, depth, focal, misfit(residual), change)
+    return Uncertainty(times, position, rotation, depth, focal, misfit(residual), change, lenses)
 
 
 def misfit(residuals: Float[np.ndarray, "n"]) -> float:
@@ -106,6 +115,23 @@ def said_of_lens(
         part = None if matches is None else matches.lens(rows)
         if part is not None:
             found = part if found is None else found.joined(part)
+    return found
+
+
+def said_of_frame_lenses(
+    tracker: Tracker, ids: list[int]
+) -> list[tuple[list[int], VaryingEvidence]]:
+    """What edges between some keyframes, earliest first, say of the lens of each of them.
+
+    Of more than ``TOGETHER`` keyframes in parts, each with its own, which share the last of one
+    and the first of the next.
+    """
+    found = []
+    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
+        matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
+        said = None if matches is None else matches.frame_lenses()
+        if matches is not None and said is not None:
+            found.append((matches.frames, said))
     return found
 
 
@@ -138,6 +164,39 @@ class _Matches:
         do not tell of all poses."""
         slope = None if rows is None else partial(self._slope, rows)
         return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope, of_depths)
+
+    def frame_lenses(self) -> VaryingEvidence | None:
+        """What they say of the lens of each keyframe."""
+        return varying_evidence(self.grid, self.problem, OPTIONS)
+
+    def lens_change(self) -> float:
+        """Part of their cost that lenses of their own would take off; 0 where nothing tells."""
+        said = self.frame_lenses()
+        if said is None:
+            return 0.0
+        step, _ = said.told(self.times, torch.zeros_like(said.gradient), FIRST, self.shared)
+        return max(0.0, said.explained(step))
+
+    @property
+    def times(self) -> Float64[Tensor, "n"]:
+        """Seconds, of the keyframes."""
+        each = [self.keyframes[k].timestamp for k in self.frames]
+        return torch.tensor(each, dtype=torch.float64)
+
+    @property
+    def shared(self) -> Float64[Tensor, "5"]:
+        """Deviations of the lens that all share."""
+        prior = lens_prior(self.keyframes.table.focal_deviation)
+        return torch.tensor(prior, dtype=torch.float64)
+
+    def considered_lenses(self, own: Mapping[int, FrameLens]) -> Considered | None:
+        """What is left open of these, of which the keyframes have some of their own."""
+        each = [own.get(k, FrameLens()) for k in self.frames]
+        return considered_lenses(
+            self.grid, self.problem, OPTIONS, CELLS,
+            torch.tensor([[o.focal, o.right, o.down] for o in each], dtype=torch.float64),
+            self.times, self.shared,
+        )  # fmt: skip
 
     def _slope(
         self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
@@ -178,8 +237,11 @@ def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marg
         doubt = 0.0 if rows is None else rows.doubt
         corrected = 1.0 if table.lens is None else table.lens.focal
         found = found.beside(said.considered(corrected, doubt, table.focal_deviation))
+        left = matches.considered_lenses(table.frame_lenses) if table.frame_lenses else None
+        found = found if left is None else found.beside(left)
     free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[free[:, None], free]
     depth, residual = found.relative_depth[own], found.normalised_residual[own]
     change = 0.0 if said is None else said.focal_change
-    return Marginals(covariance, depth, residual, found.focal_variance, change)
+    lenses = 0.0 if said is None else matches.lens_change()
+    return Marginals(covariance, depth, residual, found.focal_variance, change, lenses)

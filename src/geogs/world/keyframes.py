@@ -16,7 +16,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import scaled, se3_inverse, sim3_scale
 from geogs.limits import POSITIVE, UNBOUNDED, Id, KeyframeId, Number, Positive
-from geogs.types import FoundLens, MeasuredPose, PoseCorrection
+from geogs.types import FoundLens, FrameLens, MeasuredPose, PoseCorrection
 from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
 from geogs.world.cell_depths import KeyframePrior, MeasuredCells
 from geogs.world.grid import SampleGrid
@@ -195,6 +195,8 @@ class KeyframeTable:
     lens: FoundLens | None = None
     """By which images and depths were straightened at the end; none where they are as they were
     tracked."""
+    frame_lenses: dict[Id, FrameLens] = field(default_factory=dict)
+    """What the lenses of keyframes had of their own then, where they had."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
     """Of matches and depths, with the camera that saw what they are of."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
@@ -241,7 +243,7 @@ class KeyframeTable:
 
     def mirror(self) -> "KeyframeTable":
         """A table without keyframes that has the large arrays of this one."""
-        twin = KeyframeTable(arrays=self.arrays, lens=self.lens)
+        twin = KeyframeTable(arrays=self.arrays, lens=self.lens, frame_lenses=self.frame_lenses)
         twin.grid, twin.camera = self.grid, self.camera
         twin.encode, twin.set_of = self.encode, {}
         return twin

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import RESAMPLING, distorted_pixels, lens_maps
-from geogs.types import FoundLens
+from geogs.types import FoundLens, FrameLens
 
 FARTHEST, ENTRIES = 4.0, 1 << 14
 """Of the table by which rays are straightened: its end, in diagonals of the image, and its entries;
@@ -61,6 +61,10 @@ class StraightView:
         return FoundLens(
             float(k1), float(k2), *own, focal, deviation, right, down, other.deviation_centre
         )
+
+    def of_frame(self, own: FrameLens) -> "StraightView":
+        """That of a frame whose lens has something of its own."""
+        return replace(self, lens=self.lens.of_frame(own))
 
     # --- points ----------------------------------------------------------------------------
 

@@ -67,6 +67,14 @@ def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
     )
 
 
+def _moving_lenses(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
+    """A lens that is focused by 2 % to either side, and one that is moved against the shake."""
+    return (
+        Cell("handheld-focusing", "handheld", Flaws(focusing=0.02), frames, *size),
+        Cell("walking-stabilised", "walking", Flaws(stabilisation=0.015), frames, *size),
+    )
+
+
 _QVGA, _LARGER = (320, 240), (400, 300)
 _SMALL_STREET, _STREET = (496, 150), (800, 242)
 
@@ -91,6 +99,7 @@ FULL: tuple[Cell, ...] = (
     *(_cell(motion, camera, 120 if motion != "handheld-5hz" else 70, _LARGER)
       for motion in ROOM_MOTIONS for camera in ("clean", "phone", "kinect")),
     *_single_flaws(120, _LARGER),
+    *_moving_lenses(120, _LARGER),
     _cell("handheld", "action", 120, _LARGER),
     *(_cell(motion, "clean", 120, _LARGER, moving)
       for motion in ("handheld", "walking") for moving in (0.15, 0.33)),

@@ -54,7 +54,7 @@ def track_to_folder(
     }
     try:
         slam.loops.update(slam.segments.finish(), True)
-        global_bundle(slam.segments.main)
+        global_bundle(slam.segments.main, ends=True)
         trajectory = slam.trajectory()
         known = frame_uncertainty(slam.segments.main)
         write_trajectories(folder, trajectory, slam.keyframe_trajectory())

@@ -31,6 +31,11 @@ class Flaws(Settings, group="flaws"):
     """Radial distortion, OpenCV's first coefficient; it is written with the intrinsics."""
     k2: Annotated[float, Range(-0.5, 0.5)] = 0.0
     """Radial distortion, OpenCV's second coefficient."""
+    focusing: Annotated[float, Range(0, 0.2)] = 0.0
+    """Part by which the focal length changes to either side, within a second or two, as the camera
+    focuses; the intrinsics are those in the middle."""
+    stabilisation: Annotated[float, Range(0, 0.1)] = 0.0
+    """Focal lengths by which the principal point is moved to either side against a hand's shake."""
 
 
 _TYPICAL: dict[CameraKind, Flaws] = {

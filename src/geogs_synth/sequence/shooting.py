@@ -8,6 +8,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.image_sensor import Sensor
+from geogs_synth.camera.moving_lens import MovingLens
 from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.bodies import Body, Path
@@ -57,6 +58,7 @@ class Shooting:
         self._flaws = flaws or Flaws()
         self._rate = rate
         self._sensor = Sensor(self._flaws, lens.camera, seed)
+        self._moving_lens = MovingLens(lens, self._flaws, seed)
 
     def shoot(self, index: int) -> Shot:
         """The frame of a number."""
@@ -91,19 +93,19 @@ class Shooting:
         self, truth: RenderedView, T_wc: np.ndarray, time: float
     ) -> Float32[np.ndarray, "h w 3"]:
         """Mean linear light in [0, 1] over the exposure."""
-        times = self.sample_times(truth, T_wc, time)
-        if len(times) == 1 and self._flaws.readout == 0:
+        times, lens = self.sample_times(truth, T_wc, time), self._moving_lens.at(time)
+        if len(times) == 1 and self._flaws.readout == 0 and lens is self.lens:
             return (truth.shade / 255) ** 2
         light = np.zeros_like(truth.shade)
         for one in times:
-            light += (self._instant(one).shade / 255) ** 2
+            light += (self._instant(lens, one).shade / 255) ** 2
         return light / len(times)
 
-    def _instant(self, time: float) -> RenderedView:
+    def _instant(self, lens: RadialCamera, time: float) -> RenderedView:
         if self._flaws.readout == 0:
-            return self._raycaster.render(self.lens, self._path(np.array([time]))[0], time)
+            return self._raycaster.render(lens, self._path(np.array([time]))[0], time)
         times = time + self.row_times()
-        return self._raycaster.render_rolling(self.lens, self._path(times), times)
+        return self._raycaster.render_rolling(lens, self._path(times), times)
 
     def _image_motion(
         self, truth: RenderedView, T_wc: np.ndarray, time: float, ends: np.ndarray

@@ -24,6 +24,9 @@ MAX_MISFIT = 1.35
 were followed rightly, from 1.41 on where tracking had failed (docs/uncertainty.md)."""
 MAX_FOCAL_CHANGE = 0.05
 """Relative difference of the focal lengths that parts of a video want (docs/uncertainty.md)."""
+MAX_LENS_CHANGE = 0.1
+"""Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
+has one (docs/lens.md)."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -50,6 +53,8 @@ class Verdict:
     """Relative deviation of the focal length."""
     focal_change: float = 0.0
     """Relative difference of the focal lengths that parts of the video want."""
+    lens_change: float = 0.0
+    """Part of the matches' cost that is left because the lens changes from frame to frame."""
 
     @property
     def has_shape(self) -> bool:
@@ -108,6 +113,11 @@ def verdict(
             "parts of the video want focal lengths that differ by more than "
             f"{known.focal_change:.0%}, as where somebody zooms"
         )
+    if known.lens_change > MAX_LENS_CHANGE:
+        reasons.append(
+            "the lens changes from image to image (stabilisation, focus, zoom) in a way that the "
+            "video does not tell"
+        )
     if known.misfit > MAX_MISFIT:
         reasons.append(
             f"the matches of a tenth of its keyframes fit {known.misfit:.1f} times less well than "
@@ -122,7 +132,7 @@ def verdict(
         )
     return Verdict(
         not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal,
-        known.focal_change,
+        known.focal_change, known.lens_change,
     )  # fmt: skip
 
 

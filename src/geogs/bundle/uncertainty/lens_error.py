@@ -88,12 +88,31 @@ def shape_shifts(
     over at the cell's own depth. The latter is taken where the cell falls (``at``): where it was
     found is off by the residual, and the product of both would count as evidence.
     """
-    own = at.pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
-    own = own + at.pixels.new_tensor([camera.cx, camera.cy])
     there, here = (
-        torch.einsum("mk,k...->m...", sizes, lens_shapes(camera, p)) for p in (at.pixels, own)
+        torch.einsum("mk,k...->m...", sizes, lens_shapes(camera, p))
+        for p in (at.pixels, _own_pixels(camera, rays))
     )
     return there - carried_over(camera, T_ji, at, here[:, None].expand_as(there))
+
+
+def shifts_of_edges(
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    at: CellProjection,
+    sizes: Float[Tensor, "e 2 5"],
+) -> Float[Tensor, "e p 2"]:
+    """The same for one error of each edge's source and one of its target."""
+    there = torch.einsum("ek,kepc->epc", sizes[:, 1], lens_shapes(camera, at.pixels))
+    own = lens_shapes(camera, _own_pixels(camera, rays))
+    here = torch.einsum("ek,kpc->epc", sizes[:, 0], own)
+    return there - carried_over(camera, T_ji, at, here)
+
+
+def _own_pixels(camera: Camera, rays: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
+    """Where cells with these rays are."""
+    own = rays.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
+    return own + rays.new_tensor([camera.cx, camera.cy])
 
 
 @dataclass(frozen=True)

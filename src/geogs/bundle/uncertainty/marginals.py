@@ -74,6 +74,8 @@ class Marginals:
     """Of the focal length, as a part of it."""
     focal_change: float = 0.0
     """By how much parts of the video want focal lengths that differ, as a part of them."""
+    lens_change: float = 0.0
+    """Part of the matches' cost that a lens of each frame of its own would take off."""
 
     @property
     def pose(self) -> Float[Tensor, "n 6 6"]:

@@ -1,0 +1,215 @@
+"""Lenses that change from image to image in the adjustment of all keyframes: a planted walk."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from geogs.bundle.projection import project
+from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes
+from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.geometry.umeyama import umeyama
+from geogs.loop import frame_lenses
+from geogs.loop.frame_lenses import correct_frame_lenses
+from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
+from geogs.scene_mask import SceneMask
+from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
+from geogs.tracking.frames.frame_recorder import sparse_cells
+from geogs.tracking.frames.pose_filling import solved_poses
+from geogs.tracking.tracker import Tracker, lone_tracker
+from geogs.types import FlowMatch
+from geogs.world.edges import pack_matches
+from geogs.world.frames import FrameRecord, Observation
+from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
+from geogs.world.straight_view import StraightView
+from planted_walk import PlantedFlow, true_inverse_depth
+
+CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
+GRID, COUNT = SampleGrid(CAMERA), 20
+NOISE = np.random.default_rng(0).integers(1, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)
+
+
+def walk() -> Tensor:
+    """World to camera: aside along a wall, forward and back, looking about."""
+    k = np.arange(COUNT)
+    xi = np.zeros((COUNT, 6))
+    xi[:, 4], xi[:, 3] = 0.2 * np.sin(0.5 * k), 0.1 * np.sin(0.8 * k)
+    T_wc = se3_exp(torch.from_numpy(xi))
+    T_wc[:, :3, 3] = torch.from_numpy(
+        np.stack([0.15 * k, 0.2 * np.sin(0.7 * k), 0.3 * np.sin(0.4 * k)], -1)
+    )
+    return se3_inverse(T_wc)
+
+
+def seen_by(sizes: Tensor, wanted: Tensor) -> Tensor:
+    """Where a lens shows what the pinhole shows at some pixels."""
+    seen = wanted
+    for _ in range(6):
+        seen = seen + wanted - pinhole(sizes, seen)
+    return seen
+
+
+def pinhole(sizes: Tensor, pixels: Tensor) -> Tensor:
+    return pixels + torch.einsum("k,k...->...", sizes, lens_shapes(CAMERA, pixels))
+
+
+class VaryingFlow(PlantedFlow):
+    """Matches between images whose lenses have errors of their own, until they are straight."""
+
+    def __init__(self, T: Tensor, sizes: Tensor) -> None:
+        super().__init__(GRID, T, torch.empty(0), 0.0)
+        self.is_straight = False
+        self._see(sizes)
+
+    def encode(self, image: np.ndarray) -> int:
+        if not self.is_straight and not np.array_equal(image[..., 2], NOISE):
+            self.is_straight = True
+            self._see(torch.zeros_like(self.sizes))
+        return super().encode(image)
+
+    def _see(self, sizes: Tensor) -> None:
+        self.sizes = sizes
+        self.rays, depths = [], []
+        for n, own in enumerate(sizes):
+            at = pinhole(own, GRID.pixels) - torch.tensor([CAMERA.cx, CAMERA.cy])
+            rays = torch.cat([at / CAMERA.fx, torch.ones(GRID.size, 1)], 1)
+            grid = SampleGrid(CAMERA)
+            object.__setattr__(grid, "rays", rays)
+            self.rays.append(rays)
+            depths.append(true_inverse_depth(self.T[n : n + 1], grid)[0])
+        self.d = torch.stack(depths)
+
+    def _match(self, source, target) -> FlowMatch:
+        found = [self._one(i, j) for i, j in zip(source, target, strict=True)]
+        pixels, weight = (torch.stack(each) for each in zip(*found, strict=True))
+        return FlowMatch(pixels, weight)
+
+    def _one(self, i: int, j: int) -> tuple[Tensor, Tensor]:
+        T = (self.T[j] @ se3_inverse(self.T[i]))[None]
+        p = project(CAMERA, self.rays[i], T, self.d[i][None])
+        used = (p.valid & GRID.inside(p.pixels))[0]
+        wanted = torch.where(used[:, None], p.pixels[0], GRID.centre)
+        g = torch.Generator().manual_seed(100 * i + j)
+        pixels = seen_by(self.sizes[j], wanted) + 0.02 * torch.randn(wanted.shape, generator=g)
+        return pixels, torch.where(used, 400.0, 0.0)[:, None].expand(-1, 2).contiguous()
+
+
+def sizes_of(focal: float, centre: float) -> Tensor:
+    k = torch.arange(COUNT)
+    found = torch.zeros(COUNT, SHAPES)
+    found[:, 0] = focal * torch.sin(1.1 * k)
+    found[:, OWN[1]], found[:, OWN[2]] = centre * torch.cos(1.7 * k), centre * torch.sin(2.3 * k)
+    return found
+
+
+def tracker_of(sizes: Tensor) -> tuple[Tracker, Tensor]:
+    T = walk()
+    flow = VaryingFlow(T, sizes)
+    tracker = lone_tracker(CAMERA, operator=flow)
+    for n in range(COUNT):
+        image = np.dstack([np.full_like(NOISE, n), np.zeros_like(NOISE), NOISE])
+        state = tracker.keyframes.add(n, n / 10, image, n, T[n].clone())
+        state.inverse_depth, state.information = flow.d[n].clone(), torch.full_like(flow.d[n], 1e4)
+        tracker.map.recorder.add_keyframe(state)
+    tracker.segment.status.state = TrackState.TRACKING
+    return tracker, T
+
+
+def error(tracker: Tracker, truth: Tensor) -> float:
+    """Root mean square error of the centres after a similarity."""
+    x, y = (se3_inverse(T)[:, :3, 3] for T in (tracker.keyframes.poses(range(COUNT)), truth))
+    scale, R, t = umeyama(x, y)
+    return float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+
+
+@pytest.fixture(autouse=True)
+def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 4)
+
+
+@pytest.mark.parametrize(("focal", "centre"), [(0.02, 0.0), (0.0, 0.012)])
+def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypatch, focal, centre):
+    sizes = sizes_of(focal, centre)
+    tracker, truth = tracker_of(sizes)
+    with monkeypatch.context() as m:
+        m.setattr(frame_lenses, "EXPLAINED", np.inf)
+        global_bundle(tracker, ends=True)
+    steady = error(tracker, truth)
+    assert not tracker.keyframes.table.frame_lenses
+    tracker, truth = tracker_of(sizes)
+    global_bundle(tracker, ends=True)
+    assert error(tracker, truth) < 0.4 * steady
+    table = tracker.keyframes.table
+    lens, own = table.lens, table.frame_lenses
+    assert lens is not None
+    found = torch.tensor([[own[n].focal, own[n].right, own[n].down] for n in range(COUNT)])
+    want = sizes[:, list(OWN)]
+    found, want = found - found.mean(0), want - want.mean(0)
+    assert float((found - want).square().mean().sqrt()) < 0.45 * float(want.square().mean().sqrt())
+    assert lens.varies_focal == pytest.approx(focal / 2**0.5, rel=0.3, abs=2e-3)
+    assert lens.varies_centre == pytest.approx(centre, rel=0.3, abs=2e-3)
+    image = np.dstack([np.full_like(NOISE, 7), np.zeros_like(NOISE), NOISE])
+    view = StraightView(CAMERA, lens).of_frame(own[7])
+    assert np.array_equal(tracker.keyframes[7].image, view.image(image))
+    shown = SceneMask().of(tracker.keyframes[7])
+    assert shown is None or np.array_equal(shown, view.is_seen)
+
+
+def test_a_lens_that_stays_changes_nothing(monkeypatch):
+    poses = []
+    for explained in (frame_lenses.EXPLAINED, np.inf):
+        monkeypatch.setattr(frame_lenses, "EXPLAINED", explained)
+        tracker, _ = tracker_of(torch.zeros(COUNT, SHAPES))
+        global_bundle(tracker, ends=True)
+        poses.append(tracker.keyframes.poses(range(COUNT)))
+        assert tracker.keyframes.table.lens is None
+    assert torch.equal(*poses)
+
+
+def test_what_does_not_settle_leaves_everything_as_it_was(monkeypatch):
+    tracker, _ = tracker_of(sizes_of(0.03, 0.0))
+    ids = list(range(COUNT))
+    graph = tracker.map.graph
+    pairs = [(a, b) for a in ids for b in range(a + 1, min(a + 4, COUNT))]
+    graph.measure(pairs, packed=True)
+    graph.adjust(list(graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    before = tracker.keyframes.poses(ids), tracker.keyframes.inverse_depths(ids)
+    edges = dict(graph.edges)
+    monkeypatch.setattr(frame_lenses, "ROUNDS", 1)
+    assert correct_frame_lenses(tracker, ids[1:], ids, GLOBAL_OPTIONS) is None
+    after = tracker.keyframes.poses(ids), tracker.keyframes.inverse_depths(ids)
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert graph.edges.keys() == edges.keys()
+    assert all(torch.equal(graph.edges[e].position, edges[e].position) for e in edges)
+
+
+def test_a_frame_between_keyframes_tells_its_own_lens():
+    tracker, T = tracker_of(torch.zeros(COUNT, SHAPES))
+    for keyframe in tracker.keyframes:
+        keyframe.information *= 1e4  # depths are exact
+    keyframes, log = tracker.keyframes, tracker.map.recorder.log
+    own = torch.zeros(SHAPES)
+    own[0], own[OWN[1]] = 0.015, 0.005
+    pose = se3_exp(torch.tensor([0.01, 0.02, 0.0, 0.01, 0.0, 0.02]).double()) @ T[3]
+    record = FrameRecord(COUNT, 0.35, 3, T[4] @ se3_inverse(T[3]))
+    cells = sparse_cells(GRID)
+    for k in (3, 4):
+        motion = (pose @ se3_inverse(T[k]))[None]
+        p = project(CAMERA, GRID.rays[cells], motion, keyframes.inverse_depths([k])[:, cells])
+        used = (p.valid & GRID.inside(p.pixels, 4.0))[0]
+        pixels = seen_by(own, p.pixels[0])
+        weight = torch.where(used, 100.0, 0.0)[:, None].expand(-1, 2)
+        record.observations.append(Observation(k, *pack_matches(GRID, pixels, weight)))
+    log.records.append(record)
+    zero = torch.zeros(SHAPES, dtype=torch.float64)
+    known = {k.frame_index: zero for k in keyframes}
+    found = sizes_of_frames(log, keyframes, known, VaryingPrior((1.0, 1.0, 1.0), 1.0))
+    np.testing.assert_allclose(found[COUNT], own, atol=2e-3)
+    wrong = solved_poses(log, keyframes)[COUNT]
+    shift_frames(log, keyframes, found)
+    right = solved_poses(log, keyframes)[COUNT]
+    off = [float((T[:3, 3] - pose[:3, 3]).norm()) for T in (wrong, right)]
+    assert off[1] < 0.2 * off[0]
