@@ -1,6 +1,6 @@
 """A walk along the wall of a long hall and back, with exact matches: large problems, no images."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from geogs.bundle.projection import project
 from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.geometry.umeyama import umeyama
 from geogs.tracking.flow.flow_operator import Memories
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch
@@ -90,6 +91,27 @@ class PlantedFlow:
         seen = p.valid & self.grid.inside(p.pixels)
         weight = torch.where(seen, 1 / max(self.sigma, 0.05) ** 2, 0.0)
         return FlowMatch(pixels, weight[..., None].expand(-1, -1, 2).contiguous())
+
+
+def walked_tracker(
+    camera: Camera, flow: PlantedFlow, image_of: Callable[[int], np.ndarray]
+) -> Tracker:
+    """One that holds the walk of a flow with its depths, ten keyframes a second."""
+    tracker = lone_tracker(camera, operator=flow)
+    for n, (T, d) in enumerate(zip(flow.T, flow.d, strict=True)):
+        state = tracker.keyframes.add(n, n / 10, image_of(n), n, T.clone())
+        state.inverse_depth, state.information = d.clone(), torch.full_like(d, 1e4)
+        tracker.map.recorder.add_keyframe(state)
+    tracker.segment.status.state = TrackState.TRACKING
+    return tracker
+
+
+def centre_error(tracker: Tracker, truth: Tensor) -> float:
+    """Root mean square error of the keyframes' centres after a similarity."""
+    poses = tracker.keyframes.poses(range(len(truth)))
+    x, y = (se3_inverse(T)[:, :3, 3] for T in (poses, truth))
+    scale, R, t = umeyama(x, y)
+    return float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
 
 
 def planted_tracker(

@@ -10,7 +10,6 @@ from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes
 from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.geometry.umeyama import umeyama
 from geogs.loop import frame_lenses
 from geogs.loop.frame_lenses import correct_frame_lenses
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
@@ -18,14 +17,13 @@ from geogs.scene_mask import SceneMask
 from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import solved_poses
-from geogs.tracking.tracker import Tracker, lone_tracker
+from geogs.tracking.tracker import Tracker
 from geogs.types import FlowMatch
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameRecord, Observation
 from geogs.world.grid import SampleGrid
-from geogs.world.segments import TrackState
 from geogs.world.straight_view import StraightView
-from planted_walk import PlantedFlow, true_inverse_depth
+from planted_walk import PlantedFlow, centre_error, true_inverse_depth, walked_tracker
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
 GRID, COUNT = SampleGrid(CAMERA), 20
@@ -97,6 +95,10 @@ class VaryingFlow(PlantedFlow):
         return pixels, torch.where(used, 400.0, 0.0)[:, None].expand(-1, 2).contiguous()
 
 
+def image_of(number: int) -> np.ndarray:
+    return np.dstack([np.full_like(NOISE, number), np.zeros_like(NOISE), NOISE])
+
+
 def sizes_of(focal: float, centre: float) -> Tensor:
     k = torch.arange(COUNT)
     found = torch.zeros(COUNT, SHAPES)
@@ -108,21 +110,7 @@ def sizes_of(focal: float, centre: float) -> Tensor:
 def tracker_of(sizes: Tensor) -> tuple[Tracker, Tensor]:
     T = walk()
     flow = VaryingFlow(T, sizes)
-    tracker = lone_tracker(CAMERA, operator=flow)
-    for n in range(COUNT):
-        image = np.dstack([np.full_like(NOISE, n), np.zeros_like(NOISE), NOISE])
-        state = tracker.keyframes.add(n, n / 10, image, n, T[n].clone())
-        state.inverse_depth, state.information = flow.d[n].clone(), torch.full_like(flow.d[n], 1e4)
-        tracker.map.recorder.add_keyframe(state)
-    tracker.segment.status.state = TrackState.TRACKING
-    return tracker, T
-
-
-def error(tracker: Tracker, truth: Tensor) -> float:
-    """Root mean square error of the centres after a similarity."""
-    x, y = (se3_inverse(T)[:, :3, 3] for T in (tracker.keyframes.poses(range(COUNT)), truth))
-    scale, R, t = umeyama(x, y)
-    return float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    return walked_tracker(CAMERA, flow, image_of), T
 
 
 @pytest.fixture(autouse=True)
@@ -137,11 +125,11 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     with monkeypatch.context() as m:
         m.setattr(frame_lenses, "EXPLAINED", np.inf)
         global_bundle(tracker, ends=True)
-    steady = error(tracker, truth)
+    steady = centre_error(tracker, truth)
     assert not tracker.keyframes.table.frame_lenses
     tracker, truth = tracker_of(sizes)
     global_bundle(tracker, ends=True)
-    assert error(tracker, truth) < 0.4 * steady
+    assert centre_error(tracker, truth) < 0.4 * steady
     table = tracker.keyframes.table
     lens, own = table.lens, table.frame_lenses
     assert lens is not None
@@ -151,9 +139,8 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     assert float((found - want).square().mean().sqrt()) < 0.45 * float(want.square().mean().sqrt())
     assert lens.varies_focal == pytest.approx(focal / 2**0.5, rel=0.3, abs=2e-3)
     assert lens.varies_centre == pytest.approx(centre, rel=0.3, abs=2e-3)
-    image = np.dstack([np.full_like(NOISE, 7), np.zeros_like(NOISE), NOISE])
     view = StraightView(CAMERA, lens).of_frame(own[7])
-    assert np.array_equal(tracker.keyframes[7].image, view.image(image))
+    assert np.array_equal(tracker.keyframes[7].image, view.image(image_of(7)))
     shown = SceneMask().of(tracker.keyframes[7])
     assert shown is None or np.array_equal(shown, view.is_seen)
 

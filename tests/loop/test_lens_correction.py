@@ -9,16 +9,14 @@ from geogs.bundle.projection import project
 from geogs.bundle.uncertainty.lens_error import lens_shapes
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.geometry.umeyama import umeyama
 from geogs.loop import lens_correction
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.loop.straightening import BentImages, FrameViews
-from geogs.tracking.tracker import Tracker, lone_tracker
+from geogs.tracking.tracker import Tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.segments import TrackState
 from geogs.world.straight_view import StraightView
-from planted_walk import PlantedFlow, true_inverse_depth
+from planted_walk import PlantedFlow, centre_error, true_inverse_depth, walked_tracker
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
 GRID, COUNT = SampleGrid(CAMERA), 24
@@ -98,20 +96,7 @@ def tracker_of(
 ) -> tuple[Tracker, Tensor]:
     T = forward(0.3 if focal else 0.08)  # what tells a focal length is rotation
     flow = BentFlow(T, bend, focal, centre)
-    tracker = lone_tracker(CAMERA, operator=flow)
-    for n in range(COUNT):
-        state = tracker.keyframes.add(n, n / 10, image_of(n), n, T[n].clone())
-        state.inverse_depth, state.information = flow.d[n].clone(), torch.full_like(flow.d[n], 1e4)
-        tracker.map.recorder.add_keyframe(state)
-    tracker.segment.status.state = TrackState.TRACKING
-    return tracker, T
-
-
-def error(tracker: Tracker, truth: Tensor) -> float:
-    """Root mean square error of the centres after a similarity."""
-    x, y = (se3_inverse(T)[:, :3, 3] for T in (tracker.keyframes.poses(range(COUNT)), truth))
-    scale, R, t = umeyama(x, y)
-    return float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    return walked_tracker(CAMERA, flow, image_of), T
 
 
 @pytest.fixture(autouse=True)
@@ -124,12 +109,12 @@ def test_a_corridor_through_a_lens_that_nobody_told_keeps_its_scale(monkeypatch)
     believed = lens_correction.EVIDENCE
     monkeypatch.setattr(lens_correction, "EVIDENCE", np.inf)
     global_bundle(tracker)
-    bent = error(tracker, truth)
+    bent = centre_error(tracker, truth)
     assert bent > 0.008
     tracker, truth = tracker_of(BEND)
     monkeypatch.setattr(lens_correction, "EVIDENCE", believed)
     global_bundle(tracker)
-    assert error(tracker, truth) < 0.2 * bent
+    assert centre_error(tracker, truth) < 0.2 * bent
 
 
 def test_the_bend_is_told_as_it_is():
@@ -165,7 +150,7 @@ def test_the_end_of_tracking_straightens_images_once():
     global_bundle(tracker)
     table = tracker.keyframes.table
     assert table.lens is None  # it goes on
-    to_first_order = error(tracker, truth)
+    to_first_order = centre_error(tracker, truth)
     global_bundle(tracker, ends=True)
     lens = table.lens
     assert lens is not None
@@ -174,7 +159,7 @@ def test_the_end_of_tracking_straightens_images_once():
     straight = tracker.keyframes[3].image
     assert np.array_equal(straight, StraightView(CAMERA, lens).image(image_of(3)))
     # Everything is of straight images now.
-    assert error(tracker, truth) < 0.9 * to_first_order
+    assert centre_error(tracker, truth) < 0.9 * to_first_order
     wanted = tracker.map.graph.operator.d
     for keyframe in tracker.keyframes:
         known = keyframe.has_known_depth
@@ -204,7 +189,7 @@ def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatc
     tracker, truth = tracker_of(BEND, -0.05)
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", np.inf)
     global_bundle(tracker)
-    bent = error(tracker, truth)
+    bent = centre_error(tracker, truth)
     assert tracker.keyframes.grid.camera == CAMERA
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)  # two dozen keyframes tell little
     tracker, _ = tracker_of(BEND, -0.05)
@@ -221,7 +206,7 @@ def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatc
     assert lens.focal == pytest.approx(1 / 1.05, abs=0.01)
     assert abs(lens.focal - 1 / 1.05) < 2 * lens.deviation_focal < 0.04
     assert tracker.keyframes.grid.camera == tracker.keyframes.camera == CAMERA
-    assert error(tracker, truth) < 0.5 * bent
+    assert centre_error(tracker, truth) < 0.5 * bent
 
 
 def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypatch):

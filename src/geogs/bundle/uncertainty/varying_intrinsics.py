@@ -60,13 +60,12 @@ class VaryingPrior:
     drift: float
     """Of the logarithm of the last frame's focal length from the first one's."""
 
-    def covariance(self, times: Float[Tensor, "n"]) -> Float[Tensor, "n 3 n 3"]:
-        """Of the sizes of frames at some times."""
-        found = torch.zeros(len(times), len(OWN), len(times), len(OWN), dtype=torch.float64)
+    def information(self, times: Float[Tensor, "n"]) -> Float[Tensor, "3 n n"]:
+        """Inverse covariance of each size of frames at some times; they are independent."""
+        found = torch.zeros(len(OWN), len(times), len(times), dtype=torch.float64)
         for n, (part, square) in enumerate(zip(_parts(times), self._squares, strict=True)):
-            k = n % len(OWN)
-            found[:, k, :, k] += square * part
-        return found
+            found[n % len(OWN)] += square * part
+        return torch.linalg.inv(found)
 
     @property
     def _squares(self) -> list[float]:
@@ -93,14 +92,13 @@ class VaryingPrior:
     ) -> "VaryingPrior":
         """That which suits sizes that are known to a covariance better: a step of expectation
         maximisation of components of a variance."""
-        prior, squares = self.covariance(times), self._squares
+        prior, squares = self.information(times), self._squares
         found = []
         for n, (part, square) in enumerate(zip(_parts(times), squares, strict=True)):
             k = n % len(OWN)
             second = sizes[:, k, None] * sizes[:, k] + covariance[:, k, :, k]
-            inverse = torch.linalg.inv(prior[:, k, :, k])
-            both = inverse @ part
-            less = ((both @ inverse) * second.mT).sum() - both.diagonal().sum()
+            both = prior[k] @ part
+            less = ((both @ prior[k]) * second.mT).sum() - both.diagonal().sum()
             found.append(math.sqrt(max(0.0, square + square**2 / len(times) * float(less))))
         return VaryingPrior((found[0], found[1], found[2]), found[3])
 
@@ -138,9 +136,12 @@ class VaryingEvidence:
         """Steps of all sizes and their covariance, where ``taken`` of them was taken off already;
         what all share is known to be zero to the deviations ``shared``."""
         own = len(self.gradient) - SHAPES
-        each = torch.linalg.inv(prior.covariance(times).reshape(own, own))
-        known = torch.block_diag(each, torch.diag(shared.double().square().reciprocal()))
-        covariance = torch.linalg.inv(COUNTS * self.information + known)
+        known = torch.zeros_like(self.information)
+        for k, each in enumerate(prior.information(times)):
+            known[k : own : len(OWN), k : own : len(OWN)] = each
+        known.diagonal()[own:] = shared.double().square().reciprocal()
+        left = torch.linalg.cholesky(COUNTS * self.information + known)
+        covariance = torch.cholesky_inverse(left)
         return covariance @ (COUNTS * self.gradient - known @ taken), covariance
 
     def told(
