@@ -162,6 +162,14 @@ def test_deviations_are_those_that_samples_were_drawn_with():
     assert prior.drift == pytest.approx(0.05, rel=0.4)
 
 
+def test_times_need_not_grow_as_those_of_a_saved_map_do_not():
+    times = torch.tensor([2.0, 3.0, 0.0, 1.0], dtype=torch.float64)
+    order = times.argsort()
+    found, sorted_ = FIRST.information(times), FIRST.information(times[order])
+    np.testing.assert_allclose(found[:, order][:, :, order], sorted_, rtol=1e-9)
+    assert bool((torch.linalg.eigvalsh(found) > 0).all())
+
+
 def test_between_keyframes_a_focal_length_is_known_worst_half_way():
     prior = VaryingPrior((0.001, 0.002, 0.003), 0.04)
     found = prior.between(np.array([0.0, 1.0, 4.0]), np.array([0.0, 0.5, 1.0, 2.5]))

@@ -106,7 +106,8 @@ class VaryingPrior:
 def _parts(times: Float[Tensor, "n"]) -> list[Float[Tensor, "n n"]]:
     """Covariances of size one: of what is independent for each size, and of a random walk."""
     alone = torch.eye(len(times), dtype=torch.float64)
-    past = (times - times[0]).double() / (times[-1] - times[0]).clamp(min=1e-9)
+    first, last = times.min(), times.max()  # a saved map's frames may be of later times
+    past = (times - first).double() / (last - first).clamp(min=1e-9)
     return [alone, alone, alone, torch.minimum(past[:, None], past)]
 
 
@@ -140,8 +141,7 @@ class VaryingEvidence:
         for k, each in enumerate(prior.information(times)):
             known[k : own : len(OWN), k : own : len(OWN)] = each
         known.diagonal()[own:] = shared.double().square().reciprocal()
-        left = torch.linalg.cholesky(COUNTS * self.information + known)
-        covariance = torch.cholesky_inverse(left)
+        covariance = torch.linalg.inv(COUNTS * self.information + known)
         return covariance @ (COUNTS * self.gradient - known @ taken), covariance
 
     def told(
