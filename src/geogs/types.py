@@ -185,6 +185,11 @@ class FrameLens:
     down: float = 0.0
     """Where its principal point lies off theirs, in focal lengths."""
 
+    @property
+    def sizes(self) -> tuple[float, float, float]:
+        """All three."""
+        return self.focal, self.right, self.down
+
     def plus(self, other: "FrameLens") -> "FrameLens":
         """With what was found beside."""
         right, down = self.right + other.right, self.down + other.down

@@ -65,6 +65,17 @@ class VaryingLens:
         }
         return VaryingLens(lens, own, other.prior or self.prior)
 
+    def shift(self, tracker: Tracker) -> None:
+        """Correct what was found of frames, beside what it was corrected by. After the lens of all
+        (``shift_lens``), which takes the place of what was there."""
+        lens, each = self.lens, list(OWN)
+        common = torch.tensor([math.log(lens.focal), lens.k1, lens.k2, lens.right, lens.down])
+        sizes = {
+            n: common.double().index_add(0, torch.tensor(each), torch.tensor(o.sizes).double())
+            for n, o in self.own.items()
+        }
+        shift_frames(tracker.map.recorder.log, tracker.keyframes, sizes)
+
     def views(self, camera: Camera) -> FrameViews:
         """How its frames are straightened."""
         own = self.own.values()
@@ -86,9 +97,9 @@ def correct_frame_lenses(
     """Correct all matches for what the lens of each keyframe has of its own, and adjust again.
 
     None where matches do not ask for it, or it does not settle: then everything is as it was.
-    ``before`` was found already, images are straight by it, and what is left is asked for; what was
-    found of the frames between the keyframes is corrected for it then. Not in the world of a saved
-    map. Of a lens that somebody told of, what all frames share stays.
+    ``before`` was found already, images are straight by it, and what is left is asked for. What was
+    found of the frames between the keyframes stays (:meth:`VaryingLens.shift`). Not in the world of
+    a saved map. Of a lens that somebody told of, what all frames share stays.
     """
     graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     if not graph.edges or tracker.segment.fixed:
@@ -113,8 +124,6 @@ def correct_frame_lenses(
         return None
     known = {k.frame_index: sizes.of(k.id) for k in keyframes}
     found = sizes_of_frames(log, keyframes, known, sizes.prior)
-    if before is not None:
-        shift_frames(log, keyframes, found)
     own = {n: FrameLens(*(s - sizes.common)[list(OWN)].tolist()) for n, s in found.items()}
     focal, k1, k2, right, down = sizes.common.tolist()
     lens = FoundLens(k1, k2, 0.0, 0.0, math.exp(focal), right=right, down=down)

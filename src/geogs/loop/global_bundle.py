@@ -89,6 +89,7 @@ def global_bundle(
         match(config.fine_adjustment)
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
     if images is not None and found is not None:
+        more = None
         if varying is not None:
             more = correct_frame_lenses(tracker, free_poses, free, GLOBAL_OPTIONS, before=found)
             found = found if more is None else found.followed_by(store.camera, more)
@@ -97,6 +98,8 @@ def global_bundle(
             rest = correct_lens(tracker, free_poses, free, GLOBAL_OPTIONS, ends, before=found.lens)
         if rest is not None:
             found = found.followed_by(store.camera, VaryingLens(rest, {}))
+        if more is not None:
+            more.shift(tracker)
         images.straighten(found.views(store.camera))
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose

@@ -194,7 +194,7 @@ class _Matches:
         each = [own.get(k, FrameLens()) for k in self.frames]
         return considered_lenses(
             self.grid, self.problem, OPTIONS, CELLS,
-            torch.tensor([[o.focal, o.right, o.down] for o in each], dtype=torch.float64),
+            torch.tensor([o.sizes for o in each], dtype=torch.float64),
             self.times, self.shared,
         )  # fmt: skip
 
