@@ -10,7 +10,7 @@ from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes
 from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.loop import frame_lenses
+from geogs.loop import frame_lenses, lens_correction
 from geogs.loop.frame_lenses import correct_frame_lenses
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.scene_mask import SceneMask
@@ -143,6 +143,22 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     assert np.array_equal(tracker.keyframes[7].image, view.image(image_of(7)))
     shown = SceneMask().of(tracker.keyframes[7])
     assert shown is None or np.array_equal(shown, view.is_seen)
+
+
+def test_what_frames_have_of_their_own_is_taken_off_beside_the_lens_of_all(monkeypatch):
+    """The lens of all takes the place of what frames were corrected by."""
+    order = []
+    shift_lens, shift = lens_correction.shift_lens, frame_lenses.VaryingLens.shift
+    monkeypatch.setattr(
+        lens_correction, "shift_lens", lambda *a: (order.append("all"), shift_lens(*a))
+    )
+    monkeypatch.setattr(
+        frame_lenses.VaryingLens, "shift", lambda *a: (order.append("own"), shift(*a))
+    )
+    tracker, _ = tracker_of(sizes_of(0.02, 0.0))
+    tracker.keyframes.table.focal_deviation = 0.01
+    global_bundle(tracker, ends=True)
+    assert order == ["all", "all", "own"]
 
 
 def test_a_lens_that_stays_changes_nothing(monkeypatch):

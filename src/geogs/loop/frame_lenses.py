@@ -78,11 +78,8 @@ class VaryingLens:
 
     def views(self, camera: Camera) -> FrameViews:
         """How its frames are straightened."""
-        own = self.own.values()
-        focal, right, down = (
-            math.sqrt(sum(size**2 for size in sizes) / max(len(own), 1))
-            for sizes in ([o.focal for o in own], [o.right for o in own], [o.down for o in own])
-        )
+        each = torch.tensor([o.sizes for o in self.own.values()] or [FrameLens().sizes])
+        focal, right, down = each.double().square().mean(0).sqrt().tolist()
         lens = replace(self.lens, varies_focal=focal, varies_centre=math.hypot(right, down))
         return FrameViews(StraightView(camera, lens), self.own)
 
