@@ -7,7 +7,7 @@ somebody else's list is shown to anybody.
 import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -84,6 +84,11 @@ def require_file(path: str | Path) -> Path:
     """
     with open_file(path):
         return Path(path)
+
+
+def first_file(paths: Iterable[Path]) -> Path | None:
+    """The first of some files that is there; none where none is."""
+    return next((path for path in paths if path.is_file()), None)
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:

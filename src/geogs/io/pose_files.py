@@ -6,7 +6,7 @@ dropped, and the log says how many; a file whose numbers mean something else is 
 
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,8 @@ ORIENTATIONS = "orientations.tum"
 """The file of a result with the frames of which no more than the orientation is known."""
 _log = logging.getLogger(__name__)
 _POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
+_NUMBER = re.compile(r"(\d+)\.\w+")
+"""Names of files that are numbered, padded with zeros or not."""
 
 
 def read_tum_trajectory(path: str | Path) -> Trajectory:
@@ -123,11 +125,13 @@ def read_replica_trajectory(path: str | Path) -> Trajectory:
 def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
     """Read the ``frame-<k>.pose.txt`` files of a 7-Scenes sequence; frame k is at k / 30 s."""
     folder = Path(folder)
-    numbered = _pose_files(folder)
-    if not numbered:
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; give the folder of one 7-Scenes sequence.")
+    files = numbered(folder.iterdir(), _POSE_FILE)
+    if not files:
         raise InputError(f"{folder} holds no frame-*.pose.txt; give the folder of one sequence.")
-    T_wc = np.stack([_read_matrix(path) for _, path in numbered])
-    seconds = np.array([number for number, _ in numbered]) / FRAMES_PER_SECOND
+    T_wc = np.stack([_read_matrix(path) for _, path in files])
+    seconds = np.array([number for number, _ in files]) / FRAMES_PER_SECOND
     return matrix_trajectory(folder, seconds, T_wc, is_rigid(T_wc))
 
 
@@ -143,10 +147,9 @@ def read_poses(path: str | Path) -> Trajectory:
     return read_tum_trajectory(path) if columns == 8 else read_replica_trajectory(path)
 
 
-def _pose_files(folder: Path) -> list[tuple[int, Path]]:
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; give the folder of one 7-Scenes sequence.")
-    matches = ((_POSE_FILE.fullmatch(path.name), path) for path in folder.iterdir())
+def numbered(paths: Iterable[Path], pattern: re.Pattern[str] = _NUMBER) -> list[tuple[int, Path]]:
+    """Files by the number that a pattern finds in their names, ascending."""
+    matches = ((pattern.fullmatch(path.name), path) for path in paths)
     return sorted((int(match[1]), path) for match, path in matches if match)
 
 

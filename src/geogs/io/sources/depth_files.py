@@ -51,7 +51,7 @@ class DepthFile:
     """A picture of depth as it came."""
 
     path: Path
-    per_metre: float
+    per_metre: float = 1000.0
     """Units of the picture to the metre."""
     sensor: DepthCamera | None = None
     """Who saw it; none where its pixels are those of the colour image, at whatever size."""
@@ -75,6 +75,14 @@ class DepthFile:
                 unknown |= trust < LEAST_CONFIDENCE
         known = np.where(unknown, np.float32(0), metres)
         return np.ascontiguousarray(np.rot90(known, -self.quarter_turns))
+
+
+def depth_beside(path: Path, confidence: Path | None = None) -> DepthFile | None:
+    """A picture of millimetres, and of their confidence, as far as they are there."""
+    if not path.is_file():
+        return None
+    is_there = confidence is not None and confidence.is_file()
+    return DepthFile(path, confidence=confidence if is_there else None)
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from geogs.documents import UNUSABLE
+from geogs.documents import UNUSABLE, first_file
 from geogs.errors import InputError
 from geogs.geometry.lie import so3_exp
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import arkit_camera
-from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.depth_files import depth_beside
 from geogs.io.sources.formats.image_files import (
     ImageFile,
     ImageList,
@@ -33,7 +33,6 @@ from geogs.types import Trajectory
 PICTURES = ("lowres_wide", "vga_wide", "wide")
 """Folders of images, at several sizes; the first is that which comes with every download."""
 _NAME = re.compile(r"\d+_(\d+\.\d+)")
-_PER_METRE = 1000.0
 _ASKED = 24
 """Cameras that are read, about; that of each image differs a little by its focus."""
 _MAX_GAP = 0.15
@@ -53,14 +52,19 @@ def open_arkitscenes(place: Place) -> ImageList:
     timed = sorted((float(match[1]), path) for match, path in found if match)
     if not timed:
         raise InputError(f"{place.pictures} holds no images such as 41069021_305.377.png.")
-    files = [_with_depth(place.folder, ImageFile(path, time)) for time, path in timed]
+    depths, trust = place.folder / "lowres_depth", place.folder / "confidence"
+    names = [f"{path.stem}.png" for _, path in timed]
+    files = [
+        ImageFile(path, time, depth_beside(depths / name, trust / name))
+        for (time, path), name in zip(timed, names, strict=True)
+    ]
     name = place.folder.resolve().name
     return ImageList("arkitscenes", name, files, _camera(place, [path for _, path in timed]))
 
 
 def open_posed_arkitscenes(place: Place) -> PosedSet:
     """Read the images of one size with their poses."""
-    file = next((p for name in _TRUTHS if (p := place.folder / name).is_file()), None)
+    file = first_file(place.folder / name for name in _TRUTHS)
     if file is None:
         raise InputError(f"{place.folder} holds no true poses: {_TRUTHS[0]} is missing.")
     return with_timed_poses(open_arkitscenes(place), read_arkitscenes_truth(file), _MAX_GAP)
@@ -81,15 +85,6 @@ def read_arkitscenes_truth(path: Path) -> Trajectory:
     valid = np.isfinite(rows).all(axis=1) & is_rigid(T_cw)
     T_cw[~valid] = np.eye(4)
     return matrix_trajectory(path, rows[:, 0], np.linalg.inv(T_cw), valid)
-
-
-def _with_depth(folder: Path, file: ImageFile) -> ImageFile:
-    depth = folder / "lowres_depth" / f"{file.path.stem}.png"
-    if not depth.is_file():
-        return file
-    confidence = folder / "confidence" / depth.name
-    beside = confidence if confidence.is_file() else None
-    return replace(file, depth=DepthFile(depth, _PER_METRE, confidence=beside))
 
 
 def _camera(place: Place, paths: list[Path]) -> Calibration | None:

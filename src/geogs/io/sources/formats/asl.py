@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import UNUSABLE, read_text
+from geogs.documents import UNUSABLE, first_file
 from geogs.errors import InputError
 from geogs.io.pose_files import is_rigid, quaternion_trajectory, read_rows
 from geogs.io.sources.calibration_files import calibration_from_document, camera_document
@@ -24,6 +24,7 @@ from geogs.io.sources.formats.image_files import (
     Place,
     images_in,
     in_order_of_time,
+    listed,
 )
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
@@ -41,7 +42,10 @@ def open_asl(place: Place) -> ImageList:
     """Read the images of one camera; times are those of its ``data.csv``."""
     camera = place.pictures.parent
     listing = camera / "data.csv"
-    files = _listed(listing) if listing.is_file() else in_order_of_time(images_in(place.pictures))
+    if listing.is_file():
+        files = listed(listing, _row, "nanoseconds and a file", between=",")
+    else:
+        files = in_order_of_time(images_in(place.pictures))
     name = f"{place.folder.resolve().name}-{camera.name}"
     found = _description(camera)
     if found is None:
@@ -57,7 +61,7 @@ def open_posed_asl(place: Place) -> PosedSet:
     """Read the images of one camera with its poses."""
     above = place.pictures.parent.parent
     files = [above / name / "data.csv" for name in _TRUTHS]
-    truth = next((file for file in files if file.is_file()), None)
+    truth = first_file(files)
     if truth is None:
         raise InputError(
             f"{place.folder} holds no true poses: there is neither {files[0]} nor "
@@ -110,7 +114,7 @@ def _body_from_camera(camera: Path) -> Float64[np.ndarray, "4 4"]:
 def _description(camera: Path) -> tuple[Path, dict[str, Any]] | None:
     """The file that describes a camera, and what it says."""
     chain = camera.parent.parent / "dso" / "camchain.yaml"
-    file = next((p for p in (camera / "sensor.yaml", chain) if p.is_file()), None)
+    file = first_file((camera / "sensor.yaml", chain))
     if file is None:
         return None
     try:
@@ -119,16 +123,9 @@ def _description(camera: Path) -> tuple[Path, dict[str, Any]] | None:
         raise InputError(f"{file} describes no camera that can be understood.") from None
 
 
-def _listed(listing: Path) -> list[ImageFile]:
-    """The images of rows such as ``1403636579763555584,1403636579763555584.png``."""
-    files = []
-    for number, line in enumerate(read_text(listing).splitlines(), start=1):
-        words = [word.strip() for word in line.split("#", 1)[0].split(",")]
-        if words == [""]:
-            continue
-        if len(words) != 2 or not re.fullmatch(r"[0-9]{1,20}", words[0]) or not words[1]:
-            raise InputError(f"{listing}, line {number}: expected nanoseconds and a file.")
-        files.append(ImageFile(listing.parent / "data" / words[1], int(words[0]) * _NANOSECONDS))
-    if not files:
-        raise InputError(f"{listing} lists no images.")
-    return sorted(files, key=lambda file: file.timestamp)
+def _row(folder: Path, words: list[str]) -> ImageFile:
+    """An image of a row such as ``1403636579763555584,1403636579763555584.png``."""
+    time, name = words
+    if not re.fullmatch(r"[0-9]{1,20}", time) or not name:
+        raise ValueError
+    return ImageFile(folder / "data" / name, int(time) * _NANOSECONDS)

@@ -11,12 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there
+from geogs.io.sources.formats.image_files import (
+    ImageFile,
+    ImageList,
+    depths_there,
+    finite,
+    listed,
+)
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.formats.tum import PER_METRE, known_camera
 from geogs.io.sources.known_intrinsics import find_calibration
@@ -40,7 +45,8 @@ def is_associated(folder: Path) -> bool:
 
 def open_associated(folder: Path) -> ImageList:
     """Read a sequence; frames that are counted are a thirtieth of a second apart."""
-    files, fault = depths_there(_read_list(folder / LISTING), folder / LISTING)
+    listing = folder / LISTING
+    files, fault = depths_there(listed(listing, _row, "a time and a file, twice"), listing)
     name = folder.resolve().name
     counted = all(f.timestamp == int(f.timestamp) for f in files) and _is_counted(files)
     if counted:
@@ -82,25 +88,10 @@ def _is_counted(files: list[ImageFile]) -> bool:
     return all(f.path.stem == str(int(f.timestamp)) for f in files)
 
 
-def _read_list(listing: Path) -> list[ImageFile]:
-    """Rows with the time and file of a depth and an image, in any order of the two."""
-    files = []
-    for number, line in enumerate(read_text(listing).splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        try:
-            first, a, second, b = float(words[0]), words[1], float(words[2]), words[3]
-            if len(words) != 4 or not np.isfinite([first, second]).all():
-                raise ValueError
-        except (ValueError, IndexError):
-            raise InputError(
-                f"{listing}, line {number}: expected a time and a file, twice."
-            ) from None
-        is_depth_first = "depth" in Path(a).parts
-        time, image, depth = (second, b, a) if is_depth_first else (first, a, b)
-        beside = DepthFile(listing.parent / depth, PER_METRE)
-        files.append(ImageFile(listing.parent / image, time, beside))
-    if not files:
-        raise InputError(f"{listing} lists no images.")
-    return sorted(files, key=lambda file: file.timestamp)
+def _row(folder: Path, words: list[str]) -> ImageFile:
+    """An image with its depth, of a row with the time and file of both, in any order."""
+    one, a, other, b = words
+    first, second = finite(one), finite(other)
+    is_depth_first = "depth" in Path(a).parts
+    time, image, depth = (second, b, a) if is_depth_first else (first, a, b)
+    return ImageFile(folder / image, time, DepthFile(folder / depth, PER_METRE))

@@ -1,17 +1,19 @@
 """Images as files: a folder of photographs or frames, and the list that the data sets share."""
 
 import logging
+import math
 import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.io.pictures import decoded, upright_size
 from geogs.io.pose_files import FRAMES_PER_SECOND
@@ -148,6 +150,45 @@ def depths_there(files: Sequence[ImageFile], listing: Path) -> tuple[list[ImageF
     return kept, ""
 
 
+def listed(
+    listing: Path,
+    read: Callable[[Path, list[str]], ImageFile],
+    expected: str,
+    between: str | None = None,
+) -> list[ImageFile]:
+    """Images of a list in order of time; in its rows ``#`` begins a comment.
+
+    Args:
+        listing: the file.
+        read: an image of the list's folder and the words of a row. Raises ValueError.
+        expected: what a row has to hold, for the sentence.
+        between: what stands between words; white space if none.
+
+    Raises:
+        InputError: a row holds something else, or there is none.
+    """
+    files = []
+    for number, line in enumerate(read_text(listing).splitlines(), start=1):
+        row = line.split("#", 1)[0].strip()
+        if not row:
+            continue
+        try:
+            files.append(read(listing.parent, [word.strip() for word in row.split(between)]))
+        except ValueError:
+            raise InputError(f"{listing}, line {number}: expected {expected}.") from None
+    if not files:
+        raise InputError(f"{listing} lists no images.")
+    return sorted(files, key=lambda file: file.timestamp)
+
+
+def finite(word: str) -> float:
+    """The number that a word is. Raises ValueError if it is none, or not finite."""
+    number = float(word)
+    if not math.isfinite(number):
+        raise ValueError
+    return number
+
+
 def usual_file(files: Sequence[ImageFile]) -> ImageFile:
     """The first of those images, from all over the list, that have the most frequent size; the
     first of all if none can be read."""
@@ -240,12 +281,6 @@ def _folder_with_images(folder: Path) -> Path:
         f"{folder} holds no images ({', '.join(sorted(SUFFIXES))}) and is no data set known here; "
         f"give a video, a folder of images, or a sequence of a data set as it was unpacked."
     )
-
-
-def numbered(folder: Path, pattern: re.Pattern[str]) -> list[tuple[int, Path]]:
-    """Files by the number that a pattern finds in their names, ascending."""
-    matches = ((pattern.fullmatch(path.name), path) for path in folder.iterdir())
-    return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def file_names(folder: Path) -> list[str]:

@@ -9,23 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import UNUSABLE
+from geogs.documents import UNUSABLE, first_file
 from geogs.errors import InputError
-from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
+from geogs.io.pose_files import is_rigid, matrix_trajectory, numbered, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_camera, kitti_offset
-from geogs.io.sources.formats.image_files import (
-    ImageFile,
-    ImageList,
-    Place,
-    images_in,
-)
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, Place, images_in
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory
 
 ODOMETRY = ("image_2", "image_0", "image_3", "image_1")
 """Folders of images, those of the left colour camera first."""
+_NAME = re.compile(r"([0-9]{1,12})\.\w+")
 _FRAMES_PER_SECOND = 10.0
 """Of the data set, where the file of times is missing."""
 
@@ -46,7 +42,7 @@ def open_posed_kitti_odometry(place: Place) -> PosedSet:
     folder = place.folder.resolve()
     name = f"{folder.name}.txt"
     above = (folder, folder.parent, folder.parent / "poses", folder.parent.parent / "poses")
-    file = next((place / name for place in above if (place / name).is_file()), None)
+    file = first_file(place / name for place in above)
     if file is None:
         raise InputError(
             f"{folder} is a sequence of KITTI without true poses: {name} is in none of "
@@ -100,21 +96,17 @@ def timed(pictures: Path, times: np.ndarray | None, listing: Path) -> list[Image
     Raises:
         InputError: there are no numbered images, or more than times.
     """
-    numbered = sorted((int(p.stem), p) for p in images_in(pictures) if _is_number(p.stem))
-    if not numbered:
+    images = numbered(images_in(pictures), _NAME)
+    if not images:
         raise InputError(f"{pictures} holds no images that are numbered, such as 000000.png.")
     if times is None:
-        return [ImageFile(path, k / _FRAMES_PER_SECOND) for k, path in numbered]
-    if numbered[-1][0] >= len(times):
+        return [ImageFile(path, k / _FRAMES_PER_SECOND) for k, path in images]
+    if images[-1][0] >= len(times):
         raise InputError(
             f"{listing} has {len(times)} times, but the images are numbered up to "
-            f"{numbered[-1][0]}; copy it again."
+            f"{images[-1][0]}; copy it again."
         )
-    return [ImageFile(path, float(times[k])) for k, path in numbered]
-
-
-def _is_number(stem: str) -> bool:
-    return re.fullmatch(r"[0-9]{1,12}", stem) is not None
+    return [ImageFile(path, float(times[k])) for k, path in images]
 
 
 def _seconds(listing: Path) -> np.ndarray:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import read_text
+from geogs.documents import first_file, read_text
 from geogs.errors import InputError
 from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
@@ -123,8 +123,7 @@ def _motion(R: list[float], t: list[float], file: Path) -> Float64[np.ndarray, "
 
 def _above(folder: Path, name: str) -> Path | None:
     """A file of a drive or of its day; none if neither has it."""
-    places = (folder, folder.resolve().parent)
-    return next((place / name for place in places if (place / name).is_file()), None)
+    return first_file((folder / name, folder.resolve().parent / name))
 
 
 def _dates(listing: Path) -> np.ndarray:

@@ -10,10 +10,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+from geogs.documents import first_file
 from geogs.errors import InputError
+from geogs.io.pose_files import numbered
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
-from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.depth_files import depth_beside
 from geogs.io.sources.formats.colmap import is_model, open_colmap
 from geogs.io.sources.formats.image_files import (
     ImageFile,
@@ -37,8 +39,7 @@ SCANNETPP = tuple(name for name in _MODELS if name.startswith(("iphone", "dslr")
 ETH3D = tuple(name for name in _MODELS if name.startswith("images"))
 _PHONE_CAMERA = "pose_intrinsic_imu.json"
 _PHONE_FRAMES_PER_SECOND = 60.0
-_PER_METRE = 1000.0
-_FRAME = re.compile(r"frame_(\d{1,9})")
+_FRAME = re.compile(r"frame_(\d{1,9})\.\w+")
 
 
 def is_eth3d(folder: Path) -> bool:
@@ -84,21 +85,16 @@ def _model(place: Place) -> Path:
 
 def _files(place: Place) -> list[ImageFile]:
     paths = images_in(place.pictures)
-    numbers = {path: int(m[1]) for path in paths if (m := _FRAME.fullmatch(path.stem))}
-    if len(numbers) < len(paths):
+    frames = numbered(paths, _FRAME)
+    if len(frames) < len(paths):
         return in_order_of_time(paths)
     depths = place.pictures.parent / "depth"
     return [
-        ImageFile(path, k / _PHONE_FRAMES_PER_SECOND, _depth(depths / f"{path.stem}.png"))
-        for path, k in sorted(numbers.items(), key=lambda item: item[1])
+        ImageFile(path, k / _PHONE_FRAMES_PER_SECOND, depth_beside(depths / f"{path.stem}.png"))
+        for k, path in frames
     ]
 
 
-def _depth(path: Path) -> DepthFile | None:
-    return DepthFile(path, _PER_METRE) if path.is_file() else None
-
-
 def _camera(place: Place) -> Calibration | None:
-    files = (_model(place) / "cameras.txt", place.pictures.parent / _PHONE_CAMERA)
-    file = next((file for file in files if file.is_file()), None)
+    file = first_file((_model(place) / "cameras.txt", place.pictures.parent / _PHONE_CAMERA))
     return None if file is None else read_calibration(file)

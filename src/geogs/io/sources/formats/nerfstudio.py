@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.documents import UNUSABLE, read_json
+from geogs.documents import UNUSABLE, first_file, read_json
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
@@ -23,8 +23,10 @@ from geogs.io.sources.pose_priors import measured_pose, rigid
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 from geogs.io.sources.posed.stored_pictures import has_alpha, stored_size
 
-_FILES = ("transforms.json", "transforms_train.json", "nerfstudio/transforms.json")
-_FILES_BELOW = ("iphone/nerfstudio/transforms.json",)
+_FILES = (
+    "transforms.json", "transforms_train.json", "nerfstudio/transforms.json",
+    "iphone/nerfstudio/transforms.json",
+)  # fmt: skip
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 
@@ -32,8 +34,7 @@ def find_transforms(path: Path) -> Path | None:
     """The file of a project folder, or none; ``path`` may be the file."""
     if path.is_file():
         return path if path.suffix == ".json" else None
-    places = (path / name for name in _FILES + _FILES_BELOW)
-    return next((place for place in places if place.is_file()), None)
+    return first_file(path / name for name in _FILES)
 
 
 def open_nerfstudio(path: Path) -> PosedSet:
@@ -156,9 +157,5 @@ def _image(file: Path, name: str) -> Path:
     """
     beside = file.parent.parent
     bases = (file.parent, file.parent / "images", beside / "rgb", beside / "images")
-    for base in bases:
-        for suffix in _SUFFIXES:
-            path = base / f"{name}{suffix}"
-            if path.is_file():
-                return path
-    return file.parent / name
+    found = first_file(base / f"{name}{suffix}" for base in bases for suffix in _SUFFIXES)
+    return found or file.parent / name

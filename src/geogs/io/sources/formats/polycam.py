@@ -9,11 +9,10 @@ from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.depth_files import DepthFile, depth_beside
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_key
 from geogs.io.sources.pose_priors import measured_pose, rigid
 
-_PER_METRE = 1000.0
 _DIGITS, _LEAST_GAP = 18, 1e-3
 """Of a time in microseconds, at most; and seconds from one keyframe to the next, at least."""
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
@@ -87,7 +86,4 @@ def _times(names: list[str]) -> dict[str, float]:
 
 def _depth(keyframes: Path, name: str) -> DepthFile | None:
     path, confidence = (keyframes / kind / f"{name}.png" for kind in ("depth", "confidence"))
-    if not path.is_file():
-        return None
-    # 0, 127 and 255 are low, medium and high.
-    return DepthFile(path, _PER_METRE, confidence=confidence if confidence.is_file() else None)
+    return depth_beside(path, confidence)  # of which 0, 127 and 255 are low, medium and high

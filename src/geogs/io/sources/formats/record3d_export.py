@@ -7,7 +7,7 @@ from pathlib import Path
 
 from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.pose_files import FRAMES_PER_SECOND, numbered
 from geogs.io.sources.data_set_cameras import record3d_camera
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in
 from geogs.io.sources.formats.record3d import measured_poses
@@ -42,12 +42,12 @@ def open_record3d_export(folder: Path) -> ImageList:
             raise ValueError(f"{fps} frames a second")
     except UNUSABLE:
         raise InputError(f"{folder / METADATA} cannot be understood; export it again.") from None
-    pictures = {int(p.stem): p for p in images_in(folder / "rgb") if p.stem.isdecimal()}
+    pictures = dict(numbered(images_in(folder / "rgb")))
     if not pictures:
         raise InputError(f"{folder / 'rgb'} holds no numbered pictures; export it again.")
     files = [
         ImageFile(path, times[k] if k < len(times) else k / fps, pose=poses.get(k))
-        for k, path in sorted(pictures.items())
+        for k, path in pictures.items()
     ]
     has_depth = next((folder / "depth").glob("*.exr"), None) is not None
     fault = "depth in EXR is not read; Record3D's .r3d of the same recording has it, too"

@@ -13,11 +13,11 @@ import numpy as np
 
 from geogs.documents import read_json
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND, read_replica_trajectory
+from geogs.io.pose_files import FRAMES_PER_SECOND, numbered, read_replica_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, file_names, numbered
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, file_names
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 
 _NAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
@@ -40,7 +40,7 @@ def open_replica(folder: Path) -> ImageList:
     per_metre, there = _units_per_metre(scene), {*file_names(results)}
     files = [
         ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, per_metre, there))
-        for k, path in numbered(results, _NAME)
+        for k, path in numbered(results.iterdir(), _NAME)
     ]
     reader = ImageList("replica", scene.name, files, None)
     info = reader.info

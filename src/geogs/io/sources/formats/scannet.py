@@ -7,14 +7,12 @@ from jaxtyping import Float64
 
 from geogs.documents import read_text
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.pose_files import FRAMES_PER_SECOND, numbered
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import SUFFIXES, ImageFile, ImageList
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
-
-_PER_METRE = 1000.0
 
 
 def is_scannet(folder: Path) -> bool:
@@ -25,15 +23,8 @@ def is_scannet(folder: Path) -> bool:
 
 def open_scannet(folder: Path) -> ImageList:
     """Read a scene; image k is at k / 30 s. Depth has been registered to colour."""
-    depths = {int(p.stem): p for p in (folder / "depth").glob("*.png") if p.stem.isdecimal()}
-    files = [
-        ImageFile(
-            path,
-            k / FRAMES_PER_SECOND,
-            DepthFile(depths[k], _PER_METRE) if k in depths else None,
-        )
-        for k, path in _images(folder)
-    ]
+    depths = {k: DepthFile(path) for k, path in numbered((folder / "depth").glob("*.png"))}
+    files = [ImageFile(path, k / FRAMES_PER_SECOND, depths.get(k)) for k, path in _images(folder)]
     return ImageList("scannet", folder.resolve().name, files, _calibration(folder))
 
 
@@ -45,7 +36,7 @@ def is_posed_scannet(folder: Path) -> bool:
 def open_posed_scannet(folder: Path) -> PosedSet:
     """Read a scene; names count as numbers, padded with zeros or not."""
     calibration = _calibration(folder)
-    poses = {int(p.stem): p for p in (folder / "pose").glob("*.txt") if p.stem.isdecimal()}
+    poses = dict(numbered((folder / "pose").glob("*.txt")))
     files = tuple(
         PosedFile(path, _read_pose(poses[k]), calibration, None, k / FRAMES_PER_SECOND)
         for k, path in _images(folder)
@@ -75,8 +66,4 @@ def _calibration(folder: Path) -> Calibration | None:
 
 def _images(folder: Path) -> list[tuple[int, Path]]:
     """The images of a scene by their numbers, padded with zeros or not."""
-    return sorted(
-        (int(path.stem), path)
-        for path in (folder / "color").iterdir()
-        if path.stem.isdecimal() and path.suffix.lower() in SUFFIXES
-    )
+    return numbered(images_in(folder / "color"))

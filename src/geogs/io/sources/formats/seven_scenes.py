@@ -12,10 +12,10 @@ import numpy as np
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.pose_files import FRAMES_PER_SECOND, read_seven_scenes_poses
+from geogs.io.pose_files import FRAMES_PER_SECOND, numbered, read_seven_scenes_poses
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthCamera, DepthFile
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, file_names, numbered
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, file_names
 from geogs.io.sources.known_intrinsics import find_calibration
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 
@@ -25,7 +25,6 @@ _CAMERA = Calibration(
     525.0, 525.0, 320.0, 240.0, width=640, height=480,
     origin="the 7-Scenes colour camera, nominal", is_nominal=True,
 )  # fmt: skip
-_PER_METRE = 1000.0
 COLOUR_FROM_DEPTH = (-0.025, 0.0, 0.0)
 """Metres: X_colour = X_depth + this. Both cameras of the Kinect look the same way, side by side;
 the data set neither registers depth to colour nor publishes where they are."""
@@ -49,7 +48,7 @@ def open_seven_scenes(folder: Path) -> ImageList:
     there = {*file_names(sequence)}
     files = [
         ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, there))
-        for k, path in numbered(sequence, _NAME)
+        for k, path in numbered(sequence.iterdir(), _NAME)
     ]
     calibration = find_calibration(sequence, sequence.parent) or _CAMERA
     return ImageList("7scenes", f"{sequence.parent.name}-{sequence.name}", files, calibration)
@@ -86,7 +85,7 @@ def open_posed_seven_scenes(folder: Path) -> PosedSet:
 
 def _depth(image: Path, there: Container[str]) -> DepthFile | None:
     path = image.with_name(image.name.split(".")[0] + ".depth.png")
-    return DepthFile(path, _PER_METRE, _SENSOR) if path.name in there else None
+    return DepthFile(path, sensor=_SENSOR) if path.name in there else None
 
 
 def _sequences(folder: Path) -> list[Path]:

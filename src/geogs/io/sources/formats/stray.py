@@ -11,7 +11,7 @@ import numpy as np
 
 from geogs.documents import read_text
 from geogs.errors import InputError
-from geogs.io.pose_files import poses_from
+from geogs.io.pose_files import numbered, poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.video_file import VideoFile
@@ -19,7 +19,6 @@ from geogs.io.sources.pose_priors import measured_pose, rigid, turned_upright
 from geogs.io.sources.reader import RawFrame
 from geogs.types import MeasuredPose
 
-_PER_METRE = 1000.0
 _COLUMNS = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -37,9 +36,9 @@ class StrayRecording(VideoFile):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder / "rgb.mp4")
-        found = (p for p in (folder / "depth").glob("*.png") if p.stem.isdecimal())
         turns = self.info.quarter_turns
-        self._depths = {int(path.stem): _depth(folder, path, turns) for path in found}
+        depths = numbered((folder / "depth").glob("*.png"))
+        self._depths = {number: _depth(folder, path, turns) for number, path in depths}
         matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
         stored = (self.info.width, self.info.height)[:: -1 if turns % 2 else 1]
         self._poses = _poses(odometry, turns) if odometry.is_file() else {}
@@ -64,7 +63,7 @@ class StrayRecording(VideoFile):
 def _depth(folder: Path, path: Path, quarter_turns: int) -> DepthFile:
     confidence = folder / "confidence" / path.name
     known = confidence if confidence.is_file() else None
-    return DepthFile(path, _PER_METRE, confidence=known, quarter_turns=quarter_turns)
+    return DepthFile(path, confidence=known, quarter_turns=quarter_turns)
 
 
 def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:

@@ -12,14 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND, quaternion_trajectory, read_rows
+from geogs.io.pose_files import FRAMES_PER_SECOND, numbered, quaternion_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.formats.image_files import (
-    ImageFile,
-    ImageList,
-    Place,
-    images_in,
-)
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, Place, images_in
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.posed.posed_set import PosedSet
 from geogs.types import Trajectory
@@ -31,16 +26,15 @@ PICTURES = (
 )  # fmt: skip
 """Folders of images, one for each camera."""
 _OPENCV_FROM_NED = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-_NUMBER = re.compile(r"([0-9]{1,12})_\w+")
+_NAME = re.compile(r"([0-9]{1,12})_\w+\.\w+")
 
 
 def open_tartanair(place: Place) -> ImageList:
     """Read the images of one camera; image k is at k / 30 s, for there are no times."""
-    found = ((_NUMBER.fullmatch(path.stem), path) for path in images_in(place.pictures))
-    numbered = sorted((int(match[1]), path) for match, path in found if match)
-    if not numbered:
+    pictures = numbered(images_in(place.pictures), _NAME)
+    if not pictures:
         raise InputError(f"{place.pictures} holds no images such as 000000_left.png.")
-    files = [ImageFile(path, k / FRAMES_PER_SECOND) for k, path in numbered]
+    files = [ImageFile(path, k / FRAMES_PER_SECOND) for k, path in pictures]
     name = "-".join(place.folder.resolve().parts[1:][-3:])  # the place, the level, the path
     images = ImageList("tartanair", name, files, None)
     width, height = images.info.width, images.info.height

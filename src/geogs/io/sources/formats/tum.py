@@ -4,18 +4,21 @@
 and ETH3D's SLAM sequences (with ``calibration.txt``) lie likewise.
 """
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_text
-from geogs.errors import InputError
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there
+from geogs.io.sources.formats.image_files import (
+    ImageFile,
+    ImageList,
+    depths_there,
+    finite,
+    listed,
+)
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.known_intrinsics import find_calibration
 from geogs.io.sources.posed.posed_set import PosedSet
@@ -88,21 +91,12 @@ def _with_depths(folder: Path, files: list[ImageFile]) -> tuple[list[ImageFile],
 
 
 def _read_list(listing: Path) -> list[ImageFile]:
-    lines, files = read_text(listing).splitlines(), []
-    for number, line in enumerate(lines, start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        try:
-            time, image = float(words[0]), words[1]
-            if len(words) != 2 or not math.isfinite(time):
-                raise ValueError
-            files.append(ImageFile(listing.parent / image, time))
-        except (ValueError, IndexError):
-            raise InputError(f"{listing}, line {number}: expected a time and a file.") from None
-    if not files:
-        raise InputError(f"{listing} lists no images.")
-    return sorted(files, key=lambda file: file.timestamp)
+    return listed(listing, _row, "a time and a file")
+
+
+def _row(folder: Path, words: list[str]) -> ImageFile:
+    time, name = words
+    return ImageFile(folder / name, finite(time))
 
 
 def is_posed_tum(folder: Path) -> bool:
