@@ -8,7 +8,7 @@ import torch
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.given_pose import as_pose
-from geogs.types import Frame, MeasuredPose
+from geogs.types import Frame
 
 
 def input_frame(
@@ -30,7 +30,10 @@ def input_frame(
     Raises InputError if the image cannot be used.
     """
     if isinstance(image, Frame):
-        return image if image.pose is None else _with_pose_checked(image, image.pose)
+        pose = image.pose
+        return (
+            image if pose is None else replace(image, pose=replace(pose, T_cw=as_pose(pose.T_cw)))
+        )
     if isinstance(image, torch.Tensor):
         image = image.cpu().numpy()
     if timestamp is None:
@@ -46,10 +49,6 @@ def input_frame(
             "increase."
         )
     return Frame(index, seconds, image)
-
-
-def _with_pose_checked(frame: Frame, pose: MeasuredPose) -> Frame:
-    return replace(frame, pose=MeasuredPose(as_pose(pose.T_cw), pose.world))
 
 
 def check_image(image: object, camera: Camera) -> None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geogs.errors import InputError
-from geogs.io.decoder_noise import decoder_noise
 from geogs.io.pictures import header_read
 from geogs.io.sources.formats.image_files import SUFFIXES, image_folder, natural_key
 
@@ -88,7 +87,7 @@ def _name(path: Path, root: Path) -> str:
 def _photograph(path: Path, root: Path) -> Photograph | None:
     """A picture with what its header says; none where it is damaged."""
     try:
-        with decoder_noise(), header_read(path) as picture:
+        with header_read(path) as picture:
             width, height = picture.size
             base = picture.getexif()
             exif = base.get_ifd(_EXIF_IFD)

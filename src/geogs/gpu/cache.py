@@ -25,7 +25,7 @@ def cache_folder() -> Path:
     """``$GEOGS_CACHE``, else geogs in the user's cache directory."""
     if chosen := os.environ.get("GEOGS_CACHE"):
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    base = os.environ.get("XDG_CACHE_HOME")
     home = os.path.expanduser("~")
     if not base and not os.path.isabs(home):  # nobody knows this user
         return Path(tempfile.gettempdir()) / f"geogs-{os.getuid()}"

@@ -4,7 +4,6 @@ import ctypes
 import functools
 import glob
 import importlib.util
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,13 +77,13 @@ def load_nvrtc(cuda_major: str) -> Nvrtc:
 
 def _candidates(cuda_major: str) -> list[str]:
     """Copies in Python packages first, then those of an installed toolkit."""
-    name = f"libnvrtc.so.{cuda_major}" if os.name == "posix" else f"nvrtc64_{cuda_major}0_0.dll"
+    name = f"libnvrtc.so.{cuda_major}"
     folders = [Path(p) / "nvidia" for p in sys.path if p]
     spec = importlib.util.find_spec("torch")
     if spec is not None and spec.origin is not None:
         folders += [Path(spec.origin).parents[1] / "nvidia", Path(spec.origin).parent / "lib"]
     # Only where packages have it: a walk through all that NVIDIA's hold takes seconds.
-    places = [place + name for place in ("", "*/lib/", "*/bin/", "*/bin/*/")]
+    places = [name, f"*/lib/{name}"]
     found = [str(p) for f in folders for place in places for p in sorted(f.glob(place))]
     return list(dict.fromkeys(found + sorted(glob.glob(f"/usr/local/cuda*/lib64/{name}"))))
 

@@ -86,10 +86,8 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
     """
     from PIL import Image
 
-    if not path.is_file():
-        return None
     try:
-        with decoder_noise(), header_read(path) as picture:
+        with header_read(path) as picture:
             return picture.size, picture.mode
     except Image.DecompressionBombError:
         raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
@@ -99,10 +97,8 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
 
 def upright_size(path: Path) -> tuple[int, int] | None:
     """Width and height as :func:`decoded` turns it; none where there is no picture."""
-    if not path.is_file():
-        return None
     try:
-        with decoder_noise(), header_read(path) as picture:
+        with header_read(path) as picture:
             is_turned = picture.getexif().get(_ORIENTATION) in _QUARTER_TURNED
             return picture.size[::-1] if is_turned else picture.size
     except Exception:  # whatever a damaged file makes one of its many readers stumble over
@@ -111,13 +107,14 @@ def upright_size(path: Path) -> tuple[int, int] | None:
 
 @contextmanager
 def header_read(path: Path) -> Iterator[Any]:
-    """A picture of which Pillow has read no more than the header, and warns of nothing.
+    """A picture of which Pillow has read no more than the header, in silence.
 
     What a damaged file makes one of its many readers stumble over is raised, whatever it is.
     """
     from PIL import Image
 
     with (
+        decoder_noise(),
         open_file(path) as stream,
         warnings.catch_warnings(action="ignore"),
         Image.open(stream) as picture,

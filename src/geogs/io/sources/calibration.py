@@ -201,8 +201,7 @@ class Calibration:
 
     def _check_plausible(self, camera: Camera) -> None:
         """Raises InputError for a focal length that no camera of such images has."""
-        edge = max(camera.width, camera.height)
-        least, most = _LEAST_FOCAL * edge, _MOST_FOCAL * edge
+        least, most = _LEAST_FOCAL * camera.long_edge, _MOST_FOCAL * camera.long_edge
         squeeze = max(camera.fx / camera.fy, camera.fy / camera.fx)
         if not all(least <= focal <= most for focal in (camera.fx, camera.fy)) or squeeze > 4:
             raise InputError(

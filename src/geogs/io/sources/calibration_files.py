@@ -42,10 +42,7 @@ _COLMAP_MODELS: dict[str, tuple[int | None, ...]] = {
     "RADIAL": (0, 0, 1, 2, 3, 4, None, None),
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
-}
-
-# Of those that are a fisheye's: fx, fy, cx, cy and k1, k2, k3, k4.
-_COLMAP_FISHEYES: dict[str, tuple[int | None, ...]] = {
+    # fx, fy, cx, cy and k1, k2, k3, k4
     "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2, 3, None, None, None),
     "RADIAL_FISHEYE": (0, 0, 1, 2, 3, 4, None, None),
     "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),
@@ -208,22 +205,19 @@ def calibration_from_colmap(
     Raises:
         InputError: the camera model is not supported.
     """
-    is_fisheye = model in _COLMAP_FISHEYES
-    models = _COLMAP_FISHEYES if is_fisheye else _COLMAP_MODELS
-    if not is_fisheye:
+    if model not in _COLMAP_MODELS:
         _refuse_others(model, origin)
-    if model not in models:
         raise InputError(
             f"{origin} describes a camera of a model that is not supported; undistort the images "
             f"with COLMAP's image_undistorter first."
         )
     fx, fy, cx, cy, *distortion = (
-        0.0 if index is None else float(parameters[index]) for index in models[model]
+        0.0 if index is None else float(parameters[index]) for index in _COLMAP_MODELS[model]
     )
     return Calibration(
         fx, fy, cx - 0.5, cy - 0.5,
         distortion=tuple(distortion), width=width, height=height, origin=origin,
-        lens="fisheye" if is_fisheye else "polynomial",
+        lens="fisheye" if model.endswith("FISHEYE") else "polynomial",
     )  # fmt: skip
 
 

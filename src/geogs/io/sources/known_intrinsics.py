@@ -5,8 +5,8 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+from geogs.documents import first_file
 from geogs.errors import InputError
-from geogs.io.decoder_noise import decoder_noise
 from geogs.io.pictures import header_read
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_words, read_calibration
@@ -68,11 +68,8 @@ def guess_calibration(width: int, height: int) -> Calibration:
 
 def find_calibration(*folders: Path) -> Calibration | None:
     """Read the first calibration file of a known name in ``folders``, if there is one."""
-    for folder in folders:
-        for name in _FILES:
-            if (folder / name).is_file():
-                return read_calibration(folder / name)
-    return None
+    file = first_file(folder / name for folder in folders for name in _FILES)
+    return None if file is None else read_calibration(file)
 
 
 def calibration_from_exif(image: Path) -> Calibration | None:
@@ -81,7 +78,7 @@ def calibration_from_exif(image: Path) -> Calibration | None:
     The equivalent compares diagonals (CIPA DCG-001): f / 43.27 mm is focal length by diagonal.
     """
     try:
-        with decoder_noise(), header_read(image) as photograph:
+        with header_read(image) as photograph:
             exif: Mapping[int, object] = photograph.getexif().get_ifd(_EXIF_IFD)
             width, height = photograph.size
     except Exception:  # whatever damaged EXIF makes its reader stumble over

@@ -52,17 +52,18 @@ def measured_pose(T_wc: Float64[np.ndarray, "4 4"]) -> MeasuredPose:
     return MeasuredPose(se3_inverse(torch.from_numpy(np.ascontiguousarray(T_wc))))
 
 
-def rigid(T_wc: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"] | None:
-    """The pose with the nearest rotation; none where it is no rigid motion."""
+def rigid_pose(T_wc: Float64[np.ndarray, "4 4"], quarter_turns: int = 0) -> MeasuredPose | None:
+    """A pose from camera to world, OpenCV axes, metres, with the nearest rotation; none where it is
+    no rigid motion. Its images were turned upright by clockwise ``quarter_turns``."""
     R = T_wc[:3, :3]
     if not np.isfinite(T_wc).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.02:
         return None
     u, _, vt = np.linalg.svd(R)
     if np.linalg.det(u @ vt) < 0:
         return None
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = u @ vt, T_wc[:3, 3]
-    return out
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = u @ vt, T_wc[:3, 3]
+    return measured_pose(turned_upright(rigid, quarter_turns) if quarter_turns else rigid)
 
 
 def turned_upright(

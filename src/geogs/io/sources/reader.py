@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
+from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.threads import ordered_map
 from geogs.types import MeasuredDepth, MeasuredPose, SeenRows
@@ -119,6 +120,12 @@ def of_one_size(raw: RawFrame, info: RecordingInfo) -> RawFrame:
         return raw
     sizes = f"{width}x{height} but the others are {info.width}x{info.height}"
     return replace(raw, image=None, why_not=f"is {sizes}")
+
+
+def median_rate(steps: Float64[np.ndarray, "n"]) -> float:
+    """Images a second by the seconds from each to the next; nominal where none is above 0."""
+    steps = steps[steps > 0]
+    return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
 
 
 def read_ahead(items: Iterator[T]) -> Iterator[T]:

@@ -2,14 +2,14 @@
 
 import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -21,6 +21,24 @@ FieldOfView = float | Literal["auto"]
 """Degrees along the longer side of the working image."""
 FISHEYE_VIEW = 90.0
 """Degrees that are kept of a fisheye where nobody asks for others; a pinhole stretches more."""
+
+
+def resized_to(
+    size: tuple[int, int], image: UInt8[np.ndarray, "h w *c"]
+) -> UInt8[np.ndarray, "h2 w2 *c"]:
+    """An image at a width and height; itself where it has these."""
+    if image.shape[1::-1] == size:
+        return image
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def mask_as_image(
+    way: Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h2 w2 3"]],
+    mask: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h2 w2"]:
+    """A mask that goes the way of an image."""
+    grey = np.where(mask, np.uint8(255), np.uint8(0))
+    return way(np.repeat(grey[..., None], 3, 2))[..., 0] > 127
 
 
 class Rectifier:
@@ -46,7 +64,7 @@ class Rectifier:
         source = calibration.camera()
         distortion = calibration.distortion if calibration.is_distorted else ()
         self._distortion, self._lens = distortion, calibration.lens
-        enlarges = long_edge <= 0 or long_edge >= max(source.width, source.height)
+        enlarges = long_edge <= 0 or long_edge >= source.long_edge
         resized = source if enlarges else source.with_long_edge(long_edge)
         self.resized_camera = resized
         """The pinhole part of the resized image, before its lens distortion is removed."""
@@ -63,7 +81,7 @@ class Rectifier:
         elif field_of_view != "auto":
             self.zoom = _zoom_to(field_of_view, bends)
         elif calibration.lens == "fisheye":
-            self.zoom = max(_focal(FISHEYE_VIEW, resized) / resized.fx, bends.least_zoom())
+            self.zoom = max(_zoom_for(FISHEYE_VIEW, resized), bends.least_zoom())
         elif distortion:
             self.zoom = max(1.0, bends.least_zoom(1.0))
         if calibration.is_distorted or self.zoom != 1:
@@ -82,9 +100,7 @@ class Rectifier:
 
     def resized(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """A source image at working size, with its distortion."""
-        if (image.shape[1], image.shape[0]) == self.size:
-            return image
-        return cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
+        return resized_to(self.size, image)
 
     def straightened(
         self,
@@ -164,10 +180,9 @@ class _Bending:
 def _zoom_to(degrees: float, bends: _Bending) -> float:
     """The factor for a field of view. Raises InputError if the lens does not see so much."""
     source = bends.source
-    zoom = _focal(degrees, source) / source.fx
+    zoom = _zoom_for(degrees, source)
     if not bends.sees(zoom) and zoom < (least := bends.least_zoom()):
-        edge = max(source.width, source.height)
-        most = 2 * math.degrees(math.atan(edge / 2 / (least * source.fx)))
+        most = 2 * math.degrees(math.atan(source.long_edge / 2 / (least * source.fx)))
         raise InputError(
             f"A straight image with a field of view of {degrees:g} degrees would show more than "
             f"the lens saw; give at most {math.floor(10 * most) / 10:g}."
@@ -175,15 +190,13 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
     return zoom
 
 
-def _focal(degrees: float, camera: Camera) -> float:
-    """Focal length of a pinhole image of the camera's size by the view along its longer side."""
-    return max(camera.width, camera.height) / 2 / math.tan(math.radians(degrees) / 2)
+def _zoom_for(degrees: float, camera: Camera) -> float:
+    """The factor on the focal length by which so much is seen along the longer side."""
+    return camera.with_field_of_view(degrees).fx / camera.fx
 
 
 def _zoomed(camera: Camera, zoom: float) -> Camera:
-    return Camera(
-        camera.fx * zoom, camera.fy * zoom, camera.cx, camera.cy, camera.width, camera.height
-    )
+    return replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
 
 
 def _border_rays(camera: Camera) -> Float[np.ndarray, "n 2"]:

@@ -30,7 +30,7 @@ from geogs.io.sources.reader import (
     read_side_by_side,
 )
 from geogs.io.sources.readout_clips import read_clips
-from geogs.io.sources.undistort import Rectifier
+from geogs.io.sources.undistort import Rectifier, mask_as_image
 from geogs.shutter.angular_motion import AngularMotion
 from geogs.shutter.clip_tracks import FollowedClips
 from geogs.shutter.neighbours import with_angular_motion
@@ -117,8 +117,7 @@ class WorkingImages:
 
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
         """A mask of an image as it came, or at working size, straightened as images are."""
-        grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
-        return self._rectifier(grey)[..., 0] > 127
+        return mask_as_image(self._rectifier, mask)
 
     @property
     def depth_found(self) -> str:

@@ -22,7 +22,7 @@ SH_DEGREE_0 = 0.28209479177387814
 
 
 @dataclass(frozen=True)
-class Element:
+class _Element:
     """A table of a PLY file: packed little-endian rows, and how the header describes a row."""
 
     name: str
@@ -43,8 +43,8 @@ def write_mesh(
     _write(
         path,
         [
-            _element("vertex", _points(vertices, colours, normals)),
-            Element("face", triangles, ["list uchar int vertex_indices"]),
+            _vertices(_points(vertices, colours, normals)),
+            _Element("face", triangles, ["list uchar int vertex_indices"]),
         ],
     )
 
@@ -56,7 +56,7 @@ def write_points(
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> None:
     """Write a point cloud as binary PLY, with RGB and normals where given."""
-    _write(path, [_element("vertex", _points(positions, colours, normals))])
+    _write(path, [_vertices(_points(positions, colours, normals))])
 
 
 def splat_scales(disks: MapSnapshot) -> Float[np.ndarray, "n 3"]:
@@ -101,13 +101,13 @@ def write_splats(
         **_columns(log_scale, scales),
         **_columns(rotation, ("rot_0", "rot_1", "rot_2", "rot_3")),
     }
-    _write(path, [_element("vertex", columns)])
+    _write(path, [_vertices(columns)])
 
 
 def _points(
     positions: Float[np.ndarray, "n 3"],
     colours: UInt8[np.ndarray, "n 3"] | None,
-    normals: Float[np.ndarray, "n 3"] | None = None,
+    normals: Float[np.ndarray, "n 3"] | None,
 ) -> dict[str, np.ndarray]:
     columns = _columns(positions, ("x", "y", "z"))
     if normals is not None:
@@ -121,15 +121,15 @@ def _columns(values: Float[np.ndarray, "n k"], names: tuple[str, ...]) -> dict[s
     return {name: values[:, i].astype("<f4") for i, name in enumerate(names)}
 
 
-def _element(name: str, columns: dict[str, np.ndarray]) -> Element:
+def _vertices(columns: dict[str, np.ndarray]) -> _Element:
     dtype = [(column, values.dtype.str) for column, values in columns.items()]
     table = np.empty(len(next(iter(columns.values()))), dtype=dtype)
     for column, values in columns.items():
         table[column] = values
-    return Element(name, table, [f"{_TYPES[dtype]} {column}" for column, dtype in dtype])
+    return _Element("vertex", table, [f"{_TYPES[dtype]} {column}" for column, dtype in dtype])
 
 
-def _write(path: str | Path, elements: list[Element]) -> None:
+def _write(path: str | Path, elements: list[_Element]) -> None:
     """Header and tables in one go."""
     header = ["ply", "format binary_little_endian 1.0"]
     for element in elements:

@@ -20,7 +20,7 @@ from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.known_intrinsics import calibration_from_exif, find_calibration
-from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.reader import RawFrame, RecordingInfo, median_rate
 from geogs.types import MeasuredPose
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -86,7 +86,7 @@ class ImageList:
         height, width = image.shape[:2]
         self.info = RecordingInfo(
             kind, name, width, height,
-            fps=_median_rate([file.timestamp for file in files]),
+            fps=median_rate(np.diff([file.timestamp for file in files])),
             length=len(files),
             calibration=calibration,
             has_depth=has_depth,
@@ -237,12 +237,6 @@ def time_from_name(stem: str) -> float | None:
     unit = _SECONDS_BY_DIGITS.get(len(stem)) if stem.isdecimal() else None
     seconds = 0.0 if unit is None else int(stem) * unit
     return seconds if seconds >= 1e9 else None  # after 2001: not just a long frame number
-
-
-def _median_rate(times: Sequence[float]) -> float:
-    steps = np.diff(times)
-    steps = steps[steps > 0]
-    return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
 
 
 def image_folder(folder: Path) -> Path | None:

@@ -19,7 +19,7 @@ from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_nerfstudio
 from geogs.io.sources.formats.image_files import ImageList, natural_key
-from geogs.io.sources.pose_priors import measured_pose, rigid
+from geogs.io.sources.pose_priors import rigid_pose
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 from geogs.io.sources.posed.stored_pictures import has_alpha, stored_size
 
@@ -62,11 +62,8 @@ def with_transforms(images: ImageList, folder: Path) -> ImageList:
     if find_transforms(folder) is None:
         return images
     posed = open_nerfstudio(folder)
-    poses = {f.path.resolve(): rigid(np.linalg.inv(_finite(f.T_cw))) for f in posed.files}
-    files = []
-    for file in images.files:
-        T_wc = poses.get(file.path.resolve())
-        files.append(replace(file, pose=None if T_wc is None else measured_pose(T_wc)))
+    poses = {f.path.resolve(): rigid_pose(np.linalg.inv(_finite(f.T_cw))) for f in posed.files}
+    files = [replace(file, pose=poses.get(file.path.resolve())) for file in images.files]
     if not any(file.pose is not None for file in files):
         return images
     said = images.info

@@ -11,7 +11,7 @@ from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile, depth_beside
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_key
-from geogs.io.sources.pose_priors import measured_pose, rigid
+from geogs.io.sources.pose_priors import rigid_pose
 
 _DIGITS, _LEAST_GAP = 18, 1e-3
 """Of a time in microseconds, at most; and seconds from one keyframe to the next, at least."""
@@ -57,13 +57,9 @@ def open_polycam(folder: Path) -> ImageList:
             lenses.append(lens)
         except UNUSABLE:
             raise InputError(f"{path} holds no camera of Polycam; export it again.") from None
-        pose = rigid(T_wc @ OPENCV_FROM_OPENGL)
-        files.append(
-            ImageFile(
-                image, times[path.stem], _depth(folder / "keyframes", path.stem),
-                None if pose is None else measured_pose(pose),
-            )
-        )  # fmt: skip
+        depth = _depth(folder / "keyframes", path.stem)
+        pose = rigid_pose(T_wc @ OPENCV_FROM_OPENGL)
+        files.append(ImageFile(image, times[path.stem], depth, pose))
     if not files:
         raise InputError(f"{folder} holds no images with cameras in keyframes/; export it again.")
     fx, fy, cx, cy, width, height = np.median(np.array(lenses), axis=0)

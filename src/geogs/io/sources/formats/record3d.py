@@ -25,7 +25,7 @@ from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL, poses_fro
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import record3d_camera
 from geogs.io.sources.depth_files import LEAST_CONFIDENCE, DepthCamera
-from geogs.io.sources.pose_priors import measured_pose, rigid
+from geogs.io.sources.pose_priors import rigid_pose
 from geogs.io.sources.reader import RawFrame, RecordingInfo
 from geogs.types import MeasuredPose
 
@@ -202,9 +202,9 @@ def measured_poses(rows: object) -> dict[int, MeasuredPose]:
         if not np.isfinite(row).all() or np.linalg.norm(row[:4]) == 0:
             continue
         (T_wc,) = poses_from(row[None, 4:], row[None, :4])
-        pose = rigid(T_wc @ OPENCV_FROM_OPENGL)
+        pose = rigid_pose(T_wc @ OPENCV_FROM_OPENGL)
         if pose is not None:
-            found[number] = measured_pose(pose)
+            found[number] = pose
     return found
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_json
+from geogs.documents import first_file, read_json
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, numbered, read_replica_trajectory
 from geogs.io.sources.calibration import Calibration
@@ -57,16 +57,18 @@ def _depth(image: Path, number: int, per_metre: float, there: Container[str]) ->
 
 def _units_per_metre(scene: Path) -> float:
     """By ``cam_params.json``, else the data set's. Raises InputError for what cannot be."""
-    for file in (scene / "cam_params.json", scene.parent / "cam_params.json"):
-        if not file.is_file():
-            continue
-        document = read_json(file)
-        camera = document.get("camera") if isinstance(document, dict) else None
-        scale = camera.get("scale", _PER_METRE) if isinstance(camera, dict) else _PER_METRE
-        if type(scale) not in (int, float) or not 0 < scale < 1e9:
-            raise InputError(f"{file}: the scale of the depths is no number above 0; correct it.")
-        return float(scale)
-    return _PER_METRE
+    file = _parameters(scene)
+    document = None if file is None else read_json(file)
+    camera = document.get("camera") if isinstance(document, dict) else None
+    scale = camera.get("scale", _PER_METRE) if isinstance(camera, dict) else _PER_METRE
+    if type(scale) not in (int, float) or not 0 < scale < 1e9:
+        raise InputError(f"{file}: the scale of the depths is no number above 0; correct it.")
+    return float(scale)
+
+
+def _parameters(scene: Path) -> Path | None:
+    """The file of the camera, beside or above the scene."""
+    return first_file((scene / "cam_params.json", scene.parent / "cam_params.json"))
 
 
 def open_posed_replica(folder: Path) -> PosedSet:
@@ -94,7 +96,7 @@ def _results(folder: Path) -> Path:
 
 
 def _find_calibration(scene: Path, width: int, height: int) -> Calibration | None:
-    for place in (scene, scene.parent):
-        if (place / "cam_params.json").is_file():
-            return read_calibration(place / "cam_params.json")
+    file = _parameters(scene)
+    if file is not None:
+        return read_calibration(file)
     return _CAMERA if (width, height) == (1200, 680) else None

@@ -15,7 +15,7 @@ from geogs.io.pose_files import numbered, poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.video_file import VideoFile
-from geogs.io.sources.pose_priors import measured_pose, rigid, turned_upright
+from geogs.io.sources.pose_priors import rigid_pose
 from geogs.io.sources.reader import RawFrame
 from geogs.types import MeasuredPose
 
@@ -82,9 +82,9 @@ def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:
         row = np.array([values])
         if not (np.isfinite(number) and np.isfinite(row[:, 3:]).all() and row[:, 3:].any()):
             continue
-        pose = rigid(poses_from(row[:, :3], row[:, 3:])[0])
+        pose = rigid_pose(poses_from(row[:, :3], row[:, 3:])[0], quarter_turns)
         if pose is not None:
-            found[int(number)] = measured_pose(turned_upright(pose, quarter_turns))
+            found[int(number)] = pose
     return found
 
 

@@ -2,6 +2,8 @@
 
 import threading
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
@@ -49,14 +51,8 @@ class LiveReader:
 def _selected(
     frames: Generator[RawFrame, None, None], start: int, stop: int | None, stride: int
 ) -> Iterator[RawFrame]:
-    try:
-        for position, frame in enumerate(frames):
-            if stop is not None and position >= stop:
-                return
-            if position >= start and (position - start) % stride == 0:
-                yield frame
-    finally:
-        frames.close()
+    with closing(frames):
+        yield from islice(frames, start, stop, stride)
 
 
 class Latest(Generic[T]):

@@ -8,6 +8,7 @@ from jaxtyping import Float64, UInt8
 
 from geogs.geometry.camera import Camera
 from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.undistort import resized_to
 
 LONG_EDGE = 640
 """Images are matched at this size at most."""
@@ -41,7 +42,7 @@ class Matcher:
     def __init__(self, source: PosedSource) -> None:
         self._source = source
         camera = source.camera
-        is_large = max(camera.width, camera.height) > LONG_EDGE
+        is_large = camera.long_edge > LONG_EDGE
         self.camera: Camera = camera.with_long_edge(LONG_EDGE) if is_large else camera
         """The camera whose pixels the matches are in."""
         # Without the precise enlargement features lie a quarter of a pixel too far right and down.
@@ -83,7 +84,7 @@ class Matcher:
 
     def _motion(self, pair: MatchedPair) -> float:
         motion = np.linalg.norm(pair.pixels_first - pair.pixels_second, axis=1)
-        return float(np.median(motion)) / max(self.camera.width, self.camera.height)
+        return float(np.median(motion)) / self.camera.long_edge
 
     def _least_turned(self, first: int) -> list[int]:
         """Two images with the least rotation; its angle is right in every axis convention."""
@@ -130,7 +131,4 @@ class Matcher:
         return self._features[index]
 
     def _scaled(self, image: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2"]:
-        size = (self.camera.width, self.camera.height)
-        if image.shape[::-1] == size:
-            return image
-        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return resized_to((self.camera.width, self.camera.height), image)

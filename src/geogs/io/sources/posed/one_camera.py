@@ -16,7 +16,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.posed.posed_set import PosedFile
 from geogs.io.sources.posed.stored_pictures import stored_size
-from geogs.io.sources.undistort import Rectifier
+from geogs.io.sources.undistort import Rectifier, mask_as_image, resized_to
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +37,10 @@ class OneCamera:
         self._files = files
         self._sizes = [_size(file) for file in files]
         keys = [(file.calibration, size) for file, size in zip(files, self._sizes, strict=True)]
-        cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
+        cameras = {
+            (known, size): resolve_intrinsics(config.intrinsics, known, *size)
+            for known, size in dict.fromkeys(keys)
+        }
         self._common = common_place(keys)
         first = cameras[keys[self._common]]
         rectifier = Rectifier(first, config.long_edge, config.field_of_view)
@@ -97,8 +100,7 @@ class OneCamera:
         way = self._ways[index]
         image = way(picture)
         if mask is not None:
-            grey = np.where(mask, np.uint8(255), np.uint8(0))
-            mask = way(np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2)))[..., 0] > 127
+            mask = mask_as_image(way, mask)
         covered = way.covered() if isinstance(way, Resampler) else None
         if covered is not None:
             mask = covered if mask is None else mask & covered
@@ -136,8 +138,7 @@ class Resampler:
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The image of the target."""
-        if (image.shape[1], image.shape[0]) != self.size:
-            image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
+        image = resized_to(self.size, image)
         return cv2.remap(image, *self._maps(), RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
 
     def covered(self) -> Bool[np.ndarray, "h w"] | None:
@@ -167,7 +168,7 @@ def _way(
 ) -> Resampler | Rectifier:
     """The way of a camera into the target; without resampling where they are the same anyway."""
     if not camera.is_distorted:
-        rectifier = Rectifier(camera, max(target.width, target.height))
+        rectifier = Rectifier(camera, target.long_edge)
         own = rectifier.camera
         is_same_size = (own.width, own.height) == (target.width, target.height)
         if is_same_size and np.abs(_corners(own, target)).max() < SAME_CAMERA:
@@ -195,10 +196,6 @@ def _view(camera: Camera) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray,
     corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     low, high = (corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     return low, high
-
-
-def _resolved(config: InputConfig, known: Calibration | None, size: tuple[int, int]) -> Calibration:
-    return resolve_intrinsics(config.intrinsics, known, *size)
 
 
 def _size(file: PosedFile) -> tuple[int, int]:

@@ -103,17 +103,16 @@ def judge(source: PosedSource, pairs: list[MatchedPair], camera: Camera) -> Pose
 
 def fit_of(T_cw: Poses, pairs: list[MatchedPair], camera: Camera) -> Fit:
     """How well poses explain matched pairs; every pair counts alike, the median one is taken."""
-    K_inverse = np.linalg.inv(camera.matrix().numpy())
+    K_inverse = np.linalg.inv(camera.K)
     errors, in_front = [], []
     for pair in pairs:
         T = T_cw[pair.second] @ np.linalg.inv(T_cw[pair.first])
         one, two = (homogeneous(p) for p in (pair.pixels_first, pair.pixels_second))
         errors.append(np.median(epipolar_distance(T, K_inverse, one, two)))
         in_front.append(in_front_of_both(T, one @ K_inverse.T, two @ K_inverse.T).mean())
-    long_edge = max(camera.width, camera.height)
-    return Fit(float(np.median(errors)) / long_edge, float(np.median(in_front)))
+    return Fit(float(np.median(errors)) / camera.long_edge, float(np.median(in_front)))
 
 
 def _words(fit: Fit, camera: Camera) -> str:
-    pixels = fit.error * max(camera.width, camera.height)
+    pixels = fit.error * camera.long_edge
     return f"{pixels:.1f} pixels off, {100 * fit.in_front:.0f} % in front of the cameras"

@@ -18,9 +18,8 @@ from geogs.documents import (
     yaml_value,
 )
 from geogs.errors import GeogsError, InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.reader import RawFrame, RecordingInfo
+from geogs.io.sources.reader import RawFrame, RecordingInfo, median_rate
 from geogs.io.sources.ros.recorded_messages import (
     CAMERA_INFO,
     COMPRESSED,
@@ -70,12 +69,13 @@ class Bag:
             connections = _connections(bag, chosen)
             length = sum(c.msgcount for c in connections)
             times = [t for _, t, _ in islice(bag.messages(connections=connections), _LOOKED_AT)]
+            fps = median_rate(np.diff(np.array(times, dtype=np.float64)) * 1e-9)
             first = _first_picture(bag, connections)
             if first is None:
                 raise InputError(f"{path}: no image on {chosen} can be read; is the bag whole?")
             (height, width), calibration = first.shape[:2], _calibration(bag, chosen)
             self.info = RecordingInfo(
-                "bag", path.resolve().name, width, height, _rate(times), length, calibration
+                "bag", path.resolve().name, width, height, fps, length, calibration
             )
 
     @property
@@ -94,9 +94,8 @@ class Bag:
         last = -np.inf
         with _opened(self._path) as bag:
             messages = bag.messages(connections=_connections(bag, self.topic))
-            for index, (connection, received, data) in enumerate(islice(messages, stop)):
-                if index < start or (index - start) % stride:
-                    continue
+            chosen = islice(enumerate(messages), start, stop, stride)
+            for index, (connection, received, data) in chosen:
                 label = f"{self.info.name}, image {index}"
                 message = _read(bag, connection, data)
                 if message is None:
@@ -246,12 +245,6 @@ def _stamp(message: Any) -> float:
     """Seconds of the header; 0 where nobody has set it."""
     stamp = message.header.stamp
     return float(stamp.sec) + float(stamp.nanosec) * 1e-9
-
-
-def _rate(nanoseconds: Sequence[int]) -> float:
-    steps = np.diff(np.array(nanoseconds, dtype=np.float64)) * 1e-9
-    steps = steps[steps > 0]
-    return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
 
 
 def _head(path: Path) -> bytes:
