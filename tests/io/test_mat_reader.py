@@ -54,7 +54,7 @@ def test_damaged_files_are_refused_in_a_sentence(tmp_path, is_packed):
     path, random = tmp_path / "a.mat", np.random.default_rng(0)
     savemat(path, ARRAYS, do_compression=is_packed)
     good, refused = path.read_bytes(), 0
-    for _ in range(2000):
+    for _ in range(600):
         data = bytearray(good)
         for place in random.integers(0, len(data), random.integers(1, 6)):
             data[place] = random.integers(256)
@@ -63,7 +63,7 @@ def test_damaged_files_are_refused_in_a_sentence(tmp_path, is_packed):
             read_mat(path, ARRAYS)
         except InputError:
             refused += 1
-    assert refused > 500
+    assert refused > 150
 
 
 def test_an_array_that_promises_more_than_the_file_holds_takes_no_memory(tmp_path):

@@ -40,6 +40,13 @@ def folder(room, tmp_path_factory):
     return write_replica(room, tmp_path_factory.mktemp("room"))
 
 
+@pytest.fixture(scope="module")
+def matched(room, folder):
+    """Pairs of the images with their camera: which they are does not depend on good poses."""
+    matcher = Matcher(with_poses(folder, room.T_wc))
+    return matcher.pairs(8), matcher.camera
+
+
 def turned(axes):
     """Camera-to-world poses of cameras with other axes."""
     turn = np.eye(4)
@@ -71,19 +78,19 @@ def test_true_poses_pass(room, folder):
     assert check.given.in_front > 0.97
 
 
-def test_world_does_not_matter(room, folder):
+def test_world_does_not_matter(room, folder, matched):
     world = np.eye(4)
     world[:3, :3] = 40 * np.array([[0.0, 1, 0], [0.6, 0, 0.8], [0.8, 0, -0.6]])
     T_wc = world @ room.T_wc
     T_wc[:, :3, :3] /= 40
-    assert check_poses(with_poses(folder, T_wc)).warning is None
+    assert judge(with_poses(folder, T_wc), *matched).warning is None
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_wrong_convention_is_named(mistake, room, folder):
+def test_wrong_convention_is_named(mistake, room, folder, matched):
     source = with_poses(folder, MISTAKES[mistake](room.T_wc))
     with pytest.raises(InputError, match=rf"look like .*{mistake}.*: .*(column|invert)"):
-        check_poses(source)
+        judge(source, *matched)
 
 
 def test_each_remedy_is_right(room, folder):
@@ -117,20 +124,20 @@ def test_quaternions_with_w_first(room, tmp_path):
     ],
     ids=["OpenCV axes", "inverse in OpenCV axes", "inverse"],
 )
-def test_nerfstudio_expects_opengl_axes(mistake, message, room, tmp_path):
+def test_nerfstudio_expects_opengl_axes(mistake, message, room, matched, tmp_path):
     write_nerfstudio(room, tmp_path)
     document = json.loads((tmp_path / "transforms.json").read_text())
-    assert check_poses(open_posed_source(tmp_path, NATIVE)).warning is None
+    assert judge(open_posed_source(tmp_path, NATIVE), *matched).warning is None
     for frame in document["frames"]:
         frame["transform_matrix"] = mistake(np.array(frame["transform_matrix"])).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=message):
-        check_poses(open_posed_source(tmp_path, NATIVE))
+        judge(open_posed_source(tmp_path, NATIVE), *matched)
 
 
-def test_poses_of_other_images_only_warn(room, folder):
+def test_poses_of_other_images_only_warn(room, folder, matched):
     shuffled = room.T_wc[np.random.default_rng(1).permutation(len(room.T_wc))]
-    check = check_poses(with_poses(folder, shuffled))
+    check = judge(with_poses(folder, shuffled), *matched)
     assert "explain the images badly" in check.warning
 
 
