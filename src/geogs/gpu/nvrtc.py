@@ -1,5 +1,6 @@
 """The run-time compiler that comes inside PyTorch's CUDA wheels."""
 
+import contextlib
 import ctypes
 import functools
 import glob
@@ -91,7 +92,5 @@ def _candidates(cuda_major: str) -> list[str]:
 def _preload_builtins(path: str) -> None:
     """NVRTC opens its builtins by bare name, which fails outside the loader's path."""
     for builtins in sorted(Path(path).parent.glob("libnvrtc-builtins.so*")):
-        try:
+        with contextlib.suppress(OSError):
             ctypes.CDLL(str(builtins), mode=ctypes.RTLD_GLOBAL)
-        except OSError:
-            continue

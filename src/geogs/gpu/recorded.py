@@ -26,10 +26,7 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
     graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
     gc.disable()
     try:
-        with (
-            torch.cuda.device(device),
-            torch.cuda.graph(graph, capture_error_mode="thread_local"),
-        ):
+        with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             yield graph
     except RuntimeError:
         random = torch.cuda.default_generators[device.index or 0]

@@ -6,18 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 _WORDS = (
-    "jpeg",
-    "png",
-    "tiff",
-    "webp",
-    "opencv",
-    " warn:",
-    " error:",
-    "bmp",
-    "exif",
-    "iccp",
-    "cv::",
-)
+    "jpeg", "png", "tiff", "webp", "opencv", " warn:", " error:", "bmp", "exif", "iccp", "cv::",
+)  # fmt: skip
 """What lines of the decoders hold, in small letters."""
 _PIPE_SIZE = 1 << 20
 

@@ -57,9 +57,7 @@ def decoded(path: Path, flags: int) -> Decoded:
 
 def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
     """The same for what such a file holds, as bytes."""
-    if not len(data):
-        return Decoded(None)
-    if _promises_too_much(data) or _has_an_endless_part(data):
+    if not len(data) or _promises_too_much(data) or _has_an_endless_part(data):
         return Decoded(None)
     picture, noise = _decode(data, flags, alone=False)
     if noise:  # of this one, or of one that another thread decodes

@@ -24,12 +24,8 @@ _KINDS = {
 }  # fmt: skip
 _Order = Literal["<", ">"]
 _ORDERS: dict[str, _Order | None] = {
-    "ascii": None,
-    "binary_little_endian": "<",
-    "binary_big_endian": ">",
-}
-
-
+    "ascii": None, "binary_little_endian": "<", "binary_big_endian": ">",
+}  # fmt: skip
 LARGEST_PLY = 1 << 35
 """Bytes."""
 

@@ -15,16 +15,9 @@ GUESSED_FIELD_OF_VIEW = 60.0
 """Degrees along the longer image side, assumed where nothing is known: a phone's main camera."""
 
 _FILES = (
-    "intrinsics.json",
-    "cam_params.json",
-    "transforms.json",
-    "cameras.txt",
-    "sparse/0/cameras.txt",
-    "intrinsic/intrinsic_color.txt",
-    "sensor.yaml",
-    "calib.txt",
-    "calibration.txt",
-)
+    "intrinsics.json", "cam_params.json", "transforms.json", "cameras.txt", "sparse/0/cameras.txt",
+    "intrinsic/intrinsic_color.txt", "sensor.yaml", "calib.txt", "calibration.txt",
+)  # fmt: skip
 _FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
 _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
@@ -32,11 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 def resolve_intrinsics(
-    option: str,
-    known: Calibration | None,
-    width: int,
-    height: int,
-    quarter_turns: int = 0,
+    option: str, known: Calibration | None, width: int, height: int, quarter_turns: int = 0
 ) -> Calibration:
     """Turn ``InputConfig.intrinsics`` into the calibration of ``width x height`` images.
 

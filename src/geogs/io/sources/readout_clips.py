@@ -11,10 +11,7 @@ MINUTE = 60.0
 
 
 def read_clips(
-    reader: Reader,
-    config: InputConfig,
-    resized: Callable[[RawFrame], RawFrame],
-    first: int = 0,
+    reader: Reader, config: InputConfig, resized: Callable[[RawFrame], RawFrame], first: int = 0
 ) -> Generator[list[RawFrame], None, None]:
     """Neighbouring images of the selection, ``resized``, from a clip on; the stride does not count.
 

@@ -103,9 +103,7 @@ class Rectifier:
         return resized_to(self.size, image)
 
     def straightened(
-        self,
-        image: UInt8[np.ndarray, "h w 3"],
-        offsets: Float[np.ndarray, "h w 2"] | None = None,
+        self, image: UInt8[np.ndarray, "h w 3"], offsets: Float[np.ndarray, "h w 2"] | None = None
     ) -> UInt8[np.ndarray, "h w 3"]:
         """The working image of a resized image.
 

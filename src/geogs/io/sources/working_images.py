@@ -246,9 +246,7 @@ class WorkingImages:
             yield replace(raw, image=masked_out(raw.image, straight), mask=straight)
 
     def _rectified(
-        self,
-        depth: MeasuredDepth | None,
-        moved: Float[np.ndarray, "h w 2"] | None = None,
+        self, depth: MeasuredDepth | None, moved: Float[np.ndarray, "h w 2"] | None = None
     ) -> MeasuredDepth | None:
         """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
         if not (self.uses_depth and isinstance(depth, RecordedDepth)):

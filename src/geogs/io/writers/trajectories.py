@@ -34,12 +34,12 @@ def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 
     Reading it again gives the same numbers up to rounding.
     """
-    wxyz = matrix_to_quaternion(torch.from_numpy(trajectory.T_wc[:, :3, :3])).numpy()
+    wxyz = _quaternions(trajectory)
     rows = np.column_stack([
         trajectory.timestamps, trajectory.T_wc[:, :3, 3], wxyz[:, 1:], wxyz[:, :1]
     ])  # fmt: skip
-    lines = [" ".join(repr(float(number)) for number in row) for row in rows]
-    write_text(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""]))
+    text = "".join(_row(row, " ") for row in rows)
+    write_text(path, f"# timestamp tx ty tz qx qy qz qw\n{text}")
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
@@ -58,11 +58,15 @@ def write_euroc(path: Path, trajectory: Trajectory) -> None:
 
     The body is the camera; velocities and biases are left out.
     """
-    wxyz = matrix_to_quaternion(torch.from_numpy(trajectory.T_wc[:, :3, :3])).numpy()
-    poses = np.concatenate([trajectory.T_wc[:, :3, 3], wxyz], axis=1)
+    poses = np.concatenate([trajectory.T_wc[:, :3, 3], _quaternions(trajectory)], axis=1)
     nanoseconds = np.round(trajectory.timestamps * 1e9).astype(np.int64)
     rows = (f"{t},{_row(p, ',')}" for t, p in zip(nanoseconds.tolist(), poses, strict=True))
     write_text(path, f"{_EUROC}\n" + "".join(rows))
+
+
+def _quaternions(trajectory: Trajectory) -> np.ndarray:
+    """Rotations camera to world as w, x, y, z."""
+    return matrix_to_quaternion(torch.from_numpy(trajectory.T_wc[:, :3, :3])).numpy()
 
 
 def _row(numbers: np.ndarray, between: str) -> str:

@@ -143,8 +143,7 @@ def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
             continue
         if len(words) != 10:
             raise _WrongModel(f"{len(words)} columns in the row of an image, not 10")
-        w, x, y, z, *t = (float(word) for word in words[1:8])
-        tx, ty, tz = t
+        w, x, y, z, tx, ty, tz = (float(word) for word in words[1:8])
         yield int(words[0]), ModelImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
         next(lines, None)  # its keypoints
 

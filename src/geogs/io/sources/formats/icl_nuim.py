@@ -15,13 +15,7 @@ from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import (
-    ImageFile,
-    ImageList,
-    depths_there,
-    finite,
-    listed,
-)
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there, finite, listed
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.formats.tum import PER_METRE, known_camera
 from geogs.io.sources.known_intrinsics import find_calibration

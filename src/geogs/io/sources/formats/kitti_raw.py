@@ -6,7 +6,6 @@ longitude, altitude, roll, pitch and yaw, brought to metres by a Mercator projec
 rectified camera by the calibrations (Geiger et al., "Vision meets robotics", IJRR 2013).
 """
 
-from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -128,17 +127,15 @@ def _above(folder: Path, name: str) -> Path | None:
 
 def _dates(listing: Path) -> np.ndarray:
     """Seconds since 1970 of rows such as ``2011-09-26 13:02:25.964389445``."""
-    return np.array(list(_epochs(read_text(listing).splitlines(), listing)))
-
-
-def _epochs(lines: Iterable[str], listing: Path) -> Iterable[float]:
-    for number, line in enumerate(lines, start=1):
+    seconds = []
+    for number, line in enumerate(read_text(listing).splitlines(), start=1):
         try:
             whole, _, fraction = line.strip().partition(".")
             date = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            yield date.timestamp() + float(f"0.{fraction or 0}")
+            seconds.append(date.timestamp() + float(f"0.{fraction or 0}"))
         except ValueError:
             raise InputError(f"{listing}, line {number}: expected a date and a time.") from None
+    return np.array(seconds)
 
 
 def _raw_camera(path: Path, number: int, images: ImageList) -> Calibration:

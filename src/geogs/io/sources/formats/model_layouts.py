@@ -42,11 +42,6 @@ _PHONE_FRAMES_PER_SECOND = 60.0
 _FRAME = re.compile(r"frame_(\d{1,9})\.\w+")
 
 
-def is_eth3d(folder: Path) -> bool:
-    """Whether ``folder`` is a scene of ETH3D's photographs."""
-    return holds_pictures(folder, ETH3D)
-
-
 def place_of_model(folder: Path) -> Place | None:
     """The images that belong to a model; none where ``folder`` holds that of no such scene."""
     folder = folder.absolute()
@@ -60,7 +55,7 @@ def place_of_model(folder: Path) -> Place | None:
 
 def open_photographs(place: Place) -> ImageList:
     """Read one folder of images in order of names; frames of the phone at their times."""
-    kind = "eth3d" if is_eth3d(place.folder) else "scannetpp"
+    kind = "eth3d" if holds_pictures(place.folder, ETH3D) else "scannetpp"
     name = f"{place.folder.resolve().name}-{place.pictures.name}"
     return ImageList(kind, name, _files(place), _camera(place))
 

@@ -12,13 +12,7 @@ import numpy as np
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.formats.image_files import (
-    ImageFile,
-    ImageList,
-    depths_there,
-    finite,
-    listed,
-)
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, depths_there, finite, listed
 from geogs.io.sources.formats.timed_poses import with_timed_poses
 from geogs.io.sources.known_intrinsics import find_calibration
 from geogs.io.sources.posed.posed_set import PosedSet

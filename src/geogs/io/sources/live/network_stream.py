@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Generator
+from contextlib import suppress
 
 import av
 from av.container import InputContainer
@@ -57,15 +58,7 @@ class NetworkStream:
 
 def _frames(container: InputContainer) -> Generator[av.VideoFrame, None, None]:
     """Images until the stream ends or is gone; what is damaged is left out."""
-    packets = container.demux(container.streams.video[0])
-    while True:
-        try:
-            packet = next(packets, None)
-        except (av.error.FFmpegError, OSError):
-            return
-        if packet is None:
-            return
-        try:
-            yield from packet.decode()
-        except av.error.FFmpegError:
-            continue
+    with suppress(av.error.FFmpegError, OSError):
+        for packet in container.demux(container.streams.video[0]):
+            with suppress(av.error.FFmpegError):
+                yield from packet.decode()

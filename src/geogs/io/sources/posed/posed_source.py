@@ -12,11 +12,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
 from geogs.io.sources.posed.one_camera import OneCamera
-from geogs.io.sources.posed.posed_set import (
-    PosedSet,
-    SparsePoints,
-    without_invalid_poses,
-)
+from geogs.io.sources.posed.posed_set import PosedSet, SparsePoints, without_invalid_poses
 from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
 from geogs.io.sources.reader import fingerprint_of, read_ahead, size_of
 from geogs.io.sources.working_images import check_large_enough

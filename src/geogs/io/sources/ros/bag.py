@@ -31,11 +31,7 @@ from geogs.io.sources.ros.recorded_messages import (
 
 _log = logging.getLogger(__name__)
 
-_BEGINNINGS = {
-    ".bag": b"#ROSBAG V2.0",
-    ".mcap": b"\x89MCAP0\r\n",
-    ".db3": b"SQLite format 3\0",
-}
+_BEGINNINGS = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _METADATA = "metadata.yaml"
 _SUFFIXES = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg")
 """What image transports put behind the name of a topic."""

@@ -40,6 +40,16 @@ class GltfBuffer:
         self._views: list[dict[str, object]] = []
         self._data = b""
 
+    def add_surface(
+        self, vertices: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+    ) -> dict[str, int]:
+        """Vertices and normals, with axes turned to those of glTF. Returns their numbers."""
+        axes = OPENCV_FROM_OPENGL[:3, :3]
+        return {
+            "POSITION": self.add(vertices @ axes, "VEC3", has_range=True),
+            "NORMAL": self.add(normals @ axes, "VEC3"),
+        }
+
     def add(self, values: Float[np.ndarray, "n k"], kind: str, has_range: bool = False) -> int:
         """Numbers of the vertices, as float32; ``has_range`` for positions. Returns its number."""
         rows = values.astype("<f4")
@@ -62,9 +72,7 @@ class GltfBuffer:
         """The material of a surface that shows an image just as it is."""
         picture = {"mimeType": "image/jpeg", "bufferView": self._view(jpeg)}
         filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP}
-        surface = {
-            "baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0,
-        }  # fmt: skip
+        surface = {"baseColorTexture": {"index": 0}, **_ROUGH}
         material = {
             "pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {_UNLIT: {}},
         }  # fmt: skip
@@ -124,12 +132,8 @@ def glb(
     The world is turned by a half turn about x, so that what was down in the first image is down.
     Colours are linear in the file, as glTF has them; ours are sRGB.
     """
-    axes = OPENCV_FROM_OPENGL[:3, :3]
     gltf = GltfBuffer()
-    attributes = {
-        "POSITION": gltf.add(vertices @ axes, "VEC3", has_range=True),
-        "NORMAL": gltf.add(normals @ axes, "VEC3"),
-    }
+    attributes = gltf.add_surface(vertices, normals)
     corners = gltf.add_corners(faces)
     if colours is not None:
         steps = np.round(linear(colours) * 65535).astype("<u2")
@@ -152,14 +156,9 @@ def write_textured_glb(
     (KHR_materials_unlit); readers that do not know that see a rough surface. ``uv`` is
     in pixels of the texture, whose centres are at integers.
     """
-    axes = OPENCV_FROM_OPENGL[:3, :3]
-    size = np.array(texture.shape[1::-1])
-    gltf = GltfBuffer()
-    attributes = {
-        "POSITION": gltf.add(vertices @ axes, "VEC3", has_range=True),
-        "NORMAL": gltf.add(normals @ axes, "VEC3"),
-        "TEXCOORD_0": gltf.add((uv + 0.5) / size, "VEC2"),
-    }
+    gltf, size = GltfBuffer(), np.array(texture.shape[1::-1])
+    attributes = gltf.add_surface(vertices, normals)
+    attributes["TEXCOORD_0"] = gltf.add((uv + 0.5) / size, "VEC2")
     corners = gltf.add_corners(faces)
     with atomic_file(path) as stream:
         stream.write(gltf.packed(attributes, corners, gltf.textured(_jpeg(texture))))
