@@ -1,4 +1,4 @@
-"""Threads that work beside the one to which frames come."""
+"""Work in other threads than the one that frames come to."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class BackgroundTask:
-    """One piece of work at a time, done by a thread of its own; who needs it done waits."""
+    """One piece of work at a time in a thread of its own."""
 
     def __init__(self, name: str) -> None:
         """``name`` is the thread's."""
@@ -16,16 +16,16 @@ class BackgroundTask:
 
     @property
     def is_going_on(self) -> bool:
-        """Whether what was started last is not done yet."""
+        """Whether the work started last is not done yet."""
         return self._work is not None and not self._work.done()
 
     def start(self, work: Callable[[], None]) -> None:
-        """Begin a piece of work, after what was started before has been waited for."""
+        """Begin a piece of work, once the one before is done."""
         self.wait()
         self._work = self._thread.submit(work)
 
     def wait(self) -> None:
-        """Until the work is done; raises what it has raised, once."""
+        """Wait until the work is done; raises what it has raised, once."""
         work, self._work = self._work, None
         if work is not None:
             work.result()
@@ -50,5 +50,5 @@ class PriorityGate:
             self._is_free.set()
 
     def give(self) -> None:
-        """Called between two parts of the long work: waits until nothing is urgent."""
+        """Wait until nothing is urgent; called between two parts of the long work."""
         self._is_free.wait(self._longest)

@@ -24,15 +24,16 @@ LARGEST_SETTINGS = 1 << 17
 
 _DEEPEST = 50
 """Groups within groups."""
+_LONGEST_MESSAGE = 200
 
 UNUSABLE = (
     ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
 )  # fmt: skip
-"""What using the values of a document may end with that somebody made up."""
+"""Errors that may come of using the values of a document that somebody made up."""
 
 
 def expanded(path: str | Path) -> Path:
-    """The path with ~ as the folder of the user; as it is where there is no such."""
+    """The path with ~ as the user's folder; unchanged where there is no such user."""
     try:
         return Path(os.path.expanduser(path))
     except ValueError:  # a zero byte in the name of a user
@@ -40,7 +41,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
-    """What a plain file holds; a pipe or a device is not waited for.
+    """The content of a plain file; a pipe or a device is not waited for.
 
     Raises:
         InputError: it is missing, no plain file, too large, or cannot be read.
@@ -155,11 +156,11 @@ def yaml_value(text: str, name: str) -> Any:
         raise InputError(said) from None
 
 
-def in_short(error: Exception | str, longest: int = 200) -> str:
-    """What is said of an error, inside of a sentence: its first line, plain and not for ever."""
+def in_short(error: Exception | str) -> str:
+    """The first line of an error's message, printable and of limited length, for a sentence."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
     plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
-    return plain if len(plain) <= longest else f"{plain[:longest]}..."
+    return plain if len(plain) <= _LONGEST_MESSAGE else f"{plain[:_LONGEST_MESSAGE]}..."
 
 
 def whole_number(value: Any) -> int:

@@ -9,11 +9,11 @@ import stat
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
-"""By which numba is told of another folder; what the user says there stays."""
+"""Names another folder for numba; what the user set is kept."""
 
 
 def find_kernel_folder() -> None:
-    """Where numba would find no folder to write into, name one among the temporary files.
+    """Name a temporary folder where numba would find none that it can write to.
 
     It has to be called before numba is imported.
     """
@@ -22,7 +22,7 @@ def find_kernel_folder() -> None:
 
 
 def kernel_folder() -> Path:
-    """Where numba keeps kernels, or one of the folders in it."""
+    """The folder in which numba keeps kernels, or one of several."""
     if VARIABLE in os.environ:
         return Path(os.environ[VARIABLE])
     return next(filter(can_be_written, _usual()), _usual()[-1])
@@ -41,7 +41,7 @@ def can_be_written(folder: Path) -> bool:
 
 
 def temporary_folder() -> Path:
-    """The same for all processes of a user, if nobody else can write there; else a new one.
+    """One folder for all processes of a user, if nobody else can write there; else a new one.
 
     Who can write where kernels are kept can have programs run.
     """

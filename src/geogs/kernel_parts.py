@@ -1,4 +1,4 @@
-"""How compiled kernels contain the functions that they call.
+"""Inlining of the functions that compiled kernels call.
 
 Of a function that two kernels call, each has a copy of its own, optimised with the kernel; the
 function itself has one more. All have the same name, and where LLVM does not inline them, whichever
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def inlined(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a kernel as those of a function that such kernels call: LLVM has to inline it.
+    """Options of a function that such kernels call, by those of a kernel: LLVM has to inline it.
 
     It is compiled anew with each kernel that the disk does not have, never taken from there.
     """

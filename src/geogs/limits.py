@@ -1,4 +1,4 @@
-"""What the numbers of a stored record may be, as the types of its fields say it.
+"""Limits on the numbers of stored records, said by the types of their fields.
 
 ``Annotated`` gives a number or an array a :class:`~geogs.config.setting.Range`, or says that it is
 :data:`UNBOUNDED`, a pose (:data:`RIGID`), or a :class:`Reference` to a row of a table. Floats of
@@ -17,29 +17,29 @@ from torch import Tensor
 from geogs.config.setting import Range
 
 FARTHEST = 1e12
-"""Beyond it, and below its inverse, are no lengths of a map, in its unit, nor scales."""
+"""Lengths of a map, in its unit, and scales lie between its inverse and this."""
 MOST_IDS = 1 << 22
-"""Tables have room for every number up to the largest: at two keyframes a second, 24 days."""
+"""Tables have a row for each number up to the largest: at two keyframes a second, 24 days."""
 MOST_COUNTED = 1 << 53
-"""Whole numbers beyond it are none of a float."""
+"""Floats represent all whole numbers up to it."""
 _SQUARENESS = 1e-4
 """Largest error of an element of R R^T."""
 
 
 class _Unbounded:
-    """Infinite numbers are allowed, too; those that are none are not."""
+    """Infinite numbers are allowed, NaN is not."""
 
 
 @dataclass(frozen=True)
 class Transform:
-    """Matrices of rotation, with translation if 4 x 4, and of one scale if ``is_scaled``."""
+    """Rotation matrices, with a translation if 4 x 4, times one scale if ``is_scaled``."""
 
     is_scaled: bool = False
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A number, or an array of such, that names a row of a table."""
+    """Numbers of rows of a table."""
 
     table: str
 
@@ -50,18 +50,18 @@ AT_LEAST_0 = Range(0, FARTHEST)
 POSITIVE = Range(1 / FARTHEST, FARTHEST)
 
 Id = Annotated[int, Range(0, MOST_IDS)]
-"""Number that nothing else of its kind has, such as that of a frame."""
+"""Unique number of a thing among its kind, such as a frame."""
 KeyframeId = Annotated[int, Range(0, MOST_IDS), Reference("keyframes")]
-"""That of a keyframe that there is."""
+"""Id of a keyframe that exists."""
 Number = Annotated[int, Range(0, MOST_COUNTED)]
-"""How many there are."""
+"""A count."""
 Positive = Annotated[float, POSITIVE]
 AtLeast0 = Annotated[float, AT_LEAST_0]
 Pose = Annotated[Float64[Tensor, "4 4"], RIGID]
 
 
 def holds(marks: tuple[object, ...], value: Any) -> bool:
-    """Whether a number or an array is as it should be; other values always are."""
+    """Whether a number or an array keeps to its marks; other values always do."""
     if isinstance(value, np.ndarray):
         value = torch.from_numpy(value)
     if isinstance(value, Tensor):
@@ -81,7 +81,7 @@ def _array_holds(marks: tuple[object, ...], array: Tensor) -> bool:
 
 
 def _is_allowed(marks: tuple[object, ...], least: float | int, most: float | int) -> bool:
-    """Whether all from the least to the most may be, neither of which is NaN if none is."""
+    """Whether numbers from the least to the most are allowed; one of these is NaN if any is."""
     if math.isnan(least) or math.isnan(most):
         return False
     ends = (least, most)

@@ -1,4 +1,4 @@
-"""Where the camera is, as far as it is known right after a frame."""
+"""Pose of the camera as it is known right after a frame."""
 
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""Which pixels may show the scene."""
+"""Mask of the pixels that may show the scene."""
 
 import functools
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from geogs.world.straight_view import StraightView
 
 @functools.lru_cache(maxsize=1)
 def _view(camera: Camera, lens: FoundLens) -> StraightView:
-    """The same for all keyframes, with what it has computed."""
+    """One view for all keyframes, which keeps what it has computed."""
     return StraightView(camera, lens)
 
 
@@ -28,9 +28,9 @@ class SceneMask:
     black_is_masked: bool = False
 
     def of(self, keyframe: Keyframe) -> Bool[np.ndarray, "h w"] | None:
-        """What a keyframe shows of the scene; None where that is all of its image.
+        """Valid pixels of a keyframe; None where all are.
 
-        In a straightened image that is none of what the lens did not see.
+        Pixels of a straightened image that the lens did not see are not valid.
         """
         table = keyframe.table
         fixed = self.fixed
@@ -46,6 +46,6 @@ class SceneMask:
         return None if valid.all() else valid
 
     def _straight(self, view: StraightView) -> Bool[np.ndarray, "h w"] | None:
-        """What straight images show; None where that is all."""
+        """Valid pixels of straightened images; None where all are."""
         valid = view.is_seen if self.fixed is None else view.is_seen & view.nearest(self.fixed)
         return None if valid.all() else valid

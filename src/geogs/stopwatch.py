@@ -1,4 +1,4 @@
-"""Wall-clock seconds per stage, and how far it is."""
+"""Wall-clock seconds per stage, and its progress."""
 
 import threading
 import time
@@ -16,12 +16,12 @@ def unwatched(stage: str, fraction: float) -> None:
 
 @dataclass
 class StageSeconds:
-    """Seconds that stages took so far; mutable."""
+    """Seconds of each stage so far; mutable."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     """By stage."""
     until_stream_end: float | None = None
-    """Those of all stages up to the end of the stream; none before it."""
+    """Sum over all stages up to the end of the stream; none before it."""
 
 
 class _Here(threading.local):
@@ -59,7 +59,7 @@ class Stopwatch:
         return sum(self.seconds.values())
 
     def end_stream(self) -> None:
-        """What comes from now on comes after the stream."""
+        """Mark the end of the stream."""
         self.times.until_stream_end = self.total
 
     @contextmanager
@@ -76,7 +76,7 @@ class Stopwatch:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """What this thread does meanwhile, beside the one whose stages count, adds nothing."""
+        """Inside, this thread adds nothing: it works beside the one whose stages count."""
         before, self._here.is_aside = self._here.is_aside, True
         try:
             yield

@@ -69,7 +69,7 @@ def thread_map(
 
 @runtime_checkable
 class Each(Protocol):
-    """``map``, or what computes the next ones meanwhile."""
+    """``map``, or a function that computes the next results meanwhile."""
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T], /) -> Iterator[R]:
         """The results in the order of the items."""
@@ -79,7 +79,7 @@ class Each(Protocol):
 def ordered_map(
     function: Callable[[T], R], items: Iterable[T], threads: int, name: str = ""
 ) -> Iterator[R]:
-    """``map(function, items)``, the next ones being computed meanwhile in a few threads.
+    """``map(function, items)``; a few threads compute the next results meanwhile.
 
     No more items are taken than there are threads, beside the one that is asked for.
     """
@@ -167,19 +167,19 @@ def opencv_on_one_thread() -> None:
 
 
 SWITCH_SECONDS = 0.0001
-"""After which a thread that computes in Python lets another go on, while tracking and mapping share
-the interpreter; Python's own 5 ms, several times a frame, would be felt."""
+"""Switch interval of Python's threads while tracking and mapping share the interpreter; the usual
+5 ms, several times a frame, would be felt."""
 
 
 class QuickSwitching:
     """Threads take turns often between ``begin`` and ``end``: process-wide, for a live system."""
 
     def begin(self) -> "QuickSwitching":
-        """From now on."""
+        """Shorten the interval."""
         self._before = sys.getswitchinterval()
         sys.setswitchinterval(min(SWITCH_SECONDS, self._before))
         return self
 
     def end(self) -> None:
-        """As it was before."""
+        """Set it back."""
         sys.setswitchinterval(self._before)

@@ -1,4 +1,4 @@
-"""What flows between the parts: frozen records, no behaviour."""
+"""Frozen records that the parts exchange."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from geogs.short_repr import ShortRepr
 
 @runtime_checkable
 class MeasuredDepth(Protocol):
-    """What a depth sensor saw, read when it is asked for."""
+    """Depth of a sensor, read when it is asked for."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """Depth z of every pixel, 0 where unknown; None where it cannot be read."""
@@ -27,61 +27,61 @@ class MeasuredDepth(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MeasuredPose(ShortRepr):
-    """Where something else than the images says that the camera was."""
+    """Pose of the camera by another tracker."""
 
     T_cw: Pose
     """World to camera, metres, in a world of its own."""
     world: int = 0
-    """Poses of different worlds say nothing of each other."""
+    """Poses of different worlds cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SeenRows(ShortRepr):
-    """Where and when a rolling shutter saw what an image shows whose rows were rectified.
+    """Where and when a rolling shutter saw the pixels of an image whose rows were rectified.
 
     The nodes lie in the middle of each eight pixels, and a step beyond the border; the image was
-    made with what lies between them bilinearly.
+    resampled by bilinear interpolation between them.
     """
 
     offset: Float16[Tensor, "r c 2"]
-    """Pixels from a node to where a pinhole at the camera's place of that time saw the same."""
+    """Pixels from a node to where a pinhole with the camera's pose of that time saw the same."""
     seconds: Float16[Tensor, "r c"]
-    """That time, from the middle row's."""
+    """Time of exposure from that of the middle row."""
     doubt: float = 0.0
-    """Standard error of the readout, as a part of it; 0 where it was told."""
+    """Relative standard error of the readout; 0 where it was given."""
     is_rectified: bool = True
-    """Else rows are as they came, and ``seconds`` those of a readout of one standard error: the
-    shutter is taken for global, and may not be."""
+    """Otherwise rows are as they came, and ``seconds`` those of a readout of one standard error:
+    the shutter is assumed to be global, and may not be."""
 
 
 @dataclass(frozen=True)
 class FlowMatch:
-    """Where the cells of one image lie in another."""
+    """Matches of the grid cells of one image in another."""
 
     pixels: Float32[Tensor, "e p 2"]
     """Position in the second image of each grid cell of the first."""
     weight: Annotated[Float32[Tensor, "e p 2"], Range(0)]
     """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
     damping: Annotated[Float32[Tensor, "e p"], Range(0)] | None = None
-    """What resists a change of the first image's inverse depth, in the units of its inverse
-    variance; equal for all edges of a call that share the first image. None for nothing."""
+    """Damping of the first image's inverse depth, in the units of its inverse variance; equal for
+    all edges of a call that share the first image."""
     memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
-    """What the operator wants to be given when it measures an edge again, of each."""
+    """State of the flow operator for each edge, which it is given when it measures that again."""
 
     def on_cpu(self) -> "FlowMatch":
         """Positions and weights alone, on the CPU."""
         return FlowMatch(self.pixels.cpu(), self.weight.cpu())
 
     def sure(self) -> Bool[Tensor, "e p"]:
-        """Cells that a geometry may be guessed from: matched, along both axes, with no less than a
-        hundredth of the weight of the edge's best, where a mere guess would count like a good
-        match."""
+        """Confident cells: matched along both axes with at least a hundredth of the weight of the
+        edge's best. A first geometry is estimated from these, where a guess would count like a
+        good match."""
         weight = self.weight.amin(-1)
         best = torch.quantile(weight.float(), 0.98, dim=-1, keepdim=True)
         return (weight > 0) & (weight > 0.01 * best)
 
     def only_sure(self) -> "FlowMatch":
-        """Positions and weights, those of cells alone that a geometry may be guessed from."""
+        """Positions and weights, which are zero where a cell is not confident."""
         return FlowMatch(self.pixels, torch.where(self.sure()[..., None], self.weight, 0.0))
 
 
@@ -100,9 +100,9 @@ class Frame(ShortRepr):
     depth: MeasuredDepth | None = None
     """Depth of the image's pixels, where a sensor measured it and it is to be used."""
     pose: MeasuredPose | None = None
-    """By another tracker, where there is one and it is to be used as a prior."""
+    """Prior by another tracker, where there is one and it is to be used."""
     rows: SeenRows | None = None
-    """How its rows were rectified; none of a global shutter."""
+    """Rectification of its rows; none for a global shutter."""
     left: int | None = None
     """Images of its recording that are still to come; none where that is not known."""
     mask: Bool[np.ndarray, "h w"] | None = None
@@ -118,26 +118,25 @@ class PoseCorrection:
     scale: dict[int, float]
     """Factor by which lengths around the keyframe were divided; 1 where only the pose moved."""
     of_all: bool = False
-    """Whether everything was adjusted together, as a bundle adjustment of all keyframes does; else
-    those before the place where it begins were not."""
+    """Whether all keyframes were adjusted together; otherwise those before its first were not."""
 
 
 @dataclass(frozen=True, slots=True)
 class MetricScale:
-    """By what the lengths of a map are metres."""
+    """Factor by which the lengths of a map became metres."""
 
     origin: str
-    """What told them."""
+    """Where it comes from."""
     factor: Positive
-    """By which all lengths were multiplied."""
+    """All lengths were multiplied by it."""
     deviation: AtLeast0
-    """Standard deviation of the factor, as a part of it."""
+    """Relative standard deviation of the factor."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundLens:
-    """OpenCV's k1 and k2 that all matches found in images that were taken for those of a pinhole,
-    and its focal length.
+    """Distortion (OpenCV's k1 and k2) and focal length estimated from all matches, for images that
+    were assumed to be those of a pinhole.
 
     A ray x, y was seen at focal (1 + k1 r^2 + k2 r^4) times that, about a principal point.
     """
@@ -148,16 +147,16 @@ class FoundLens:
     """Standard deviation."""
     deviation_k2: AtLeast0
     focal: Positive = 1.0
-    """The focal length over what it was taken for; 1 where that was not asked, or is right."""
+    """Focal length over the assumed one; 1 where it was not estimated, or is right."""
     deviation_focal: AtLeast0 = 0.0
     right: float = 0.0
     down: float = 0.0
-    """Where the principal point lies off what it was taken for, in the focal lengths found."""
+    """Offset of the principal point from the assumed one, in the focal lengths found."""
     deviation_centre: AtLeast0 = 0.0
     varies_focal: AtLeast0 = 0.0
     varies_centre: AtLeast0 = 0.0
-    """What frames have of their own, focal lengths as parts of that and principal points in it;
-    root mean square over the frames, zero where all are alike."""
+    """Variation from frame to frame of the focal length, relative, and of the principal point, in
+    focal lengths; root mean square, zero where all frames are alike."""
 
     @property
     def varies(self) -> bool:
@@ -170,20 +169,20 @@ class FoundLens:
         return self.right != 0 or self.down != 0
 
     def of_frame(self, own: "FrameLens") -> "FoundLens":
-        """That of a frame which has something of its own."""
+        """The lens of a frame with a deviation of its own."""
         focal = self.focal * math.exp(own.focal)
         return replace(self, focal=focal, right=self.right + own.right, down=self.down + own.down)
 
 
 @dataclass(frozen=True)
 class FrameLens:
-    """What the lens of one frame has of its own, beside that of all."""
+    """Deviation of the lens of one frame from that of all."""
 
     focal: float = 0.0
     """Logarithm of its focal length over that of all."""
     right: float = 0.0
     down: float = 0.0
-    """Where its principal point lies off theirs, in focal lengths."""
+    """Offset of its principal point from theirs, in focal lengths."""
 
     @property
     def sizes(self) -> tuple[float, float, float]:
@@ -191,7 +190,7 @@ class FrameLens:
         return self.focal, self.right, self.down
 
     def plus(self, other: "FrameLens") -> "FrameLens":
-        """With what was found beside."""
+        """The sum of two deviations."""
         right, down = self.right + other.right, self.down + other.down
         return FrameLens(self.focal + other.focal, right, down)
 
@@ -223,37 +222,37 @@ class Trajectory(ShortRepr):
         ]
 
     def of(self, state: FrameState) -> "Trajectory":
-        """The frames of which so much is known and no more."""
+        """The frames of one state."""
         keep = np.array([known == state for known in self.states], bool)
         return Trajectory(self.timestamps[keep], self.T_wc[keep], self.tracked[keep])
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class FoundFrames(ShortRepr):
-    """Frames of a video that had no place, and have one after all, in time order."""
+    """Frames of a video that had no pose and were given one afterwards, in time order."""
 
     numbers: tuple[int, ...]
-    """Which frames of the video they are: the rows of what follows."""
+    """Indices of the frames in the video, one for each row of what follows."""
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
     T_cw: Float[np.ndarray, "n 4 4"]
     """World to camera, float64."""
     position: Float[np.ndarray, "n"]
-    """Standard deviation of the camera's centre beside the frames that had a place before, map
-    units; infinite where that is not known."""
+    """Standard deviation of the camera's centre relative to the frames that had a pose before, map
+    units; infinite where it is not known."""
     rotation: Float[np.ndarray, "n"]
-    """The same of its orientation, radians."""
+    """Standard deviation of the orientation, radians."""
 
     @staticmethod
     def none() -> "FoundFrames":
-        """Of no frame."""
+        """No frames."""
         return FoundFrames((), np.zeros(0), np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def of(self, kept: Bool[np.ndarray, "n"]) -> "FoundFrames":
-        """Some of them."""
+        """Those of the frames that are kept."""
         numbers = tuple(n for n, is_kept in zip(self.numbers, kept, strict=True) if is_kept)
         columns = (self.timestamps, self.T_cw, self.position, self.rotation)
         return FoundFrames(numbers, *(column[kept] for column in columns))
@@ -266,20 +265,20 @@ class Uncertainty(ShortRepr):
     timestamps: Float[np.ndarray, "n"]
     """Seconds."""
     position: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
-    """That of the camera's centre, map units, all axes together: of what is left when the
-    trajectory is laid over the truth by a similarity."""
+    """Camera's centre, map units, all axes together: the error left after the trajectory is
+    aligned with the truth by a similarity."""
     rotation: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
-    """That of its orientation, radians."""
+    """Orientation, radians."""
     depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
-    """That of its depths, as a part of them, where the trajectory is as long as the true one: of
-    the best known quarter of what it sees, as bare walls tell nothing."""
+    """Depths, relative, where the trajectory is as long as the true one: those of the best known
+    quarter of what the frame sees, as bare walls say nothing."""
     focal: AtLeast0 = 0.0
-    """That of the focal length, as a part of it: of the width of things over their depth."""
+    """Focal length, relative: the width of things over their depth."""
     misfit: AtLeast0 = 0.0
-    """How many times as long as the usual keyframe's are the residuals of the tenth whose matches
-    fit least; 0 where that is not known."""
+    """Residuals of the tenth of the keyframes whose matches fit least, over those of the usual
+    keyframe; 0 where that is not known."""
     focal_change: AtLeast0 = 0.0
-    """By how much parts of the video want focal lengths that differ, as a part of them."""
+    """Relative difference of the focal lengths that parts of the video fit best."""
     lens_change: AtLeast0 = 0.0
     """Part of the cost of the matches that is left because the lens changes from frame to frame."""
 
@@ -295,8 +294,8 @@ class Uncertainty(ShortRepr):
         )
 
     def with_found(self, found: FoundFrames) -> "Uncertainty":
-        """With frames that were found beside these: each is as far off as those around it, and by
-        its own deviations, which are independent."""
+        """With frames that were found afterwards: their own deviations add to those of the frames
+        around them, as independent ones."""
         around = self.at(found.timestamps)
         order = np.argsort(np.concatenate([self.timestamps, found.timestamps]), kind="stable")
         columns = (
@@ -349,7 +348,7 @@ class RenderedKeyframe(ShortRepr):
     normal: Float[Tensor, "h w 3"]
     """Camera frame, facing the camera, zero where there is no depth."""
     weight: Float[Tensor, "h w"]
-    """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
+    """Confidence of the depth in [0, 1]; less where disks spread along the ray."""
     image: UInt8[np.ndarray, "h2 w2 3"] | None
     """RGB at working resolution; none in a result that was written without images."""
     timestamp: float
