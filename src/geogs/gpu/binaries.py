@@ -1,4 +1,4 @@
-"""Kernels that came compiled with the package: machine code of several architectures, and PTX.
+"""Kernels shipped compiled with the package: machine code of several architectures, and PTX.
 
 :mod:`geogs.gpu.build_binaries` makes them for a release; a clone of the sources has none.
 """
@@ -12,15 +12,15 @@ from geogs.gpu.cache import cache_key
 from geogs.gpu.kernel_source import OPTIONS, read_source
 
 FOLDER = Path(__file__).with_name("compiled")
-"""An archive for each architecture, in which a source has the name that its text gives it."""
+"""An archive for each architecture; the name of its entries is a hash of the source."""
 MACHINE_CODE = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
-"""Runs on what has the same number before the last digit, and the last digit or a higher one."""
+"""Each runs on GPUs of the same major and the same or a higher minor compute capability."""
 PTX = "compute_75"
-"""What the driver of every later GPU translates."""
+"""Translated by the driver of every later GPU."""
 
 
 def shipped_code(text: str, capability: tuple[int, int]) -> Iterator[bytes]:
-    """What came for a source (with its includes) and a GPU: machine code, then PTX, or nothing."""
+    """Shipped code of a source (with its includes) for a GPU: machine code, then PTX, or none."""
     for architecture in usable_by(capability):
         archive = FOLDER / f"{architecture}.zip"
         try:
@@ -39,12 +39,12 @@ def usable_by(capability: tuple[int, int]) -> list[str]:
 
 
 def name_of(text: str) -> str:
-    """Under which a source is kept: another text, or other options, have another name."""
+    """Name of an entry: another text, or other options, have another."""
     return cache_key(text, *OPTIONS)
 
 
 def shipped_sources(sources: Iterable[Path]) -> dict[str, int]:
-    """How many of the sources, as they are now, came for each architecture."""
+    """How many of the sources, as they are now, are shipped for each architecture."""
     names = [name_of(read_source(source)) for source in sources]
     counts = {}
     for architecture in (*MACHINE_CODE, PTX):

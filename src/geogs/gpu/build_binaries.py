@@ -1,4 +1,4 @@
-"""Kernels compiled for the GPUs of the day, on any machine.
+"""Compile the kernels that a release ships, on any machine.
 
 ``python -m geogs.gpu.build_binaries`` needs NVRTC (``pip install nvidia-cuda-nvrtc``), but neither
 a GPU nor a driver. What the oldest CUDA of a major version compiles, all its drivers load.

@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class CacheState:
-    """What is kept and whether more can be."""
+    """Kernels in the cache, and whether more can be written."""
 
     kernels: int
     """Compiled source files."""
@@ -33,12 +33,12 @@ def cache_folder() -> Path:
 
 
 def cache_key(*parts: str) -> str:
-    """Name of a cached file made from everything that its content depends on."""
+    """Name of a cached file: a hash of everything that its content depends on."""
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
 def read_cubin(key: str) -> bytes | None:
-    """A cached cubin, None where there is none or it does not carry its own checksum."""
+    """A cached cubin; None where there is none or its checksum is wrong."""
     try:
         content = _path(key).read_bytes()
     except OSError:
@@ -48,7 +48,7 @@ def read_cubin(key: str) -> bytes | None:
 
 
 def write_cubin(key: str, cubin: bytes) -> bool:
-    """Keep a cubin; appears at once and whole, whoever else writes it. False if it cannot be."""
+    """Keep a cubin, atomically, whoever else writes it. False if it cannot be written."""
     path = _path(key)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

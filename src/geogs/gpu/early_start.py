@@ -1,4 +1,4 @@
-"""A GPU made ready while Python still imports PyTorch, which waits for neither."""
+"""Initialise a GPU while Python still imports PyTorch."""
 
 import contextlib
 import ctypes
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def start_gpu(name: str) -> None:
-    """Have the driver make the GPU of a device's name ready, in a thread; ``auto`` is the first.
+    """Initialise the GPU of a device's name in a thread; ``auto`` is the first.
 
     PyTorch finds it as it is, or makes it ready itself. Nothing is done where PyTorch has no CUDA,
     and nothing is said where it fails: who uses the GPU says it.
@@ -20,8 +20,8 @@ def start_gpu(name: str) -> None:
 
 
 def is_gpu(name: str) -> bool:
-    """Whether the device of that name is a GPU: of ``auto``, whether one can be used, which is made
-    ready meanwhile."""
+    """Whether the device of that name is a GPU; for ``auto``, whether one can be used, which is
+    initialised meanwhile."""
     if name != "auto":
         return name.startswith("cuda")
     start_gpu(name)
@@ -40,7 +40,7 @@ def _has_cuda() -> bool:
 
 
 def _make_ready(index: int) -> None:
-    """Make the context that PyTorch is going to use; the interpreter goes on meanwhile."""
+    """Make the context that PyTorch is going to use, without holding the interpreter lock."""
     with contextlib.suppress(OSError, AttributeError):
         cuda = ctypes.CDLL("libcuda.so.1")
         device, context = ctypes.c_int(), ctypes.c_void_p()

@@ -1,4 +1,4 @@
-"""What of CUDA this machine has, found out without starting a GPU."""
+"""CUDA on this machine, found out without starting a GPU."""
 
 import ctypes
 import functools

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-"""Below which all kernel sources of ours lie."""
+"""Holds all kernel sources of ours."""
 INCLUDE_FOLDER = Path(__file__).parent
-"""Where ``#include "common.cuh"`` is found."""
+"""Holds ``#include "common.cuh"``."""
 OPTIONS = ("--use_fast_math", "--std=c++17")
-"""With which all are compiled; what else a kernel needs to know it is given when it is launched."""
+"""Compiler options of all kernels; whatever else they depend on is an argument of the launch."""
 
 _KERNEL = re.compile(
     r'extern\s+"C"\s+__global__\s+void\s+(?:__launch_bounds__\([^)]*\)\s*)?(\w+)\s*\(([^)]*)\)',
@@ -32,7 +32,7 @@ def kernel_sources(folder: Path) -> list[Path]:
 
 
 def read_source(path: Path) -> str:
-    """The text with its own includes in place, each once: all that the compiled code depends on."""
+    """The text with its own includes inserted, each once: all that the compiled code depends on."""
     seen: set[str] = set()
 
     def insert(text: str, folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Kernels of a source file for a device: as they came, from the cache, or compiled now."""
+"""Kernels of a source file for a device: shipped, from the cache, or compiled now."""
 
 import contextlib
 import functools

@@ -18,7 +18,7 @@ class Nvrtc:
     def __init__(self, path: str) -> None:
         library = ctypes.CDLL(path)
         self.path = path
-        """As it was opened; a bare name was found by the system's loader."""
+        """Path as opened; a bare name was found by the system's loader."""
         self._library = library
         major, minor = ctypes.c_int(), ctypes.c_int()
         self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))

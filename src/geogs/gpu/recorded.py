@@ -1,4 +1,4 @@
-"""Work on a GPU as a recorded sequence of kernels: its many launches cost the CPU one."""
+"""Work on a GPU recorded as a CUDA graph: its many launches cost the CPU one."""
 
 import gc
 import logging
@@ -12,16 +12,16 @@ from torch import Tensor
 _log = logging.getLogger(__name__)
 
 Maps = tuple[Tensor, ...]
-"""What is made of tensors, on their device."""
+"""Results, on the device of the tensors they are made of."""
 
 
 @contextmanager
 def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
     """A CUDA graph of what this thread launches on ``device`` within the block.
 
-    Python's garbage collector rests meanwhile: an older graph that it found and destroyed would
-    end the recording with an error. What cannot be recorded leaves the device's generator of
-    random numbers believing that it is still recorded: it goes on with a state of its own.
+    Python's garbage collector is off meanwhile: an older graph that it destroyed would end the
+    recording with an error. A recording that fails leaves the device's random generator in
+    recording mode: it goes on with a copy of its state.
     """
     graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
     gc.disable()
@@ -38,17 +38,16 @@ def recording(device: torch.device) -> Generator[torch.cuda.CUDAGraph]:
 
 
 class Recorded:
-    """Does ``work``, which no value of the tensors that it is given may change the course of.
+    """Does ``work``, whose control flow may not depend on the values of its tensors.
 
-    On a GPU it is recorded as a CUDA graph at the second tensors of each set of shapes, and played
-    back from then on; before it was done once, libraries have not chosen their kernels, and shapes
-    that come but once are not worth it. Elsewhere, and where a driver cannot record it, it is
-    called as it is. Threads and streams may share one: each waits until what another has begun is
-    done.
+    On a GPU it is recorded as a CUDA graph at the second call with tensors of the same shapes, and
+    replayed from then on: in the first call libraries still choose their kernels, and shapes that
+    come only once are not worth it. Elsewhere, and where a driver cannot record it, it is called as
+    it is. Threads and streams may share one: each waits until what another has begun is done.
     """
 
     def __init__(self, work: Callable[..., Maps], name: str) -> None:
-        """``name`` is what is said to be slow where it cannot be recorded."""
+        """``name`` stands in the warning where it cannot be recorded."""
         self._work, self._name = work, name
         self._done_once = set[tuple[torch.Size, ...]]()
         self._recordings: dict[tuple[torch.Size, ...], Callable[..., Maps]] = {}
@@ -56,7 +55,7 @@ class Recorded:
         self._done: torch.cuda.Event | None = None
 
     def __call__(self, *given: Tensor) -> Maps:
-        """What ``work`` returns."""
+        """The result of ``work``."""
         if not given[0].is_cuda:
             return self._work(*given)
         shapes = tuple(tensor.shape for tensor in given)

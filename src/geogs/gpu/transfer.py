@@ -1,4 +1,4 @@
-"""From the host's memory to a GPU without waiting."""
+"""Copies from the host's memory to a GPU without waiting."""
 
 from collections.abc import Sequence
 

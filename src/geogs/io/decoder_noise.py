@@ -1,4 +1,4 @@
-"""What decoders of pictures, which are C libraries, print on the standard error of the process."""
+"""Catch what decoders of pictures, which are C libraries, print on the standard error."""
 
 import os
 import threading
@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 _WORDS = (
     "jpeg", "png", "tiff", "webp", "opencv", " warn:", " error:", "bmp", "exif", "iccp", "cv::",
 )  # fmt: skip
-"""What lines of the decoders hold, in small letters."""
+"""Words by which lines of decoders are known, in lower case."""
 _PIPE_SIZE = 1 << 20
 
 
@@ -16,8 +16,8 @@ _PIPE_SIZE = 1 << 20
 def decoder_noise(alone: bool = True) -> Iterator[list[str]]:
     """Inside, lines of decoders on the standard error are caught; afterwards the list has them.
 
-    Lines of others come to the standard error, at the end of a block at the latest. Who is not
-    ``alone`` may also get lines of those who decode side by side with it.
+    Lines of others go on to the standard error, at the end of a block at the latest. A block that
+    is not ``alone`` may also get lines of decoders in other threads.
     """
     lines: list[str] = []
     before = _STANDARD_ERROR.enter(alone)
@@ -28,14 +28,14 @@ def decoder_noise(alone: bool = True) -> Iterator[list[str]]:
 
 
 class _StandardError:
-    """The one of the process: led into a pipe for as long as anybody decodes."""
+    """That of the process, redirected into a pipe for as long as anybody decodes."""
 
     def __init__(self) -> None:
         self._turn = threading.Condition()
         self._inside = self._waiting = 0
         self._is_one_alone = False
         self._kept: int | None = None
-        """Where the standard error leads otherwise; none while it does, or where there is none."""
+        """The standard error itself while it is redirected; else none."""
         self._pipe = -1
         self._caught: list[str] = []
 
@@ -58,7 +58,7 @@ class _StandardError:
             return len(self._caught)
 
     def leave(self, before: int) -> list[str]:
-        """Be done; the lines that were caught since ``before``."""
+        """Be done. Returns the lines that were caught since ``before``."""
         with self._turn:
             self._read()
             lines = self._caught[before:]

@@ -45,7 +45,7 @@ def read_mat(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Element:
-    """A piece of a file with its type; the data may reach beyond what was unpacked of it."""
+    """A piece of a file with its type; ``data`` may be cut off where not all was unpacked."""
 
     type: int
     size: int
@@ -84,7 +84,7 @@ def _arrays(data: bytes, names: Collection[str]) -> Iterator[tuple[str, np.ndarr
 
 @dataclass(frozen=True)
 class _Head:
-    """What stands before the numbers of an array."""
+    """Header of an array."""
 
     flags: int
     shape: tuple[int, ...]
@@ -127,5 +127,5 @@ def _element(data: memoryview, order: str) -> _Element:
 
 
 def _unpacked(data: memoryview, size: int) -> memoryview:
-    """What is compressed, as far as so many bytes."""
+    """The first ``size`` bytes of compressed data."""
     return memoryview(zlib.decompressobj().decompress(data, size))

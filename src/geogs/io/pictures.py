@@ -27,16 +27,16 @@ _PIXELS_A_BYTE = 10_000
 _ORIENTATION, _QUARTER_TURNED = 0x0112, (5, 6, 7, 8)
 """Entry of the EXIF, and its values for which width and height are exchanged."""
 _HARMLESS = 1 << 24
-"""Pixels that are decoded in no time, whatever the file holds; or bytes."""
+"""Pixels, or bytes, that are decoded in no time, whatever the file holds."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """What came of a file."""
+    """A decoded picture."""
 
     picture: np.ndarray | None
-    """As OpenCV gives it; none where there is no picture in the file."""
+    """In OpenCV's order of channels; none where there is no picture in the file."""
     is_damaged: bool = False
     """Whether the decoder complained, or the file is cut off, although there is a picture."""
 
@@ -56,7 +56,7 @@ def decoded(path: Path, flags: int) -> Decoded:
 
 
 def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
-    """The same for what such a file holds, as bytes."""
+    """Decode the bytes of such a file."""
     if not len(data) or _promises_too_much(data) or _has_an_endless_part(data):
         return Decoded(None)
     picture, noise = _decode(data, flags, alone=False)
@@ -121,7 +121,7 @@ def header_read(path: Path) -> Iterator[Any]:
 
 
 def _promises_too_much(data: np.ndarray) -> bool:
-    """Whether a header tells of more pixels than so few bytes can hold, which would be made up."""
+    """Whether a header claims more pixels than so few bytes can hold."""
     from PIL import Image
 
     try:
@@ -138,8 +138,8 @@ def _promises_too_much(data: np.ndarray) -> bool:
 
 
 def _has_an_endless_part(data: np.ndarray) -> bool:
-    """Whether a part of a PNG is said to be far longer than the file, for which OpenCV makes room
-    of up to 4 GiB."""
+    """Whether a chunk of a PNG claims to be far longer than the file, for which OpenCV would
+    allocate up to 4 GiB."""
     file, at = data.data, len(_PNG)
     if file[:at] != _PNG:
         return False

@@ -44,7 +44,7 @@ class PlyElement:
     """A table: its properties by their names."""
 
     columns: dict[str, Shaped[np.ndarray, "n"]]
-    """Those of one number a row, in the type that the header says."""
+    """Properties of one number a row, in the type that the header says."""
     lists: dict[str, PlyLists]
 
 
@@ -56,7 +56,7 @@ class _Property:
     stored: np.dtype
     """Type and byte order in which they are stored; text is stored as double precision."""
     stored_length: np.dtype | None
-    """The same of the length before each list; none for single numbers."""
+    """Type and byte order of the length before each list; none for single numbers."""
 
     @property
     def prefix(self) -> str:
@@ -71,7 +71,7 @@ class _Property:
 
 
 class _WrongPly(ValueError):
-    """What is wrong, in words of ours."""
+    """An error in words of ours, which repeat little of the file."""
 
 
 def read_ply(path: str | Path) -> dict[str, PlyElement]:

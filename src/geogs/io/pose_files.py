@@ -24,7 +24,7 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes x right, y down, z forward from x right, y up, z backward; it is its own inverse."""
 
 POSE_FILES = ("groundtruth.txt", "traj.txt")
-"""What files with the poses of a sequence are called in its folder."""
+"""Names of files with the poses of a sequence in its folder."""
 ORIENTATIONS = "orientations.tum"
 """The file of a result with the frames of which no more than the orientation is known."""
 _log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def _has_pose(
 
 
 def read_frame_poses(folder: Path) -> Trajectory:
-    """Frames of a result whose place is known, or no more than their orientation, in order of time.
+    """Frames of a result whose pose is known, or no more than their orientation, in order of time.
 
     Raises:
         InputError: ``trajectory.tum`` is missing, a file is damaged, or no frame is known at all.

@@ -1,4 +1,4 @@
-"""What is no file: a camera, a stream in the network, a pipe, a file that plays at its pace."""
+"""Addresses of live sources: a camera, a network stream, a pipe, a file played at its pace."""
 
 import re
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ _PLAY = re.compile(r"play:(.+)", re.DOTALL)
 
 @dataclass(frozen=True)
 class LiveAddress:
-    """Where frames come from that do not wait."""
+    """Address of a live source."""
 
     kind: Literal["camera", "stream", "pipe", "play"]
     target: str
@@ -32,7 +32,7 @@ class LiveAddress:
 
 
 def live_address(source: str | Path) -> LiveAddress | None:
-    """What ``camera:0``, ``rtsp://…``, ``-`` or ``play:FILE`` name; none where it is a path.
+    """The address ``camera:0``, ``rtsp://…``, ``-`` or ``play:FILE``; none where it is a path.
 
     A path made of an URL has lost one of its slashes, which counts as there.
     """

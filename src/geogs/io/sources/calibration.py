@@ -1,4 +1,4 @@
-"""A camera as the user or the data set describes it: intrinsics, distortion, and where from."""
+"""A camera as the user or the data set describes it: intrinsics, distortion, and their origin."""
 
 import math
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ _LONGEST_EDGE = 1 << 20
 
 @dataclass(frozen=True)
 class FocalRefinement:
-    """What the video itself said of the focal length, and of the distortion with it."""
+    """Outcome of a self-calibration: focal length, and the distortion with it."""
 
     deviation: float | None = None
     """Standard deviation of fx in pixels of the source's images; none where there is a failure."""
@@ -28,12 +28,12 @@ class FocalRefinement:
     """Standard deviations of k1 and k2; none where they were not found beside it."""
     keyframes: int = 0
     frames: int = 0
-    """Looked at."""
+    """Used for it."""
     failure: str | None = None
-    """Why the video does not tell it."""
+    """Why it failed."""
     is_explained: bool = True
-    """Whether any camera explains how its first views move; else what moves in them may decide what
-    all matches say later, too."""
+    """Whether any camera explains the motion in its first views; else moving objects may decide
+    what is estimated from all matches later, too."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ class Calibration:
     is_guess: bool = False
     """Whether the focal length is only assumed."""
     is_nominal: bool = False
-    """Whether the focal length is what the maker says of the lens, to a few percent."""
+    """Whether the focal length is the maker's nominal one, good to a few percent."""
     refinement: FocalRefinement | None = None
-    """What the video said of it, where it was asked."""
+    """Outcome of a self-calibration, if there was one."""
     lens: LensModel = "polynomial"
-    """What the coefficients are of."""
+    """Model of the coefficients."""
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
@@ -97,14 +97,14 @@ class Calibration:
 
     @property
     def is_unknown_lens(self) -> bool:
-        """Whether nobody said how the lens bends, and what is said is but from the video."""
+        """Whether the distortion was not given: it is unknown, or estimated from the video."""
         is_asked = self.refinement is not None and not self.is_distorted
         return self.is_guess or self.is_found_lens or is_asked
 
     @property
     def is_found_lens(self) -> bool:
-        """Whether the focal length is what the video itself said of it, and the distortion, too; a
-        lens of which it said that it does not bend counts as found."""
+        """Whether focal length and distortion were estimated from the video; a lens without
+        distortion counts as estimated."""
         said = self.refinement
         if said is None or said.failure is not None:
             return False
@@ -112,8 +112,8 @@ class Calibration:
 
     @property
     def focal_deviation(self) -> float:
-        """Relative standard deviation of a focal length that was found in the video or guessed; 0
-        where somebody said it."""
+        """Relative standard deviation of a focal length that was estimated from the video or
+        guessed; 0 where it was given."""
         if self.is_guess:
             return GUESS
         said = self.refinement
@@ -126,13 +126,14 @@ class Calibration:
 
     @property
     def numbers(self) -> str:
-        """As the command line takes them."""
+        """Intrinsics as the command line takes them."""
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         name = ["fisheye"] if self.lens == "fisheye" else []
         return ",".join(name + [f"{value:.6g}" for value in values])
 
     def with_lens(self, found: FoundLens) -> "Calibration":
-        """The calibration with what images straightened by it bend, once the size is known."""
+        """The calibration with the distortion that is left in images straightened by it, once the
+        size is known."""
         bend, shift = (found.k1, found.k2), (found.right, found.down)
         camera, distortion = with_bend(
             self.camera(), self.distortion, self.lens, bend, found.focal, shift

@@ -48,13 +48,13 @@ _COLMAP_MODELS: dict[str, tuple[int | None, ...]] = {
     "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),
 }
 FISHEYE = "fisheye"
-"""What numbers begin with that are a fisheye's."""
+"""Begins the numbers of a fisheye."""
 _FISHEYES = (FISHEYE, "equidistant", "opencv_fisheye", "kannala_brandt", "kb4")
-"""What files call a fisheye, in small letters."""
+"""Names of a fisheye in files, in lower case."""
 _OTHER_LENSES = (
     "FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT", "OMNI", "EUCM", "DOUBLE", "SPHER", "MEI", "PRISM",
 )  # fmt: skip
-"""What names of camera models hold that the images have to be undistorted for."""
+"""Parts of names of camera models that are not supported."""
 _RECORD3D, _SCANNETPP = "metadata", "pose_intrinsic_imu.json"
 """Names of files with cameras of Record3D and of ScanNet++'s phone."""
 
@@ -88,7 +88,7 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def camera_document(path: Path, name: str = "cam0") -> dict[str, Any]:
-    """What a YAML file says of its camera, or of the one of a name in Kalibr's chain.
+    """The camera of a YAML file, or the one of a name in Kalibr's chain.
 
     Raises:
         InputError: it cannot be read.
@@ -104,7 +104,7 @@ def camera_document(path: Path, name: str = "cam0") -> dict[str, Any]:
 
 
 def calibration_from_words(words: Sequence[str], origin: str) -> Calibration:
-    """The same from their words, of which the first may be ``fisheye``. Raises ValueError, too."""
+    """Build a calibration from numbers as words; ``fisheye`` may come first. Raises ValueError."""
     is_fisheye = words[:1] == [FISHEYE]
     numbers = [float(word) for word in (words[1:] if is_fisheye else words)]
     if not is_fisheye:
@@ -140,7 +140,7 @@ def _text_of_settings(path: Path) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """What is missing, without what the file holds."""
+    """The missing entry, if that is the error; nothing of the file's content."""
     return f" (no entry {error})" if isinstance(error, KeyError) else ""
 
 
@@ -257,7 +257,7 @@ def _from_numbers(text: str, path: Path) -> Calibration:
 
 
 def _lens(model: str, path: Path | str) -> LensModel:
-    """What a file calls a lens. Raises InputError for one that is not supported."""
+    """Lens model by its name in a file. Raises InputError for one that is not supported."""
     if model.lower() in _FISHEYES:
         return "fisheye"
     _refuse_others(model, path)

@@ -59,7 +59,7 @@ def kitti_camera(path: Path, number: int | None, rectified: bool = True) -> Cali
 
 
 def kitti_offset(path: Path, number: int) -> Float64[np.ndarray, "3"]:
-    """Where camera 0 lies in the axes of a rectified camera, metres.
+    """Position of camera 0 in the axes of a rectified camera, metres.
 
     Raises:
         InputError: the file does not say.

@@ -1,4 +1,4 @@
-"""Depth that a sensor measured: pictures of it beside the images, brought to the image's pixels."""
+"""Depth of a sensor: pictures of it beside the images, registered to the image's pixels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from geogs.io.sources.undistort import Rectifier
 SAME_SURFACE = 0.03
 """Relative difference of depth up to which neighbouring pixels are interpolated."""
 INVALID = 65535
-"""What some sensors write where they saw nothing, beside 0."""
+"""Written by some sensors where depth is unknown, beside 0."""
 
 LEAST_CONFIDENCE = 1
 """Least confidence of a phone's lidar (0 low, 1 medium, 2 high) at which a depth is taken."""
@@ -31,15 +31,15 @@ class DepthCamera:
 
     camera: Camera
     T_colour_depth: tuple[float, float, float]
-    """From the depth camera's axes to the colour camera's, which are parallel; metres."""
+    """Translation from the depth camera's axes to the parallel ones of the colour camera; metres."""
 
 
 @runtime_checkable
 class RecordedDepth(Protocol):
-    """A depth as it came."""
+    """A depth map as stored."""
 
     sensor: DepthCamera | None
-    """Who saw it; none where its pixels are those of the colour image, at whatever size."""
+    """Its camera; none where its pixels are those of the colour image, at whatever size."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """The depth of its own pixels, 0 where unknown; None where it cannot be read."""
@@ -48,15 +48,15 @@ class RecordedDepth(Protocol):
 
 @dataclass(frozen=True)
 class DepthFile:
-    """A picture of depth as it came."""
+    """A picture of depth as stored."""
 
     path: Path
     per_metre: float = 1000.0
     """Units of the picture to the metre."""
     sensor: DepthCamera | None = None
-    """Who saw it; none where its pixels are those of the colour image, at whatever size."""
+    """Its camera; none where its pixels are those of the colour image, at whatever size."""
     confidence: Path | None = None
-    """Picture of how far each pixel is to be trusted, see ``LEAST_CONFIDENCE``."""
+    """Picture of the confidence of each pixel, see ``LEAST_CONFIDENCE``."""
     quarter_turns: int = 0
     """Clockwise, from the picture as stored to the upright image."""
 
@@ -87,15 +87,15 @@ def depth_beside(path: Path, confidence: Path | None = None) -> DepthFile | None
 
 @dataclass(frozen=True)
 class RectifiedDepth:
-    """The same of the pixels of a working image, made when it is asked for."""
+    """Depth of the pixels of a working image, made when it is asked for."""
 
     file: RecordedDepth
     colour: Calibration
     """Camera of the image as it came."""
     rectifier: Rectifier
-    """What made the working image."""
+    """Made the working image."""
     offsets: Float[np.ndarray, "h w 2"] | None = None
-    """By which its rows were moved, since the shutter rolls."""
+    """Offsets by which the rows of a rolling shutter were rectified."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """Depth z in the working image's camera; 0 where unknown, None where it cannot be read."""

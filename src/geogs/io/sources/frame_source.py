@@ -44,7 +44,7 @@ class RecordingSpan:
 
 @dataclass(frozen=True, slots=True)
 class RecordingPlace:
-    """How far one recording has been read."""
+    """Progress of reading one recording."""
 
     span: RecordingSpan | None = None
     """None before its first frame."""
@@ -75,14 +75,14 @@ class RecordingPlace:
 
 @dataclass(frozen=True, slots=True)
 class ReadingPlace:
-    """How far a source has been read."""
+    """Progress of reading a source."""
 
     frames: int = 0
     """Given, of all recordings together."""
     time: float = 0.0
     """Time of the last, seconds in the joint time."""
     recordings: tuple[RecordingPlace, ...] = ()
-    """In each recording that was begun."""
+    """Progress in each recording that was begun."""
 
     @property
     def skipped(self) -> int:
@@ -118,7 +118,7 @@ class Source:
         self.calibration = first.calibration
         """The camera of the first recording's images as they came, upright, with its distortion."""
         self.shutter = first.shutter
-        """By which rows are rectified."""
+        """The shutter by which rows are rectified."""
         self.mask = first.mask
         """Pixels of every frame that may show the scene; none where all do."""
         self.fps = first.fps
@@ -133,11 +133,11 @@ class Source:
         self.uses_depth = any(images.uses_depth for images in recordings)
         """Whether frames of any recording come with the depth that a sensor measured."""
         self.depths_found = [images.depth_found for images in recordings]
-        """What there is of the depth of a sensor, a sentence for each recording."""
+        """A sentence on the depth of a sensor for each recording."""
         self.uses_poses = any(images.poses.is_used for images in recordings)
         """Whether frames of any recording come with poses of another tracker, as priors."""
         self.is_live = first.is_live
-        """Whether frames do not wait until they are asked for; such a recording is read alone."""
+        """Whether frames come at their own pace; such a recording is read alone."""
         self.is_calibration_open = any(images.is_calibration_open for images in recordings)
         """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
         self.is_overlay_open = first.is_overlay_open
@@ -145,7 +145,7 @@ class Source:
         self.is_shutter_open = first.is_shutter_open
         """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
         self.place = ReadingPlace()
-        """How far the source has been read, at each frame of this iteration."""
+        """Progress of reading, at each frame of this iteration."""
 
     def __len__(self) -> int:
         """``length``. Raises TypeError where it is not known."""
@@ -170,7 +170,7 @@ class Source:
 
     @property
     def spans(self) -> list[RecordingSpan]:
-        """Where each of several recordings begins that was read so far; none of a single one."""
+        """Beginnings of several recordings, as far as they were read; none for a single one."""
         if len(self._recordings) == 1:
             return []
         return [place.span for place in self.place.recordings if place.span is not None]
@@ -185,7 +185,7 @@ class Source:
         return Source([images.known_better(calibration) for images in self._recordings])
 
     def with_lens(self, found: FoundLens) -> "Source":
-        """The same frames, as they are, of images whose lens is known better by now."""
+        """The same frames, unchanged, with a better calibration of the stored images."""
         same = copy.copy(self)
         same.calibration = self.calibration.with_lens(found)
         return same
@@ -216,7 +216,7 @@ class Source:
 
     @property
     def followed_clips(self) -> FollowedClips:
-        """Of the first recording's images at working size, as they came."""
+        """Clips of the first recording's images at working size, as they came."""
         return self._recordings[0].followed_clips
 
     def linked_frames(self) -> Generator[Frame, None, None]:

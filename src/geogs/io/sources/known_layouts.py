@@ -28,7 +28,7 @@ R = TypeVar("R")
 
 
 def _whole(open_folder: Callable[[Path], R]) -> Callable[[Place], R]:
-    """For a layout with images of one camera."""
+    """Opener for a layout with images of one camera."""
     return lambda place: open_folder(place.folder)
 
 
@@ -128,4 +128,4 @@ LAYOUTS: tuple[Layout, ...] = (
 )  # fmt: skip
 """Earlier ones win."""
 WITH_MODEL = tuple(layout for layout in LAYOUTS if layout.name in ("ScanNet++", "ETH3D"))
-"""Those whose poses are a COLMAP model."""
+"""Layouts whose poses are a COLMAP model."""

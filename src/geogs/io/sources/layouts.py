@@ -1,4 +1,4 @@
-"""Where data sets keep the images of a sequence: found by content, one level up or down too."""
+"""Find the images of a sequence in a data set by content, one level up or down too."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ _NAMED = 5
 
 @dataclass(frozen=True)
 class Layout:
-    """How a data set lies on disk."""
+    """Files and folders of a data set."""
 
     name: str
     """Name of the data set, for sentences."""
@@ -28,9 +28,9 @@ class Layout:
     """Folders of images in that of a sequence, of one camera each; the first that there is counts,
     unless another is given."""
     signs: tuple[str, ...] = ()
-    """Patterns of files that lie beside the images and tell of the data set without them."""
+    """Patterns of files beside the images by which the data set is known without these."""
     needs: str = ""
-    """What has to lie beside these signs, in words."""
+    """What is missing where there are only these signs, in words."""
     posed: Callable[[Place], PosedSet] | None = None
     """Reads the images with their true poses; raises InputError where these are missing."""
 
@@ -84,7 +84,7 @@ def found_below(folder: Path, layouts: Sequence[Layout]) -> tuple[Layout, Place]
 
 
 def what_is_missing(folder: Path, layouts: Sequence[Layout]) -> str | None:
-    """What a folder lacks that is near a layout, as a sentence; none where it is near none."""
+    """A sentence on what a folder lacks that resembles a layout; none where it resembles none."""
     for layout in layouts:
         for sign in layout.signs:
             found = next(iter(folder.glob(sign)), None)

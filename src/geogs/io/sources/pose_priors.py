@@ -1,4 +1,4 @@
-"""Poses beside the images that another tracker said: which a source has, and which it uses."""
+"""Poses of another tracker beside the images: which a source has, and which it uses."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ LONGEST_GAP = 0.25
 NEAR = 0.02
 """Seconds before the first and after the last pose within which that is taken."""
 KEYWORDS = ("none", "auto", "prior")
-"""What ``input.poses`` may be beside a file."""
+"""Values of ``input.poses`` beside a file."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ def turned_upright(
 
 @dataclass(frozen=True)
 class ChosenPoses:
-    """What a source does with the poses beside its images."""
+    """The poses beside the images that a source uses."""
 
     is_used: bool = False
     file: TimedPoses | None = None
-    """In place of the reader's."""
+    """Poses in place of the reader's."""
 
     def of(self, seconds: float, own: MeasuredPose | None) -> MeasuredPose | None:
         """The pose of an image that the reader has one of, or none."""
@@ -93,7 +93,7 @@ class ChosenPoses:
 
 
 def chosen_poses(asked: str, info: RecordingInfo) -> ChosenPoses:
-    """By what ``input.poses`` asks of a recording.
+    """The poses that ``input.poses`` asks for.
 
     Raises:
         InputError: there are none, or the file cannot be read.

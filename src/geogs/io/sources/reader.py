@@ -1,4 +1,4 @@
-"""What a format supplies: how its images are stored, and read ahead or side by side."""
+"""Readers, which formats supply, of images as stored; reading ahead or in several threads."""
 
 import hashlib
 import stat
@@ -19,7 +19,7 @@ from geogs.types import MeasuredDepth, MeasuredPose, SeenRows
 S = TypeVar("S")
 T = TypeVar("T")
 READERS = 4
-"""Threads that read side by side what may be read in any order."""
+"""Threads that read what may be read in any order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class RawFrame:
     """One image as stored, upright."""
 
     label: str
-    """What to call it in a message: the file, or the frame of the video."""
+    """Its name in messages: the file, or the frame of the video."""
     timestamp: float
     """Seconds."""
     image: UInt8[np.ndarray, "h w 3"] | None
@@ -35,27 +35,27 @@ class RawFrame:
     is_damaged: bool = False
     """Whether its decoder found that a part is wrong."""
     why_not: str = "cannot be read"
-    """What is wrong where there is no image."""
+    """Fault where there is no image."""
     depth: MeasuredDepth | None = None
-    """What a depth sensor saw at that time, as it came or of the pixels of a working image."""
+    """Depth of a sensor at that time, as stored or of the pixels of a working image."""
     pose: MeasuredPose | None = None
     """Pose of the upright image, by another tracker."""
     name: str = ""
     """Name of its file, or number of the frame, by which its mask is found."""
     rows: SeenRows | None = None
-    """How those of a working image were rectified; none of a global shutter."""
+    """Rectification of the rows of a working image; none for a global shutter."""
     mask: Bool[np.ndarray, "h w"] | None = None
     """Pixels of a working image that may show the scene, by its own mask; none where all do."""
 
     @property
     def fault(self) -> str:
-        """What is wrong, with its name."""
+        """Its name and the fault."""
         return f"{self.label} {self.why_not}"
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
-    """What a recording says of itself."""
+    """Metadata of a recording."""
 
     kind: str
     """Name of the format."""
@@ -69,7 +69,7 @@ class RecordingInfo:
     length: int | None = None
     """Images in it; none where only reading to the end would tell."""
     calibration: Calibration | None = None
-    """The camera as far as the data set says."""
+    """The camera, if the data set describes it."""
     quarter_turns: int = 0
     """Clockwise quarter turns from the stored to the upright images."""
     has_depth: bool = False
@@ -79,16 +79,16 @@ class RecordingInfo:
     depth_fault: str = ""
     """Why there is none though files speak of it, as a clause."""
     poses_by: str | None = None
-    """Who said the poses that come with images and are no truth; none where there are none."""
+    """Source of the poses, which are no truth, beside the images; none where there are none."""
     is_capture: bool = False
-    """Whether they are plainly those of an app that tracked its camera, in metres."""
+    """Whether an app plainly tracked its camera, in metres."""
     seconds: float | None = None
-    """Time of its last image, about; none where nothing says it."""
+    """Time of its last image, about; none where it is not known."""
 
 
 @runtime_checkable
 class Reader(Protocol):
-    """How one format stores its images."""
+    """Reads the images of one format."""
 
     info: RecordingInfo
 
@@ -112,7 +112,7 @@ class SpreadReader(Protocol):
 
 
 def of_one_size(raw: RawFrame, info: RecordingInfo) -> RawFrame:
-    """The image as it is; without its picture if that has another size than the recording."""
+    """The frame; without its image if that has another size than the recording."""
     if raw.image is None:
         return raw
     height, width = raw.image.shape[:2]
@@ -139,7 +139,7 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
 
 
 def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T]:
-    """``map(read, places)``, the next ones being read meanwhile in a few threads."""
+    """``map(read, places)``; a few threads read the next ones meanwhile."""
     return ordered_map(read, places, READERS, "read-ahead")
 
 

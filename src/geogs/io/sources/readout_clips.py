@@ -1,4 +1,4 @@
-"""Clips of neighbouring images from all over a source, which tell its shutter's readout."""
+"""Clips of neighbouring images from all over a source, to estimate its shutter's readout."""
 
 from collections.abc import Callable, Generator
 
@@ -15,8 +15,7 @@ def read_clips(
 ) -> Generator[list[RawFrame], None, None]:
     """Neighbouring images of the selection, ``resized``, from a clip on; the stride does not count.
 
-    They are as many as tell the readout. A video can only be read from its beginning on, so that
-    they come from its first minute.
+    A video can only be read from its beginning on: its clips come from the first minute.
     """
     ends = [n for n in (config.stop, reader.info.length) if n is not None]
     clip = min(CLIP, max(1, round(SPAN * reader.info.fps)))
@@ -41,7 +40,7 @@ def read_clips(
 
 
 def clip_starts(first: int, count: int, clip: int) -> list[int]:
-    """Where clips of ``clip`` images begin that spread over ``count`` images from ``first`` on.
+    """First images of clips of ``clip`` images that spread over ``count`` images from ``first`` on.
 
     Those of a short video overlap by half.
     """

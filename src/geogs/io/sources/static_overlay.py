@@ -1,7 +1,7 @@
-"""What all images of a video show at the same place, while all else in them moves.
+"""Static overlays: what all images of a video show at the same place, while all else moves.
 
-A time stamp, a logo, a car's bonnet, the arm of a robot: what they show says of the camera that it
-stands still. Where nobody gave a mask, they are found and masked out.
+A time stamp, a logo, a car's bonnet or the arm of a robot suggest that the camera stands still.
+Where no mask was given, they are found and masked out.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 IMAGES = 16
-"""That are compared, from all over a video."""
+"""Images that are compared, from all over a video."""
 LEAST_FRAMES = 40
-"""Of a video that is asked: in less than a second a camera hardly moves, and what it turns about
+"""Shortest video that is searched: in about a second a camera hardly moves, and what it turns about
 stands still."""
 _LEAST_IMAGES = 8
 _FEW = 0.9
@@ -36,18 +36,18 @@ _GAP = 0.02
 _DENSE = 0.08
 """Part of the pixels around that have a still gradient, where one counts."""
 _LEAST_AREA, _LEAST_GRADIENTS = 0.002, 0.001
-"""Of the image, of a part that stands still and of its gradients."""
+"""Least area of a static part and of its gradients, as fractions of the image."""
 _SHARE = 0.05
 """Part of the pixels of what looks the same in all images that still gradients have to be: a sky
 does, too, wherever the camera is."""
 
 
 def static_overlay(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"] | None:
-    """Where all images show the same, while the camera moves; none where that is nowhere.
+    """Mask of what all images show at the same place while the camera moves; none if nothing.
 
-    A pixel with a gradient tells it where nine of ten images differ from their median by no more
-    than a shift of ``_MOTION`` would do. What is bare may look the same wherever the camera is, and
-    counts beside such gradients alone.
+    A pixel with a gradient is static where nine of ten images differ from their median by no more
+    than a shift of ``_MOTION`` would do. A bare pixel may look the same wherever the camera is, and
+    counts only beside such gradients.
 
     Args:
         images: grey, upright and of one size, from all over a video.

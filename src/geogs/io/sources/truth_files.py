@@ -14,7 +14,7 @@ _FILES: tuple[tuple[Callable[[Path], bool], Callable[[Path], Trajectory]], ...] 
     (arkitscenes.is_arkitscenes_truth, arkitscenes.read_arkitscenes_truth),
     (icl_nuim.is_icl_truth, icl_nuim.read_icl_truth),
 )
-"""Those that say more than their rows: axes, times, or where the camera is in a body."""
+"""Files that need more than their rows: axes, times, or the pose of the camera in a body."""
 
 
 def read_truth(path: Path) -> Trajectory:

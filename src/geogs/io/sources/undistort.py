@@ -1,4 +1,4 @@
-"""From the image as it came to the working image: resize, then straighten it."""
+"""Make working images of stored ones: resize, then undistort."""
 
 import functools
 import math
@@ -126,14 +126,14 @@ class Rectifier:
 
     @functools.cached_property
     def _pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where they are without a lens."""
+        """Places of the pixels without distortion."""
         v, u = np.mgrid[: self.size[1], : self.size[0]].astype(np.float32)
         return u, v
 
 
 @dataclass(frozen=True)
 class _Bending:
-    """How the lens of a source bends rays."""
+    """Distortion of a source."""
 
     source: Camera
     distortion: Sequence[float]

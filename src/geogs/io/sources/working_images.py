@@ -43,7 +43,7 @@ from geogs.types import MeasuredDepth, SeenRows
 LEAST_EDGE = 12
 """Pixels of the shorter side of a working image."""
 MOST_OF = 0.97
-"""Part of what a recording says it holds that is enough not to be called cut off."""
+"""Fraction of the announced length below which a recording is called cut off."""
 
 
 class WorkingImages:
@@ -77,9 +77,9 @@ class WorkingImages:
                 f"{why}; leave out --depth, or give that of the images."
             )
         self.poses = chosen_poses(config.poses, info)
-        """Of another tracker, beside the images."""
+        """Poses of another tracker beside the images."""
         self.reader = reader
-        """How they are stored."""
+        """Reads the stored images."""
         self.name = info.name
         """Name of the sequence."""
         self.fps = info.fps / config.stride
@@ -91,10 +91,10 @@ class WorkingImages:
         """The camera of the images as they came, upright, with its distortion."""
         given = Shutter() if config.readout == "auto" else Shutter(config.readout, "as given")
         self.shutter = shutter or given
-        """By which rows are rectified; a global one until it is found."""
+        """The shutter by which rows are rectified; a global one until it is estimated."""
         self._focal = focal
         self.followed_clips = followed_clips or FollowedClips(self._clips)
-        """From all over the selection, of images at working size, lens and rows as they came."""
+        """Clips from all over the selection, at working size, with lens and rows as they came."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
         self.camera = self._rectifier.camera
         """The pinhole camera of the working images."""
@@ -111,7 +111,7 @@ class WorkingImages:
         self.black_is_masked = self._masks is not None
         """Whether pixels of frames that are quite black are masked out."""
         self.is_live = isinstance(reader, LiveReader)
-        """Whether frames do not wait until they are asked for."""
+        """Whether frames come at their own pace."""
         self.uses_depth = config.depth != "none" and info.has_depth
         """Whether images come with the depth that a sensor measured."""
 
@@ -121,7 +121,7 @@ class WorkingImages:
 
     @property
     def depth_found(self) -> str:
-        """What there is of the depth of a sensor, as a sentence."""
+        """A sentence on the depth of a sensor."""
         info = self.reader.info
         if info.has_depth:
             of = "" if info.length is None else f" of {info.length}"
@@ -223,7 +223,7 @@ class WorkingImages:
             yield raw
 
     def _open_rows(self) -> SeenRows | None:
-        """When rows of any image may have been seen; none where the shutter is known to be global.
+        """Possible times of rows of any image; none where the shutter is known to be global.
 
         It is the same for all images and kept once.
         """
@@ -254,9 +254,9 @@ class WorkingImages:
         return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
 
     def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
-        """The same for a rolling shutter, from a place in the source on.
+        """Working images of a rolling shutter, from a place in the source on.
 
-        The turning is measured between neighbours in the source, whatever the stride, and the
+        Rotation is measured between neighbours in the source, whatever the stride, and the
         image before the first is read, too.
         """
         config, rolling, readout = self._config, self.rolling_camera, self.shutter.readout
@@ -285,7 +285,7 @@ class WorkingImages:
         yield from each(straight, with_angular_motion(images, rolling, readout, is_selected, each))
 
     def why_short(self, read: int, last: float) -> str:
-        """What to say where fewer images came than the recording says; nothing where all did.
+        """Message where fewer images came than the recording announces; empty where all did.
 
         Args:
             read: images of the selection, those that cannot be used included.
@@ -301,7 +301,7 @@ class WorkingImages:
         return f"{self.name} {missing}; is it cut off?"
 
     def why_empty(self, skipped: int) -> str:
-        """What to say where there is no image but those that were skipped."""
+        """Message where there is no image but those that were skipped."""
         if skipped:
             return f"{self.name}: none of its {skipped} images can be used."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."

@@ -20,8 +20,8 @@ _ELSEWHERE = "give another output folder"
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     """Open ``path`` for binary writing; it is replaced when the block ends without an error.
 
-    Missing folders are made. After an error the former file is still there and the unfinished one
-    is gone.
+    Missing folders are made. After an error the previous file is still there and the unfinished
+    one is gone.
 
     Raises:
         OutputError: the disk is full, or the place cannot be written.
@@ -69,13 +69,13 @@ def prepare_output_folder(path: str | Path) -> Path:
 
 
 def unwritable(path: Path, error: OSError) -> OutputError:
-    """What to raise where a file or folder cannot be written."""
+    """The error to raise where a file or folder cannot be written."""
     remedy = f"free some space on {_disk_of(path)}" if error.errno in _FULL else _ELSEWHERE
     return OutputError(f"{path} cannot be written ({error.strerror or error}); {remedy}.")
 
 
 def _disk_of(path: Path) -> str:
-    """Where the disk is mounted that a file lies on, or would."""
+    """Mount point of the disk of a file, which may not exist, in words."""
     try:
         place = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
         while not place.is_mount() and place != place.parent:

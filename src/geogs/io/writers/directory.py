@@ -44,7 +44,7 @@ class Directory:
             yield folder
 
     def names(self) -> list[str]:
-        """What is in it, in order."""
+        """Names of its entries, in order."""
         return sorted(os.listdir(self._handle))
 
     def folders(self) -> Iterator[str]:
@@ -56,7 +56,7 @@ class Directory:
                     yield from (f"{name}/{below}" for below in inner.folders())
 
     def files(self) -> Iterator[str]:
-        """Names of all below that is no folder."""
+        """Names of all files below."""
         for folder in (".", *self.folders()):
             with self.inner(folder) as inner:
                 yield from (
@@ -72,7 +72,7 @@ class Directory:
         return False
 
     def number(self, name: str) -> int:
-        """The number by which the file system knows what has that name."""
+        """The inode number of an entry."""
         with self._parent(name) as (parent, last):
             return parent._status(last).st_ino
 
@@ -99,12 +99,12 @@ class Directory:
             return True
 
     def move(self, name: str, target: "Directory", new_name: str) -> None:
-        """Give it a name in another folder, in place of what had that."""
+        """Move an entry to a name in another folder, in place of what had that."""
         with self._parent(name) as (here, old), target._parent(new_name) as (there, new):
             os.replace(old, new, src_dir_fd=here._handle, dst_dir_fd=there._handle)
 
     def delete(self, name: str) -> None:
-        """Delete a file, and the folders that it lay in as far as they are empty now."""
+        """Delete a file, and the folders above that are empty now."""
         with self._parent(name) as (parent, last):
             os.unlink(last, dir_fd=parent._handle)
         with suppress(OSError):
@@ -113,12 +113,12 @@ class Directory:
                 self.delete_empty(name)
 
     def delete_empty(self, name: str) -> None:
-        """Delete a folder that has nothing in it."""
+        """Delete an empty folder."""
         with self._parent(name) as (parent, last):
             os.rmdir(last, dir_fd=parent._handle)
 
     def delete_all(self, name: str) -> None:
-        """Delete a folder with all that is in it, as far as that can be."""
+        """Delete a folder with all that is in it, as far as possible."""
         with self._parent(name) as (parent, last):
             shutil.rmtree(last, ignore_errors=True, dir_fd=parent._handle)
 

@@ -53,7 +53,7 @@ def pinhole(camera: Camera | Calibration) -> dict[str, object]:
 
 
 def _refinement(calibration: Calibration) -> dict[str, object]:
-    """What the video said, if it was asked; deviations in pixels of the source's images."""
+    """Outcome of a self-calibration, if any; deviations in pixels of the source's images."""
     said = calibration.refinement
     if said is None:
         return {}

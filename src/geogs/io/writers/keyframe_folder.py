@@ -21,12 +21,12 @@ JPEG_QUALITY = 95
 
 
 def image_path(folder: Path, keyframe_id: int) -> Path:
-    """Where the image of a keyframe lies in the folder of a result."""
+    """Path of a keyframe's image in the folder of a result."""
     return folder / "keyframes" / f"{keyframe_id:06d}.jpg"
 
 
 def mask_path(folder: Path, keyframe_id: int) -> Path:
-    """Where its mask lies, if it has one."""
+    """Path of its mask, if it has one."""
     return folder / "keyframes" / f"{keyframe_id:06d}.mask.png"
 
 
@@ -66,7 +66,7 @@ def _read(path: Path, flags: int) -> np.ndarray:
 
 
 def rows_path(folder: Path) -> Path:
-    """Where the rows of keyframes lie in the folder of a result, if any were rectified."""
+    """Path of the rows of keyframes in the folder of a result, if any were rectified."""
     return folder / "keyframes" / "rows.safetensors"
 
 

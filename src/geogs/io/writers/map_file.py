@@ -1,4 +1,4 @@
-"""``map.safetensors``: the disks, ten numbers each, and from where and how they were seen."""
+"""``map.safetensors``: the disks, ten numbers each, and the views that they were seen from."""
 
 import json
 from collections.abc import Mapping
@@ -30,11 +30,11 @@ _SHAPES = {"position": (3,), "quaternion": (4,), "scale": (2,), "opacity": ()}
 
 @dataclass(frozen=True)
 class MapFile:
-    """All that a map's file holds."""
+    """Content of a map's file."""
 
     disks: MapSnapshot
     tensors: dict[str, Tensor]
-    """What else there is, on the CPU."""
+    """All others, on the CPU."""
     metadata: dict[str, Any]
 
 
@@ -128,7 +128,7 @@ def _open(path: str | Path) -> "safe_open":
 
 @dataclass(frozen=True, repr=False)
 class MapViews(ShortRepr):
-    """The keyframes that a map's depth maps are made for, and all that those depend on."""
+    """The keyframes for which depth maps are rendered, and all that these depend on."""
 
     camera: Camera
     """Camera of the keyframes' images."""
@@ -143,7 +143,7 @@ class MapViews(ShortRepr):
     unit: float
     """Length of a unit of the map's own frame in the world."""
     disks: MapSnapshot
-    """In the map's own frame, where they are rendered."""
+    """In the map's own frame, in which they are rendered."""
     keyframe_id: Int64[np.ndarray, "k"]
     timestamp: Float64[np.ndarray, "k"]
     """Seconds."""

@@ -44,9 +44,9 @@ LIST = ".geogs.json"
 """Name of the list of a result's files."""
 _NEW = re.compile(r"\.geogs\.(\d{1,20})\.(new|ready)")
 _MARKS = ("summary.json", "map.safetensors")
-"""What every result has, so that what it is can be told without a list."""
+"""Files of every result, by which one without a list is recognised."""
 _FOLDERS = ("adjusted", "depth_fusion", "keyframes", "online", "report", "snapshots")
-"""What a result may need, looked at before it is worked for."""
+"""Folders that a result may need, checked before the work begins."""
 _LARGEST_LIST = 1 << 26
 """Bytes; there are about a hundred for every file."""
 
@@ -103,7 +103,7 @@ def recover(folder: Path) -> None:
 
 
 def _check(place: Directory) -> None:
-    """Raises what a whole result would raise at its end, where that can be told before."""
+    """Raise early what writing a whole result would raise at its end."""
     names, listed = place.names(), _listed(place)
     if any(mark in names and mark not in listed for mark in _MARKS):
         raise OutputError(
@@ -117,7 +117,7 @@ def _check(place: Directory) -> None:
 
 
 def _begun(place: Directory) -> str:
-    """Name of a folder for new files, which is there now."""
+    """Make a folder for new files. Returns its name."""
     name = f".geogs.{token_hex(6)}.part"
     place.make(name)
     new = f".geogs.{place.number(name)}.new"
@@ -132,7 +132,7 @@ def _ours(place: Directory) -> list[str]:
 
 
 def _committed(place: Directory, new: str, what: Extent) -> str:
-    """The name of the new folder from where on it counts."""
+    """The first and second step. Returns the name of the folder that counts from now on."""
     made: list[str] = []
     try:
         with place.inner(new) as files:

@@ -18,8 +18,8 @@ _EUROC = (
 def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) -> None:
     """Write ``trajectory.tum`` and ``keyframes.tum`` of a result or one of its stages.
 
-    The first has the frames whose place is known. Those of which no more than the orientation is
-    known go to ``orientations.tum``, at the place 0 0 0, where there are any.
+    The first has the frames whose pose is known. Those of which no more than the orientation is
+    known go to ``orientations.tum``, at the position 0 0 0, where there are any.
     """
     write_tum_trajectory(folder / "trajectory.tum", frames.of("tracked"))
     turned = frames.of("orientation only")

@@ -1,4 +1,4 @@
-"""How well every frame is known, as a table."""
+"""A table of the uncertainty of every frame."""
 
 from pathlib import Path
 

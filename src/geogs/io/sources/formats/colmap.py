@@ -155,7 +155,7 @@ def _text_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
 
 
 class _WrongModel(ValueError):
-    """What is wrong, in words of ours."""
+    """An error in words of ours, which repeat nothing of the file."""
 
 
 class _Bytes:
@@ -284,7 +284,7 @@ def _project(place: Path) -> Path:
 
 
 def _image_folder(place: Path, images: list[ModelImage]) -> Path:
-    """Where the images lie: the known folder that has most of the first ones."""
+    """Folder of the images: the known one that has most of a sample of them."""
     project = _project(place)
     bases = dict.fromkeys((project, project / "iphone", place, place.parent, place.parent.parent))
     roots = [base / name for base in bases for name in _IMAGE_FOLDERS]

@@ -28,7 +28,7 @@ _CAMERA = Calibration(
     481.2, 480.0, 319.5, 239.5, width=640, height=480, origin="the ICL-NUIM data set"
 )  # fmt: skip
 _NAMES = ("frei_png", "living_room", "livingroom", "office_room", "icl-nuim", "icl_nuim")
-"""What is in the names of folders that have the data set's camera."""
+"""Parts of the names of folders that have the data set's camera."""
 _Y_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
 
 

@@ -41,9 +41,9 @@ class ImageFile:
     path: Path
     timestamp: float
     depth: DepthFile | None = None
-    """What a depth sensor saw at that time."""
+    """Depth of a sensor at that time."""
     pose: MeasuredPose | None = None
-    """By another tracker."""
+    """Pose by another tracker."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Place:
     folder: Path
     """The sequence's own."""
     pictures: Path
-    """That of its images which are read; its own where the layout does not say."""
+    """Folder of the images that are read; its own where the layout does not say."""
 
 
 class ImageList:
@@ -199,7 +199,7 @@ def usual_file(files: Sequence[ImageFile]) -> ImageFile:
 
 
 def _folders_of_project(folder: Path, place: Path) -> list[Path]:
-    """Where a calibration of the images may lie: with them, or above a folder called images."""
+    """Folders that may hold a calibration: that of the images, or above one called images."""
     above = [place.parent] if place.resolve().name in _SUBFOLDERS else []
     return [folder, place, *above]
 

@@ -23,7 +23,7 @@ ODOMETRY = ("image_2", "image_0", "image_3", "image_1")
 """Folders of images, those of the left colour camera first."""
 _NAME = re.compile(r"([0-9]{1,12})\.\w+")
 _FRAMES_PER_SECOND = 10.0
-"""Of the data set, where the file of times is missing."""
+"""Rate of the data set, where the file of times is missing."""
 
 
 def open_kitti_odometry(place: Place) -> ImageList:

@@ -93,7 +93,7 @@ def _six(file: Path) -> Float64[np.ndarray, "6"]:
 
 
 def _camera_from_imu(folder: Path, number: int) -> Float64[np.ndarray, "4 4"]:
-    """From the unit's axes to those of a rectified camera, by the three calibrations."""
+    """Transform from the unit's axes to those of a rectified camera, by the three calibrations."""
     T = np.eye(4)
     for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt"):
         rows, file = _rows(folder, name)

@@ -127,7 +127,7 @@ def _pose(
 
 
 def _undo_applied(document: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
-    """From the world of the file, its scale undone, to the original one."""
+    """Transform from the world of the file, its scale undone, to the original one."""
     applied = np.eye(4)
     if "applied_transform" in document:
         applied[:3] = np.array(document["applied_transform"], dtype=np.float64)[:3, :4]

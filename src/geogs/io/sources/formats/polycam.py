@@ -14,12 +14,12 @@ from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_k
 from geogs.io.sources.pose_priors import rigid_pose
 
 _DIGITS, _LEAST_GAP = 18, 1e-3
-"""Of a time in microseconds, at most; and seconds from one keyframe to the next, at least."""
+"""Most digits of a time in microseconds, and least seconds from one keyframe to the next."""
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Where an export of Polycam's raw data has cameras and images; none if it is no such."""
+    """Folders of cameras and images of an export of Polycam's raw data; none if it is no such."""
     base = folder / "keyframes"
     for cameras, images in _FOLDERS:
         if (base / cameras).is_dir() and (base / images).is_dir():

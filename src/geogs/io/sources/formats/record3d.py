@@ -54,7 +54,7 @@ class Files:
         return [f"rgbd/{p.name}" for p in (self.path / "rgbd").iterdir()]
 
     def read(self, name: str, largest: int) -> bytes:
-        """What one holds. Raises InputError if it is missing, too large, or damaged."""
+        """Content of one. Raises InputError if it is missing, too large, or damaged."""
         return read_bytes(self.path / name, largest)
 
 

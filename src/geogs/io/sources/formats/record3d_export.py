@@ -58,6 +58,6 @@ def open_record3d_export(folder: Path) -> ImageList:
 
 
 def _name(folder: Path) -> str:
-    """That of the recording, where the folder has the one that all exports have."""
+    """Name of the recording, also where the folder is called as that of any export."""
     whole = folder.resolve()
     return whole.parent.name if whole.name.upper() == "EXR_RGBD" else whole.name

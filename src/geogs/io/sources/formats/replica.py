@@ -56,7 +56,7 @@ def _depth(image: Path, number: int, per_metre: float, there: Container[str]) ->
 
 
 def _units_per_metre(scene: Path) -> float:
-    """By ``cam_params.json``, else the data set's. Raises InputError for what cannot be."""
+    """Scale of the depths in ``cam_params.json``, or else that of the data set."""
     file = _parameters(scene)
     document = None if file is None else read_json(file)
     camera = document.get("camera") if isinstance(document, dict) else None

@@ -1,4 +1,4 @@
-"""Open what does not wait: a camera, a stream, a pipe, or a file that plays at its pace."""
+"""Open live sources: a camera, a stream, a pipe, or a file played at its pace."""
 
 import sys
 import time

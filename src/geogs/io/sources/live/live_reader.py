@@ -1,4 +1,4 @@
-"""A reader of frames that do not wait: whoever is late gets the newest, and the rest is counted."""
+"""A reader of live frames: it gives the newest, and counts those it dropped."""
 
 import threading
 from collections.abc import Generator, Iterator, Sequence
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 @runtime_checkable
 class Feed(Protocol):
-    """Where frames come from at their own pace."""
+    """A source of frames that come at their own pace."""
 
     info: RecordingInfo
 

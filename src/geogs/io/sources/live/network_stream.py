@@ -1,4 +1,4 @@
-"""Streams of the network through FFmpeg (PyAV), which is waited for no longer than said."""
+"""Network streams through FFmpeg (PyAV), with a timeout."""
 
 import time
 from collections.abc import Generator
@@ -21,7 +21,7 @@ _OPTIONS = {
 
 
 class NetworkStream:
-    """What a camera or a server of the network sends."""
+    """Feed of a camera or a server in the network."""
 
     def __init__(self, address: LiveAddress) -> None:
         """Raises InputError if it cannot be opened or gives no image."""

@@ -27,12 +27,12 @@ _FORMATS = {"420": "yuv420p", "mono": "gray", "444": "yuv444p"}
 _LEVELS = np.arange(256)
 _FULL_Y = np.clip(np.rint((_LEVELS - 16) * 255 / 219), 0, 255).astype(np.uint8)
 _FULL_C = np.clip(np.rint((_LEVELS - 128) * 255 / 224 + 128), 0, 255).astype(np.uint8)
-"""What levels of Y, and of Cb and Cr, are in the full range (ITU-R BT.601)."""
+"""Levels of Y, and of Cb and Cr, in the full range (ITU-R BT.601)."""
 
 
 @dataclass(frozen=True)
 class RawFormat:
-    """How frames lie in a pipe."""
+    """Format of the frames in a pipe."""
 
     width: int
     height: int

@@ -18,9 +18,9 @@ class Convention:
     """A way in which poses are given wrongly."""
 
     name: str
-    """What the poses look like."""
+    """Description of such poses."""
     remedy: str
-    """What the user has to do to them."""
+    """Correction by the user."""
     correct: Callable[[Poses], Poses]
     """Right world-to-camera poses, up to the world, from those that were read."""
 

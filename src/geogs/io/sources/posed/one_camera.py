@@ -177,7 +177,7 @@ def _way(
 
 
 def _corners(camera: Camera, target: Camera) -> Float64[np.ndarray, "2 2"]:
-    """How far two corners of the image move from one camera to the other, in pixels."""
+    """Motion of two corners of the image from one camera to the other, in pixels."""
     corners = np.array([[0.0, 0.0], [target.width - 1.0, target.height - 1.0]])
     rays = (corners - (target.cx, target.cy)) / (target.fx, target.fy)
     return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy) - corners

@@ -1,4 +1,4 @@
-"""Do the poses fit the images? If not: are they in another axis convention than assumed?"""
+"""Check that poses fit the images, or name the axis convention in which they do."""
 
 import logging
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ GOOD_ERROR = 0.004
 GOOD_IN_FRONT = 0.75
 """Part of the matches that lies in front of both cameras if the poses fit, at least."""
 CLEARLY = 3.0
-"""How many times larger the error of wrong poses must be than that of the convention that fits."""
+"""Least ratio of the error of wrong poses to that of the convention that fits."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How well poses explain matches between images."""
+    """Agreement of poses with matches between images."""
 
     error: float
     """Median Sampson distance to the epipolar line, as a part of the long edge."""
@@ -53,7 +53,7 @@ class PoseCheck:
     pairs: int
     """Pairs of images that could be matched."""
     warning: str | None
-    """What to tell the user; none where the poses fit."""
+    """Warning for the user; none where the poses fit."""
 
 
 def check_poses(source: PosedSource) -> PoseCheck:
@@ -102,7 +102,7 @@ def judge(source: PosedSource, pairs: list[MatchedPair], camera: Camera) -> Pose
 
 
 def fit_of(T_cw: Poses, pairs: list[MatchedPair], camera: Camera) -> Fit:
-    """How well poses explain matched pairs; every pair counts alike, the median one is taken."""
+    """Agreement of poses with matched pairs: the median over pairs."""
     K_inverse = np.linalg.inv(camera.K)
     errors, in_front = [], []
     for pair in pairs:

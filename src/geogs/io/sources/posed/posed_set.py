@@ -1,4 +1,4 @@
-"""What one format says about its images before any is read: files, poses, cameras, points."""
+"""An image set as its format describes it: files, poses, cameras, points."""
 
 import logging
 from collections.abc import Sequence
@@ -67,7 +67,7 @@ class PosedSet:
     """Name of the scene."""
     files: tuple[PosedFile, ...]
     scene_scale: str = "arbitrary"
-    """What one unit of the world is: metres, millimetres or arbitrary."""
+    """Unit of the world: metres, millimetres or arbitrary."""
     points: SparsePoints | None = None
     left_out: tuple[tuple[str, str], ...] = ()
     """Names of images that have no pose, each with the reason as a clause."""

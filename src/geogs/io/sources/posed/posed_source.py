@@ -27,7 +27,7 @@ class PosedImage:
     index: int
     """Its place in the source, from 0."""
     label: str
-    """What to call it in a message: the file."""
+    """Its name in messages: the file."""
     timestamp: float
     """Seconds."""
     image: UInt8[np.ndarray, "h w 3"]
@@ -58,7 +58,7 @@ class PosedSource:
         self.name = posed.name
         """Name of the scene."""
         self.scene_scale = posed.scene_scale
-        """What one unit of the world is: metres, millimetres or arbitrary."""
+        """Unit of the world: metres, millimetres or arbitrary."""
         self.points: SparsePoints | None = posed.points
         """Sparse points of the world with which images see them, if the format has any."""
         self.left_out: tuple[tuple[str, str], ...] = posed.left_out
@@ -96,14 +96,14 @@ class PosedSource:
         return fingerprint_of([file.path for file in self._files])
 
     def stored_bytes(self) -> list[int]:
-        """What each image takes in its file; 0 where it is gone.
+        """Size of the file of each image; 0 where it is gone.
 
         Of images of the same thing by the same camera, a blurred one takes least.
         """
         return [size_of(file.path) or 0 for file in self._files]
 
     def label(self, index: int) -> str:
-        """What to call image ``index`` in a message."""
+        """Name of image ``index`` in messages."""
         return str(self._files[index].path)
 
     def __getitem__(self, index: int) -> PosedImage:

@@ -16,7 +16,7 @@ _REDUCED = {
     4: cv2.IMREAD_REDUCED_COLOR_4,
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
-"""How OpenCV is told to decode a picture at a part of its size."""
+"""OpenCV's flags to decode a picture at a fraction of its size."""
 
 
 def stored_size(path: Path) -> tuple[int, int] | None:

@@ -34,9 +34,9 @@ _log = logging.getLogger(__name__)
 _BEGINNINGS = {".bag": b"#ROSBAG V2.0", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _METADATA = "metadata.yaml"
 _SUFFIXES = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg")
-"""What image transports put behind the name of a topic."""
+"""Suffixes that image transports add to the name of a topic."""
 _LOOKED_AT = 30
-"""Messages that tell the rate, and among which the first picture must be."""
+"""Messages from which the rate is measured, and among which the first picture must be."""
 
 
 def is_bag(path: Path) -> bool:
@@ -61,7 +61,7 @@ class Bag:
         with _opened(path) as bag:
             chosen = _chosen(bag, path, topic)
             self.topic: str = chosen
-            """Whose images are read."""
+            """Topic of the images that are read."""
             connections = _connections(bag, chosen)
             length = sum(c.msgcount for c in connections)
             times = [t for _, t, _ in islice(bag.messages(connections=connections), _LOOKED_AT)]
@@ -210,7 +210,7 @@ def _calibration(bag: Any, topic: str) -> Calibration | None:
 
 
 def _camera_topic(bag: Any, topic: str) -> str | None:
-    """Where the camera of an image topic is described: beside it, or the only one in the bag."""
+    """Topic with the camera of an image topic: beside it, or the only one in the bag."""
     known = [c.topic for c in bag.connections if c.msgtype == CAMERA_INFO and c.msgcount]
     base = _without_transport(topic)
     beside = (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info")

@@ -1,4 +1,4 @@
-"""What ROS messages hold: pictures (``sensor_msgs/Image``, ``CompressedImage``) and the camera
+"""Content of ROS messages: pictures (``sensor_msgs/Image``, ``CompressedImage``) and the camera
 (``sensor_msgs/CameraInfo``) of images as the sensor gave them."""
 
 from typing import Any
@@ -86,7 +86,7 @@ def _raw(message: Any) -> UInt8[np.ndarray, "h w 3"] | None:
 
 
 def calibration_of(message: Any, topic: str, is_rectified: bool) -> Calibration | None:
-    """What a message says of the camera; none where it says that this is unknown.
+    """The calibration in a message; none where it says that this is unknown.
 
     Args:
         message: of ROS 1 or ROS 2, which call the same things K and k.

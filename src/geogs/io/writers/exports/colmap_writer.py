@@ -25,7 +25,7 @@ _OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 @dataclass(frozen=True)
 class _Model:
-    """What the three files hold."""
+    """Content of the three files."""
 
     camera: Camera
     names: list[str]
@@ -34,9 +34,9 @@ class _Model:
     """Quaternion w, x, y, z and translation of each image."""
     points: SeenPoints
     seen: list[np.ndarray]
-    """Where each image sees which point."""
+    """Observations of each image."""
     tracks: list[np.ndarray]
-    """Numbers of the images that see each point, and its place in each one's list."""
+    """Observations of each point: number of the image, and index in that image's list."""
 
     @property
     def parameters(self) -> list[float]:
@@ -71,7 +71,7 @@ def _pose(T_cw: Float64[np.ndarray, "4 4"]) -> list[float]:
 
 
 def _observations(points: SeenPoints, image: int) -> np.ndarray:
-    """Where an image sees which point."""
+    """Observations of an image: pixel and number of the point."""
     own = points.seen_image == image
     table = np.empty(int(own.sum()), _OBSERVATION)
     table["x"], table["y"] = (points.seen_at[own] + 0.5).T
@@ -80,7 +80,7 @@ def _observations(points: SeenPoints, image: int) -> np.ndarray:
 
 
 def _tracks(points: SeenPoints) -> list[np.ndarray]:
-    """Numbers of the images that see each point, and its place in each one's list."""
+    """Observations of each point: number of the image, and index in that image's list."""
     place = np.zeros(len(points.seen_image), np.int64)
     order = np.argsort(points.seen_image, kind="stable")
     counts = np.bincount(points.seen_image)

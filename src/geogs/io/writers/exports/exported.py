@@ -1,4 +1,4 @@
-"""What is exported, whatever the format: posed images, and points with who sees them."""
+"""Records that all formats of exports share: posed images, and points with who sees them."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 @dataclass(frozen=True)
 class ExportedImage:
-    """An image that has been written, and where it was taken."""
+    """An image that has been written, with its pose."""
 
     name: str
     """Name of the file, with its suffix."""
@@ -29,6 +29,6 @@ class SeenPoints:
     seen_point: Int64[np.ndarray, "m"]
     """Point of observation k; ascending."""
     seen_image: Int64[np.ndarray, "m"]
-    """Image of observation k, by its place."""
+    """Index of the image of observation k."""
     seen_at: Float64[np.ndarray, "m 2"]
     """Column and row of observation k, the centre of the first pixel at (0, 0)."""
