@@ -33,7 +33,7 @@ _NUMBER = re.compile(r"(\d+)\.\w+")
 """Names of files that are numbered, padded with zeros or not."""
 
 
-def read_tum_trajectory(path: str | Path) -> Trajectory:
+def read_tum_trajectory(path: Path) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` rows (spaces or commas, ``#`` starts a comment).
 
     A file that begins with the quaternion 1 0 0 0 is refused: it is the unit rotation with w first,
@@ -42,7 +42,6 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
     Raises:
         InputError: the file is missing, empty, not of eight columns, or its quaternions are not.
     """
-    path = Path(path)
     rows = read_rows(path, columns=(8,), layout="t tx ty tz qx qy qz qw")
     seconds, position, xyzw = rows[:, 0], rows[:, 1:4], rows[:, 4:]
     _check_quaternions(path, rows, _has_pose(np.column_stack([seconds, position]), xyzw))
@@ -108,12 +107,11 @@ def poses_from(
     return T_wc
 
 
-def read_replica_trajectory(path: str | Path) -> Trajectory:
+def read_replica_trajectory(path: Path) -> Trajectory:
     """Read one camera-to-world matrix a row: 16 numbers (Replica) or the upper 12 (KITTI).
 
     Row k is frame k at k / 30 s; rows without a pose are left out.
     """
-    path = Path(path)
     rows = read_rows(path, columns=(16, 12), layout="a 4x4 matrix a row")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3] = rows[:, :12].reshape(-1, 3, 4)
@@ -122,11 +120,8 @@ def read_replica_trajectory(path: str | Path) -> Trajectory:
     return matrix_trajectory(path, seconds, T_wc, valid)
 
 
-def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
+def read_seven_scenes_poses(folder: Path) -> Trajectory:
     """Read the ``frame-<k>.pose.txt`` files of a 7-Scenes sequence; frame k is at k / 30 s."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; give the folder of one 7-Scenes sequence.")
     files = numbered(folder.iterdir(), _POSE_FILE)
     if not files:
         raise InputError(f"{folder} holds no frame-*.pose.txt; give the folder of one sequence.")
@@ -135,9 +130,8 @@ def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
     return matrix_trajectory(folder, seconds, T_wc, is_rigid(T_wc))
 
 
-def read_poses(path: str | Path) -> Trajectory:
+def read_poses(path: Path) -> Trajectory:
     """Read poses in whichever of the formats above ``path`` is: a folder, or rows of 8, 12, 16."""
-    path = Path(path)
     if path.is_dir():
         for name in POSE_FILES:
             if (path / name).is_file():

@@ -28,7 +28,7 @@ class FocalRefinement:
     """Standard deviations of k1 and k2; none where they were not found beside it."""
     keyframes: int = 0
     frames: int = 0
-    """Used for it."""
+    """Frames that were looked at."""
     failure: str | None = None
     """Why it failed."""
     is_explained: bool = True

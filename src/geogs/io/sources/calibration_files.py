@@ -61,13 +61,12 @@ _RECORD3D, _SCANNETPP = "metadata", "pose_intrinsic_imu.json"
 _log = logging.getLogger(__name__)
 
 
-def read_calibration(path: str | Path) -> Calibration:
+def read_calibration(path: Path) -> Calibration:
     """Read the camera in ``path``; the format follows from the name and the content.
 
     Raises:
         InputError: the file is missing, unreadable, of no known format, or of another lens.
     """
-    path = Path(path)
     is_json = path.suffix == ".json" or path.name == _RECORD3D
     document, text = (read_json(path), "") if is_json else (None, _text_of_settings(path))
     try:

@@ -31,7 +31,7 @@ class DepthCamera:
 
     camera: Camera
     T_colour_depth: tuple[float, float, float]
-    """Translation from the depth camera's axes to the parallel ones of the colour camera; metres."""
+    """Translation from its axes to those of the colour camera, which are parallel; metres."""
 
 
 @runtime_checkable

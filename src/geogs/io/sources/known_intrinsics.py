@@ -84,7 +84,7 @@ def calibration_from_exif(image: Path) -> Calibration | None:
 
 def _from_option(option: str) -> Calibration:
     if Path(option).is_file():
-        return read_calibration(option)
+        return read_calibration(Path(option))
     words = option.replace(",", " ").split()
     try:
         return calibration_from_words(words, "as given")

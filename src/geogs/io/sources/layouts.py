@@ -49,10 +49,10 @@ class Layout:
         for name in self.pictures:
             parts = Path(name).parts
             for depth in range(len(parts), 0, -1):
-                root = folder.parents[depth - 1] if depth <= len(folder.parents) else folder
-                is_part = folder.parts[-depth:] == parts[:depth]
-                if is_part and has_images(root / name) and self.holds(root):
-                    return Place(root, root / name)
+                if folder.parts[-depth:] == parts[:depth]:
+                    root = folder.parents[depth - 1]
+                    if has_images(root / name) and self.holds(root):
+                        return Place(root, root / name)
         return None
 
 

@@ -155,7 +155,7 @@ def _text_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
 
 
 class _WrongModel(ValueError):
-    """An error in words of ours, which repeat nothing of the file."""
+    """An error in words of ours."""
 
 
 class _Bytes:

@@ -21,6 +21,7 @@ from geogs.io.sources.formats.image_files import (
     ImageFile,
     ImageList,
     Place,
+    has_images,
     holds_pictures,
     images_in,
     in_order_of_time,
@@ -47,9 +48,10 @@ def place_of_model(folder: Path) -> Place | None:
     folder = folder.absolute()
     for pictures, model in _MODELS.items():
         parts = Path(model).parts
-        root = folder.parents[len(parts) - 1] if len(parts) <= len(folder.parents) else folder
-        if folder.parts[-len(parts) :] == parts and holds_pictures(root, (pictures,)):
-            return Place(root, root / pictures)
+        if folder.parts[-len(parts) :] == parts:
+            root = folder.parents[len(parts) - 1]
+            if has_images(root / pictures):
+                return Place(root, root / pictures)
     return None
 
 

@@ -40,8 +40,7 @@ def find_transforms(path: Path) -> Path | None:
 def open_nerfstudio(path: Path) -> PosedSet:
     """Read the images that ``transforms.json`` lists, in natural order of their names."""
     file = find_transforms(path)
-    if file is None:
-        raise InputError(f"{path} holds no transforms.json.")
+    assert file is not None, "the file was found before"
     document = _read(file)
     try:
         frames = sorted(document["frames"], key=lambda frame: natural_key(frame["file_path"]))

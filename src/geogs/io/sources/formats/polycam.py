@@ -36,8 +36,7 @@ def open_polycam(folder: Path) -> ImageList:
         InputError: there are none, or a camera cannot be understood.
     """
     places = polycam_folders(folder)
-    if places is None:
-        raise InputError(f"{folder} is no export of Polycam's raw data.")
+    assert places is not None, "the folder is an export"
     cameras, images = places
     files, lenses = [], []
     paths = sorted(cameras.glob("*.json"), key=lambda p: natural_key(p.name))
