@@ -20,6 +20,8 @@ Argument = torch.Tensor | int | float | None
 _MAX_STATIC_SHARED = 48 * 1024
 _MAX_DYNAMIC_SHARED = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _INVALID_CONTEXT = 201
+_FORMATS = {"int": "i4x", "unsigned": "I4x", "float": "f4x", "double": "d", "long long": "q"}
+"""Formats by which ``struct`` packs a parameter into eight bytes."""
 
 
 @functools.cache
@@ -51,7 +53,8 @@ class DeviceKernel:
         self._function = function
         self._index = index
         # Every argument has eight bytes of a buffer, which the driver reads through pointers.
-        self._packer = struct.Struct("<" + "".join(_format(p) for p in signature.parameters))
+        formats = ("Q" if p.endswith("*") else _FORMATS[p] for p in signature.parameters)
+        self._packer = struct.Struct("<" + "".join(formats))
         self._buffer = ctypes.create_string_buffer(self._packer.size)
         start = ctypes.addressof(self._buffer)
         places = range(start, start + self._packer.size, 8)
@@ -130,15 +133,6 @@ def _use_primary_context(index: int) -> None:
     code = _driver()[0].cuCtxSetCurrent(_primary_context(index))
     if code:
         raise DeviceError(f"GPU {index} cannot be used ({driver_error(code)}).")
-
-
-def _format(parameter: str) -> str:
-    """How ``struct`` packs a parameter into eight bytes."""
-    if parameter.endswith("*"):
-        return "Q"
-    return {"int": "i4x", "unsigned": "I4x", "float": "f4x", "double": "d", "long long": "q"}[
-        parameter
-    ]
 
 
 def load_kernels(

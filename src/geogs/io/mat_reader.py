@@ -66,19 +66,17 @@ def _arrays(data: bytes, names: Collection[str]) -> Iterator[tuple[str, np.ndarr
     rest = memoryview(data)[_HEADER:]
     while len(rest):
         element = _element(rest, order)
-        matrix = element
-        if element.type == _COMPRESSED:
-            matrix = _element(_unpacked(element.whole(), _HEAD), order)
+        is_packed = element.type == _COMPRESSED
+        matrix = _element(_unpacked(element.whole(), _HEAD), order) if is_packed else element
         if matrix.type == _MATRIX:
             head = _Head.of(matrix.data, order)
             if head.name in names:
-                if element.type == _COMPRESSED:
+                if is_packed:
                     if matrix.size > LARGEST_ARRAY:
                         raise ValueError("too large")
                     matrix = _element(_unpacked(element.whole(), _TAG + matrix.size), order)
                 yield head.name, head.array(matrix.whole(), order)
         # What is compressed is not filled up to a multiple of eight bytes.
-        is_packed = element.type == _COMPRESSED
         rest = rest[_TAG + element.size if is_packed else element.end :]
 
 

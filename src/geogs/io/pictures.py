@@ -57,7 +57,7 @@ def decoded(path: Path, flags: int) -> Decoded:
 
 def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
     """Decode the bytes of such a file."""
-    if not len(data) or _promises_too_much(data) or _has_an_endless_part(data):
+    if not len(data) or _claims_too_many_pixels(data) or _has_oversized_chunk(data):
         return Decoded(None)
     picture, noise = _decode(data, flags, alone=False)
     if noise:  # of this one, or of one that another thread decodes
@@ -120,7 +120,7 @@ def header_read(path: Path) -> Iterator[Any]:
         yield picture
 
 
-def _promises_too_much(data: np.ndarray) -> bool:
+def _claims_too_many_pixels(data: np.ndarray) -> bool:
     """Whether a header claims more pixels than so few bytes can hold."""
     from PIL import Image
 
@@ -137,7 +137,7 @@ def _promises_too_much(data: np.ndarray) -> bool:
     return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
 
 
-def _has_an_endless_part(data: np.ndarray) -> bool:
+def _has_oversized_chunk(data: np.ndarray) -> bool:
     """Whether a chunk of a PNG claims to be far longer than the file, for which OpenCV would
     allocate up to 4 GiB."""
     file, at = data.data, len(_PNG)

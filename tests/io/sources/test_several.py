@@ -71,7 +71,7 @@ def test_two_videos_of_a_place_make_one_map(small_room, tmp_path):
     pictures = sorted((small_room / "results").glob("frame*"))
     k = json.loads((small_room / "cam_params.json").read_text())["camera"]
     # The second begins where the first has been, and ends elsewhere.
-    for part, chosen in zip(parts, (pictures[:24], pictures[12:36]), strict=True):
+    for part, chosen in zip(parts, (pictures[:18], pictures[9:27]), strict=True):
         part.mkdir()
         for picture in chosen:
             shutil.copy(picture, part)
@@ -84,9 +84,9 @@ def test_two_videos_of_a_place_make_one_map(small_room, tmp_path):
     ]  # fmt: skip
     assert cli.main(argv) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["frames"] == 48
+    assert summary["frames"] == 36
     assert [v["name"] for v in summary["videos"]] == ["a", "b"]
-    assert summary["videos"][1]["first_frame"] == 24
+    assert summary["videos"][1]["first_frame"] == 18
     assert [s["fate"] for s in summary["segments"]] == ["world"]
     lost = sum(round(30 * (last - first)) + 1 for first, last in summary["lost_spans"])
     assert lost <= 2

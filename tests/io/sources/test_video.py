@@ -76,14 +76,8 @@ def test_rotated_video_is_upright_with_its_intrinsics(tmp_path, rotation):
 
 
 def test_display_angle_to_quarter_turns():
-    assert [clockwise_quarter_turns(a) for a in (0.0, -90.0, 90.0, 180.0, -180.0, 89.9)] == [
-        0,
-        1,
-        3,
-        2,
-        2,
-        3,
-    ]
+    angles = (0.0, -90.0, 90.0, 180.0, -180.0, 89.9)
+    assert [clockwise_quarter_turns(a) for a in angles] == [0, 1, 3, 2, 2, 3]
     image = gradient_image(0)
     np.testing.assert_array_equal(turn_upright(image, 1)[0, -1], image[0, 0])
     np.testing.assert_array_equal(turn_upright(image, 2), image[::-1, ::-1])

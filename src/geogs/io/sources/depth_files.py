@@ -105,7 +105,7 @@ class RectifiedDepth:
         if self.file.sensor is not None:
             depth = registered(depth, self.file.sensor, self.colour)
         resized = self.rectifier.resized_camera
-        u, v = self.rectifier.places(self.offsets)
+        u, v = self.rectifier.source_pixels(self.offsets)
         height, width = depth.shape
         x = (u + 0.5) * (width / resized.width) - 0.5
         y = (v + 0.5) * (height / resized.height) - 0.5

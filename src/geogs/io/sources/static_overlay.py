@@ -16,7 +16,7 @@ LEAST_FRAMES = 40
 """Shortest video that is searched: in about a second a camera hardly moves, and what it turns about
 stands still."""
 _LEAST_IMAGES = 8
-_FEW = 0.9
+_AGREEMENT = 0.9
 """Part of the images in which a place has to look the same: of a glitch nothing follows."""
 _BLUR = 1.0
 """Pixels, against noise and the blocks of a codec."""
@@ -37,7 +37,7 @@ _DENSE = 0.08
 """Part of the pixels around that have a still gradient, where one counts."""
 _LEAST_AREA, _LEAST_GRADIENTS = 0.002, 0.001
 """Least area of a static part and of its gradients, as fractions of the image."""
-_SHARE = 0.05
+_LEAST_RATIO = 0.05
 """Part of the pixels of what looks the same in all images that still gradients have to be: a sky
 does, too, wherever the camera is."""
 
@@ -57,7 +57,7 @@ def static_overlay(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarra
     smooth = np.stack([cv2.GaussianBlur(image, (0, 0), _BLUR) for image in images])
     usual = np.median(smooth, axis=0).astype(np.float32)
     changes = np.abs(smooth - usual)
-    rank = int(_FEW * (len(images) - 1))
+    rank = int(_AGREEMENT * (len(images) - 1))
     change = np.partition(changes, rank, axis=0)[rank]
     if (change > _CHANGE).mean() < _LEAST_MOVING:
         return None
@@ -84,7 +84,7 @@ def _parts(
     still = still & (around > _DENSE)
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, side)
     found = np.zeros_like(still)
-    for seen, least in ((still, 0.0), (same, _SHARE)):
+    for seen, least in ((still, 0.0), (same, _LEAST_RATIO)):
         closed = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_CLOSE, disk)
         count, part = cv2.connectedComponents(closed)
         area = np.bincount(part.ravel(), minlength=count)

@@ -110,14 +110,12 @@ class Rectifier:
         ``offsets`` say where in the resized image, relative to where the lens alone puts it, each
         pixel of the working image was seen; what was outside gets the colour of the border.
         """
-        maps = self._maps
-        if offsets is not None:
-            maps = self.places(offsets)
+        maps = self._maps if offsets is None else self.source_pixels(offsets)
         if maps is not None:
             image = cv2.remap(image, *maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
         return np.ascontiguousarray(image)
 
-    def places(
+    def source_pixels(
         self, offsets: Float[np.ndarray, "h w 2"] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Column and row of each pixel of the working image in the resized image."""

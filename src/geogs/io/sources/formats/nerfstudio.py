@@ -46,7 +46,7 @@ def open_nerfstudio(path: Path) -> PosedSet:
         frames = sorted(document["frames"], key=lambda frame: natural_key(frame["file_path"]))
         to_world = _undo_applied(document)
         files = tuple(_file(file, document, frame, to_world, k) for k, frame in enumerate(frames))
-    except (np.linalg.LinAlgError, *UNUSABLE) as error:
+    except UNUSABLE as error:
         what = f" (no entry {error})" if isinstance(error, KeyError) else ""
         raise InputError(f"{file} cannot be understood{what}; is it complete?") from None
     return PosedSet("nerfstudio", _name(file), files)

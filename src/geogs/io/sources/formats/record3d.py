@@ -140,7 +140,7 @@ class Record3dRecording:
             self._poses = measured_poses(metadata.get("poses", []))
             self._times = [float(t) for t in metadata.get("frameTimestamps") or []]
             self._size = _whole(metadata, "dh", _LIDAR[0]), _whole(metadata, "dw", _LIDAR[1])
-        except (*UNUSABLE, UnicodeDecodeError):
+        except UNUSABLE:
             raise InputError(f"{path}: its metadata cannot be understood; copy it again.") from None
         if not (0 < fps < 1e4):
             raise InputError(f"{path}: its metadata says {fps} frames a second.")
