@@ -6,6 +6,7 @@ somebody else's list is shown to anybody.
 
 import json
 import os
+import re
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ LARGEST_DOCUMENT = 1 << 26
 LARGEST_SETTINGS = 1 << 17
 """Bytes of a YAML document, whose reader is slow: a calibration, settings, a card."""
 
+_NUMBER = re.compile(r"(\d+)\.\w+")
+"""Names of files that are numbered, padded with zeros or not."""
 _DEEPEST = 50
 """Groups within groups."""
 _LONGEST_MESSAGE = 200
@@ -90,6 +93,12 @@ def require_file(path: str | Path) -> Path:
 def first_file(paths: Iterable[Path]) -> Path | None:
     """The first of some files that is there; none where none is."""
     return next((path for path in paths if path.is_file()), None)
+
+
+def numbered(paths: Iterable[Path], pattern: re.Pattern[str] = _NUMBER) -> list[tuple[int, Path]]:
+    """Files by the number that a pattern finds in their names, ascending."""
+    matches = ((pattern.fullmatch(path.name), path) for path in paths)
+    return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:

@@ -45,25 +45,25 @@ def thread_map(
 ) -> list[R]:
     """``list(map(function, items))`` over the workers; results in the order of the items.
 
-    The caller's thread takes part, and tells the ``progress``, which may raise an exception as any
-    item may: those that nobody has begun are left.
+    The caller's thread takes part, and reports the ``progress``, which may raise an exception as
+    any item may: items that are not begun yet are left.
     """
     results: dict[int, R] = {}
-    caller, told = threading.get_ident(), 0
+    caller, reported = threading.get_ident(), 0
 
-    def tell() -> None:
-        nonlocal told
-        while told < len(results):
-            told += 1
-            progress(told / len(items))
+    def report() -> None:
+        nonlocal reported
+        while reported < len(results):
+            reported += 1
+            progress(reported / len(items))
 
     def one(n: int) -> None:
         results[n] = function(items[n])
         if threading.get_ident() == caller:
-            tell()
+            report()
 
     run_chunks(one, len(items), worker_count())
-    tell()
+    report()
     return [results[n] for n in range(len(items))]
 
 
@@ -99,8 +99,8 @@ def ordered_map(
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:
     """Call ``function(chunk)`` for every chunk; threads take the next one as they become free.
 
-    The caller's thread takes part. After an exception chunks that nobody has begun are left, and it
-    is raised once all threads are done. Calls within calls share the threads.
+    The caller's thread takes part. After an exception chunks that are not begun yet are left; it is
+    raised once all threads are done. Calls within calls share the threads.
     """
     counter, failed = itertools.count(), False
 

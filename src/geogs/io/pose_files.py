@@ -6,14 +6,14 @@ dropped, and the log says how many; a file whose numbers mean something else is 
 
 import logging
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from geogs.documents import read_text
+from geogs.documents import numbered, read_text
 from geogs.errors import InputError
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.types import Trajectory
@@ -29,8 +29,6 @@ ORIENTATIONS = "orientations.tum"
 """The file of a result with the frames of which no more than the orientation is known."""
 _log = logging.getLogger(__name__)
 _POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
-_NUMBER = re.compile(r"(\d+)\.\w+")
-"""Names of files that are numbered, padded with zeros or not."""
 
 
 def read_tum_trajectory(path: Path) -> Trajectory:
@@ -139,12 +137,6 @@ def read_poses(path: Path) -> Trajectory:
         return read_seven_scenes_poses(path)
     columns = len(next(_numbers_by_line(path), (0, []))[1])
     return read_tum_trajectory(path) if columns == 8 else read_replica_trajectory(path)
-
-
-def numbered(paths: Iterable[Path], pattern: re.Pattern[str] = _NUMBER) -> list[tuple[int, Path]]:
-    """Files by the number that a pattern finds in their names, ascending."""
-    matches = ((pattern.fullmatch(path.name), path) for path in paths)
-    return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def _read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:

@@ -148,7 +148,7 @@ def _from_json(document: Any, path: Path) -> Calibration:
         return replace(record3d_camera(document), origin=str(path))
     if path.name == _SCANNETPP:
         return scannetpp_camera(document, path)
-    # "source" is the camera of the images as they came, in the intrinsics.json of a result.
+    # "source" is the camera of the images as stored, in the intrinsics.json of a result.
     entry = document.get("source") or document.get("camera") or document
     if "fl_x" in entry:
         return calibration_from_nerfstudio(entry, path)

@@ -91,7 +91,7 @@ class RectifiedDepth:
 
     file: RecordedDepth
     colour: Calibration
-    """Camera of the image as it came."""
+    """Camera of the stored image."""
     rectifier: Rectifier
     """Made the working image."""
     offsets: Float[np.ndarray, "h w 2"] | None = None

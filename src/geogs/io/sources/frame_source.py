@@ -116,7 +116,7 @@ class Source:
         self.camera = first.camera
         """The pinhole camera of every frame."""
         self.calibration = first.calibration
-        """The camera of the first recording's images as they came, upright, with its distortion."""
+        """The camera of the first recording's images as stored, upright, with its distortion."""
         self.shutter = first.shutter
         """The shutter by which rows are rectified."""
         self.mask = first.mask
@@ -141,9 +141,9 @@ class Source:
         self.is_calibration_open = any(images.is_calibration_open for images in recordings)
         """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
         self.is_overlay_open = first.is_overlay_open
-        """Whether nobody gave a mask, and what all images show over the scene may be masked."""
+        """Whether no mask was given, and static overlays may be masked out."""
         self.is_shutter_open = first.is_shutter_open
-        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        """Whether the readout is not known yet, and can be estimated from the frames."""
         self.place = ReadingPlace()
         """Progress of reading, at each frame of this iteration."""
 
@@ -181,7 +181,7 @@ class Source:
         return self.calibration.origin
 
     def with_calibration(self, calibration: Calibration) -> "Source":
-        """The same frames, undistorted by another calibration of the images as they came."""
+        """The same frames, undistorted by another calibration of the stored images."""
         return Source([images.known_better(calibration) for images in self._recordings])
 
     def with_lens(self, found: FoundLens) -> "Source":
@@ -199,12 +199,12 @@ class Source:
         return Source([images.known_better(focal=focal) for images in self._recordings])
 
     def without_overlay(self, overlay: Bool[np.ndarray, "h w"]) -> "Source":
-        """The same frames, without what all images of :meth:`spread` show over the scene."""
+        """The same frames, with a static overlay of the images of :meth:`spread` masked out."""
         return Source([images.known_better(overlay=overlay) for images in self._recordings])
 
     def spread(self, count: int) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """So many images from all over the recordings, at working size, lens and rows as they came;
-        fewer, or none, where they can only be had by reading all before them."""
+        """So many images from all over the recordings, at working size, lens and rows as stored;
+        fewer, or none, where a recording can only be read from its beginning."""
         each = -(-count // len(self._recordings))
         found = [raw.image for images in self._recordings for raw in images.spread(each)]
         return [image for image in found if image is not None]
@@ -216,7 +216,7 @@ class Source:
 
     @property
     def followed_clips(self) -> FollowedClips:
-        """Clips of the first recording's images at working size, as they came."""
+        """Clips of the first recording's images at working size, lens and rows as stored."""
         return self._recordings[0].followed_clips
 
     def linked_frames(self) -> Generator[Frame, None, None]:
@@ -252,13 +252,13 @@ class Source:
 
     def _frames_of(self, number: int) -> Generator[Frame, None, None]:
         """The frames of a recording after the present place."""
-        images, former = self._recordings[number], self.place.recordings[:number]
+        images, previous = self._recordings[number], self.place.recordings[:number]
         here = (*self.place.recordings, RecordingPlace())[number]
         index, end = self.place.frames, self.place.time
         for raw in images.read(here.read):
             here = here.after(raw)
             if raw.image is None:
-                self.place = ReadingPlace(index, end, (*former, here))
+                self.place = ReadingPlace(index, end, (*previous, here))
                 continue
             follows_cut = here.span is None and index > 0
             if here.span is None:
@@ -266,7 +266,7 @@ class Source:
                 span = RecordingSpan(images.name, index, raw.timestamp + shift, raw.timestamp)
                 here = replace(here, span=span, shift=shift)
             end = raw.timestamp + here.shift
-            self.place = ReadingPlace(index + 1, end, (*former, here))
+            self.place = ReadingPlace(index + 1, end, (*previous, here))
             pose = images.poses.of(raw.timestamp, raw.pose)
             pose = None if pose is None else replace(pose, world=number)
             left = None if images.length is None else max(0, images.length - here.read)

@@ -20,7 +20,7 @@ from geogs.shutter.rolling_camera import RollingCamera
 FieldOfView = float | Literal["auto"]
 """Degrees along the longer side of the working image."""
 FISHEYE_VIEW = 90.0
-"""Degrees that are kept of a fisheye where nobody asks for others; a pinhole stretches more."""
+"""Default field of view of a fisheye, degrees; a pinhole image would stretch more."""
 
 
 def resized_to(

@@ -62,11 +62,11 @@ class WorkingImages:
         followed_clips: FollowedClips | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """``calibration`` of the upright images, where it is known better than the reader's.
+        """``calibration`` of the upright images, instead of the reader's.
 
-        ``shutter``, where it is known better than the settings'; ``focal`` of the working images
-        instead of what the settings ask for; ``followed_clips`` of the same recording; ``overlay``,
-        true where all of its images at working size show what is no part of the scene.
+        ``shutter``, instead of the settings'; ``focal`` of the working images, instead of what the
+        settings ask for; ``followed_clips`` of the same recording; ``overlay``, true where all
+        images at working size show a static overlay.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -88,13 +88,13 @@ class WorkingImages:
         self.calibration = calibration or resolve_intrinsics(
             config.intrinsics, info.calibration, info.width, info.height, info.quarter_turns
         )
-        """The camera of the images as they came, upright, with its distortion."""
+        """The camera of the images as stored, upright, with its distortion."""
         given = Shutter() if config.readout == "auto" else Shutter(config.readout, "as given")
         self.shutter = shutter or given
         """The shutter by which rows are rectified; a global one until it is estimated."""
         self._focal = focal
         self.followed_clips = followed_clips or FollowedClips(self._clips)
-        """Clips from all over the selection, at working size, with lens and rows as they came."""
+        """Clips from all over the selection, at working size, with lens and rows as stored."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
         self.camera = self._rectifier.camera
         """The pinhole camera of the working images."""
@@ -116,7 +116,7 @@ class WorkingImages:
         """Whether images come with the depth that a sensor measured."""
 
     def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
-        """A mask of an image as it came, or at working size, straightened as images are."""
+        """A mask of an image as stored, or at working size, undistorted as images are."""
         return mask_as_image(self._rectifier, mask)
 
     @property
@@ -142,10 +142,8 @@ class WorkingImages:
         focal: float | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
     ) -> "WorkingImages":
-        """The same images with what is given instead of what was known: undistorted by another
-        calibration, rectified by another readout, as a pinhole of another focal length sees them,
-        without what all of them show over the scene.
-        """
+        """The same images, undistorted by another calibration, rectified by another readout, as a
+        pinhole of another focal length sees them, or with a static overlay masked out."""
         info = self.reader.info
         known = calibration.fit(info.width, info.height) if calibration else self.calibration
         return WorkingImages(
@@ -154,8 +152,8 @@ class WorkingImages:
         )  # fmt: skip
 
     def spread(self, count: int) -> Iterator[RawFrame]:
-        """So many images from all over the selection, at working size, lens and rows as they came;
-        fewer, or none, where they can only be had by reading all before them."""
+        """So many images from all over the selection, at working size, lens and rows as stored;
+        fewer, or none, where the recording can only be read from its beginning."""
         config, length = self._config, self.reader.info.length
         if length is None and self.reader.info.seconds is not None:
             length = round(self.reader.info.seconds * self.reader.info.fps)
@@ -167,12 +165,12 @@ class WorkingImages:
 
     @property
     def is_overlay_open(self) -> bool:
-        """Whether nobody gave a mask, and what all images show over the scene may be masked."""
+        """Whether no mask was given, and static overlays may be masked out."""
         return self._config.mask is None and self._config.mask_overlay and not self.is_live
 
     @property
     def is_shutter_open(self) -> bool:
-        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        """Whether the readout is not known yet, and can be estimated from the frames."""
         return not self.is_live and self._config.readout == "auto" and self.shutter == Shutter()
 
     @property
@@ -187,7 +185,7 @@ class WorkingImages:
         return read_clips(self.reader, self._config, self._at_working_size, first)
 
     def _at_working_size(self, raw: RawFrame) -> RawFrame:
-        """The image at working size, lens and rows as they came."""
+        """The image at working size, lens and rows as stored."""
         raw = of_one_size(raw, self.reader.info)
         if raw.image is None:
             return raw
@@ -248,7 +246,7 @@ class WorkingImages:
     def _rectified(
         self, depth: MeasuredDepth | None, moved: Float[np.ndarray, "h w 2"] | None = None
     ) -> MeasuredDepth | None:
-        """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
+        """Stored depth for the pixels of a working image, whose rows were ``moved``."""
         if not (self.uses_depth and isinstance(depth, RecordedDepth)):
             return None
         return RectifiedDepth(depth, self.calibration, self._rectifier, moved)

@@ -21,12 +21,11 @@ def write_intrinsics(
     calibration: Calibration | None = None,
     shutter: Shutter | None = None,
 ) -> None:
-    """Write the pinhole of the frames, and with it the calibration of the images as they came.
+    """Write the pinhole of the frames, and the calibration and the shutter of the stored images.
 
-    The frames have a global shutter; that of the images as they came is written with its readout in
-    seconds, by which rows were rectified.
-    All in pixels with the centre of the first pixel at (0, 0). Given as ``intrinsics``,
-    the file stands for the source's calibration where it has one.
+    The readout, by which rows were rectified, is in seconds; all else is in pixels with the centre
+    of the first pixel at (0, 0). Given as ``intrinsics``, the file stands for the calibration of
+    the source where it has one.
     """
     document: dict[str, object] = {
         "model": "PINHOLE",

@@ -1,8 +1,8 @@
 """The files of a command take their places together, or none of them does.
 
-New files are written into a folder of their own beside the old ones, which geogs makes and so has
-no links in it. Until the last of them is on the disk nothing else in the folder is touched; where
-the disk is full or the command ends before, it goes, and all is as it was. Then
+New files are written into a new folder beside the old ones, which has no links in it. Until the
+last of them is on the disk nothing else is touched; if the disk is full or the command ends before,
+that folder is deleted, and all is as it was. Then
 
 1. the folders that the files need are made, or are seen to be folders and no links,
 2. the new folder is renamed from ``.geogs.N.new`` to ``.geogs.N.ready``, by which it counts,
@@ -10,20 +10,17 @@ the disk is full or the command ends before, it goes, and all is as it was. Then
    for are deleted, and last the list of the result's files is renamed into its place.
 
 A process that is killed before the second step leaves a folder that the next command deletes; one
-that is killed after it a folder whose files the next command puts into their places. Of the third
-step every part may be done twice. It takes no space but what folders grow by for new names, so a
-disk that was not full before the second step is not full in it.
+that is killed after it a folder whose files the next command puts into their places: each part of
+the third step may be done twice. It needs hardly any space, as files are only renamed.
 
-Other programs open files by their names, which stay what they are: they see each file old or new
-and whole, and for as long as the third step takes some old beside some new ones. (A link to a
-folder of one result or the next would spare them that, but on many disks there are no links, and
-copies of the folder would be of the link.) Nothing of geogs reads such a mixture.
+Other programs see each file whole, old or new, and during the third step some old beside some new
+ones. (A link to the folder of the current result would avoid that, but not all disks have links,
+and copies of the folder would be of the link.) Nothing of geogs reads such a mixture.
 
-What may be deleted says the list, ``.geogs.json``: the names and SHA-256 of the files of the
-result, which lies among the new files before any of these has its place. A list may come from
-somebody else: names in it lead nowhere out of the folder, and a file that holds anything else than
-geogs wrote stays. Folders of new files say in their names (N) by which number the file system knows
-them, so that one that was made elsewhere and copied here is not taken for one of ours.
+The list ``.geogs.json`` says which files may be deleted: names and SHA-256 of the result's files.
+It may come from somebody else: names in it cannot lead out of the folder, and a file with other
+content stays. N in the names of new folders is their inode number, so that a folder that was copied
+from elsewhere is not taken for one of ours.
 """
 
 import json

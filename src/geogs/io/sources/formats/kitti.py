@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import UNUSABLE, first_file
+from geogs.documents import UNUSABLE, first_file, numbered
 from geogs.errors import InputError
-from geogs.io.pose_files import is_rigid, matrix_trajectory, numbered, read_rows
+from geogs.io.pose_files import is_rigid, matrix_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import kitti_camera, kitti_offset
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, Place, images_in

@@ -10,9 +10,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.documents import first_file
+from geogs.documents import first_file, numbered
 from geogs.errors import InputError
-from geogs.io.pose_files import numbered
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import depth_beside

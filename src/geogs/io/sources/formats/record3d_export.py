@@ -5,9 +5,9 @@
 
 from pathlib import Path
 
-from geogs.documents import UNUSABLE, read_json
+from geogs.documents import UNUSABLE, numbered, read_json
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND, numbered
+from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.data_set_cameras import record3d_camera
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, images_in
 from geogs.io.sources.formats.record3d import measured_poses

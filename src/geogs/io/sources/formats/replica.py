@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import first_file, read_json
+from geogs.documents import first_file, numbered, read_json
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND, numbered, read_replica_trajectory
+from geogs.io.pose_files import FRAMES_PER_SECOND, read_replica_trajectory
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import DepthFile

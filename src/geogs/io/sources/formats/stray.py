@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.documents import read_text
+from geogs.documents import numbered, read_text
 from geogs.errors import InputError
-from geogs.io.pose_files import numbered, poses_from
+from geogs.io.pose_files import poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.video_file import VideoFile

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from geogs.documents import numbered
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND, numbered, quaternion_trajectory, read_rows
+from geogs.io.pose_files import FRAMES_PER_SECOND, quaternion_trajectory, read_rows
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, Place, images_in
 from geogs.io.sources.formats.timed_poses import with_timed_poses
