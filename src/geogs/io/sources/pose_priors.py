@@ -103,10 +103,9 @@ def chosen_poses(asked: str, info: RecordingInfo) -> ChosenPoses:
         return ChosenPoses()
     if word not in KEYWORDS:
         return ChosenPoses(True, TimedPoses(read_tum_trajectory(expanded(asked))))
-    has_poses = info.poses_by is not None
-    if word == "prior" and not has_poses:
+    if word == "prior" and not info.has_poses:
         raise InputError(
             f"{info.name} has no poses of another tracker beside its images that can be read here; "
             "name their file (rows t tx ty tz qx qy qz qw), or leave out --poses."
         )
-    return ChosenPoses(has_poses and (word == "prior" or info.is_capture))
+    return ChosenPoses(info.has_poses and (word == "prior" or info.is_capture))

@@ -72,18 +72,21 @@ class RecordingInfo:
     """The camera, if the data set describes it."""
     quarter_turns: int = 0
     """Clockwise quarter turns from the stored to the upright images."""
-    has_depth: bool = False
-    """Whether a sensor's depth comes with any of the images, and can be read."""
     depths: int = 0
-    """Images with such a depth."""
+    """Images with the depth of a sensor that can be read."""
     depth_fault: str = ""
     """Why there is none though files speak of it, as a clause."""
-    poses_by: str | None = None
-    """Source of the poses, which are no truth, beside the images; none where there are none."""
+    has_poses: bool = False
+    """Whether poses, which are no truth, come with the images."""
     is_capture: bool = False
     """Whether an app plainly tracked its camera, in metres."""
     seconds: float | None = None
     """Time of its last image, about; none where it is not known."""
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any images come with the depth of a sensor that can be read."""
+        return self.depths > 0
 
 
 @runtime_checkable

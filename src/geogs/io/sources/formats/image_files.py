@@ -65,7 +65,7 @@ class ImageList:
         name: str,
         files: Sequence[ImageFile],
         calibration: Calibration | None,
-        poses_by: str | None = None,
+        has_poses: bool = False,
         is_capture: bool = False,
         usual: ImageFile | None = None,
         depth_fault: str = "",
@@ -75,8 +75,8 @@ class ImageList:
         self.files = files
         depths = [file.depth for file in files if file.depth is not None]
         asked = depths[:: max(1, len(depths) // _ASKED)]
-        has_depth = any(depth.metres() is not None for depth in asked)
-        if depths and not has_depth:
+        can_be_read = any(depth.metres() is not None for depth in asked)
+        if depths and not can_be_read:
             depth_fault = f"none of its pictures of depth can be read, such as {depths[0].path}"
         usual = usual or usual_file(files)
         candidates = (decoded(file.path, cv2.IMREAD_COLOR).rgb for file in (usual, *files))
@@ -89,10 +89,9 @@ class ImageList:
             fps=median_rate(np.diff([file.timestamp for file in files])),
             length=len(files),
             calibration=calibration,
-            has_depth=has_depth,
-            depths=len(depths) if has_depth else 0,
+            depths=len(depths) if can_be_read else 0,
             depth_fault=depth_fault,
-            poses_by=poses_by,
+            has_poses=has_poses,
             is_capture=is_capture,
         )  # fmt: skip
 

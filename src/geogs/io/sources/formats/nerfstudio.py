@@ -66,9 +66,7 @@ def with_transforms(images: ImageList, folder: Path) -> ImageList:
     if not any(file.pose is not None for file in files):
         return images
     said = images.info
-    return ImageList(
-        said.kind, said.name, files, said.calibration, "the transforms.json beside them"
-    )
+    return ImageList(said.kind, said.name, files, said.calibration, has_poses=True)
 
 
 def _finite(T: np.ndarray) -> np.ndarray:

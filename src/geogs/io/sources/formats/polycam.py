@@ -66,7 +66,7 @@ def open_polycam(folder: Path) -> ImageList:
         fx, fy, cx, cy, width=int(width), height=int(height), origin="Polycam"
     )
     name = folder.resolve().name
-    return ImageList("polycam", name, files, calibration, "Polycam", is_capture=True)
+    return ImageList("polycam", name, files, calibration, has_poses=True, is_capture=True)
 
 
 def _times(names: list[str]) -> dict[str, float]:

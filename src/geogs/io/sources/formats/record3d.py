@@ -144,13 +144,13 @@ class Record3dRecording:
             raise InputError(f"{path}: its metadata cannot be understood; copy it again.") from None
         if not (0 < fps < 1e4):
             raise InputError(f"{path}: its metadata says {fps} frames a second.")
-        depths = sum(name.endswith(".depth") for name in names)
-        has_depth = depths > 0 and _lzfse() is not None
-        fault = "Record3D's depth needs pip install 'geogs[record3d]'" if depths else ""
+        depths, fault = sum(name.endswith(".depth") for name in names), ""
+        if depths and _lzfse() is None:
+            depths, fault = 0, "Record3D's depth needs pip install 'geogs[record3d]'"
         self.info = RecordingInfo(
             "record3d", path.resolve().stem, width, height, fps, len(self._images), calibration,
-            has_depth=has_depth, depths=depths, depth_fault="" if has_depth else fault,
-            poses_by="Record3D" if self._poses else None, is_capture=True,
+            depths=depths, depth_fault=fault,
+            has_poses=bool(self._poses), is_capture=True,
         )  # fmt: skip
 
     @property

@@ -52,7 +52,7 @@ def open_record3d_export(folder: Path) -> ImageList:
     has_depth = next((folder / "depth").glob("*.exr"), None) is not None
     fault = "depth in EXR is not read; Record3D's .r3d of the same recording has it, too"
     return ImageList(
-        "record3d", _name(folder), files, calibration, "Record3D" if poses else None,
+        "record3d", _name(folder), files, calibration, bool(poses),
         is_capture=True, depth_fault=fault if has_depth else "",
     )  # fmt: skip
 

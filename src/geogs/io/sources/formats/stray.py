@@ -47,9 +47,8 @@ class StrayRecording(VideoFile):
             kind="stray",
             name=folder.resolve().name,
             calibration=_calibration(matrix, *stored) if matrix.is_file() else None,
-            has_depth=bool(self._depths),
             depths=len(self._depths),
-            poses_by="Stray Scanner" if self._poses else None,
+            has_poses=bool(self._poses),
             is_capture=True,
         )
 
