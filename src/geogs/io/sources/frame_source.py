@@ -66,7 +66,7 @@ class RecordingPlace:
         """The place after one more image, which is logged if it is the first of its faults."""
         if raw.image is None:
             if not self.skipped:
-                _log.warning("%s; skipped.", raw.fault)
+                _log.warning("%s %s; skipped.", raw.label, raw.why_not)
             return replace(self, skipped=self.skipped + 1)
         if raw.is_damaged and not self.damaged:
             _log.warning("%s is damaged; used as far as it goes.", raw.label)

@@ -47,11 +47,6 @@ class RawFrame:
     mask: Bool[np.ndarray, "h w"] | None = None
     """Pixels of a working image that may show the scene, by its own mask; none where all do."""
 
-    @property
-    def fault(self) -> str:
-        """Its name and the fault."""
-        return f"{self.label} {self.why_not}"
-
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:

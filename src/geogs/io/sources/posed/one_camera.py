@@ -12,10 +12,11 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import RESAMPLING, lens_maps
+from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.posed.posed_set import PosedFile
-from geogs.io.sources.posed.stored_pictures import stored_size
+from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
 from geogs.io.sources.undistort import Rectifier, mask_as_image, resized_to
 
 _log = logging.getLogger(__name__)
@@ -82,25 +83,18 @@ class OneCamera:
                 cropped, len(self._files),
             )  # fmt: skip
 
-    def stored_shape(self, index: int) -> tuple[int, int]:
-        """Width and height of image ``index`` on disk."""
-        return self._sizes[index]
+    def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+        """Image ``index`` and its mask as the common camera sees them; none where all is valid.
 
-    def needed_shape(self, index: int) -> tuple[int, int]:
-        """Width and height to which image ``index`` is resized first, whatever comes after it."""
-        return self._ways[index].size
-
-    def view(
-        self,
-        index: int,
-        picture: UInt8[np.ndarray, "h w 3"],
-        mask: Bool[np.ndarray, "mh mw"] | None,
-    ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], Bool[np.ndarray, "h2 w2"] | None]:
-        """Image ``index`` and its mask, each of any size, as the common camera sees them."""
-        way = self._ways[index]
-        image = way(picture)
-        if mask is not None:
-            mask = mask_as_image(way, mask)
+        Raises:
+            InputError: it cannot be read.
+        """
+        file, stored, way = self._files[index], self._sizes[index], self._ways[index]
+        image = way(read_picture(file.path, stored, way.size))
+        mask = None
+        if file.mask is not None:
+            valid = read_mask(file.mask, stored[::-1], of_alpha=file.mask == file.path)
+            mask = mask_as_image(way, valid)
         covered = way.covered() if isinstance(way, Resampler) else None
         if covered is not None:
             mask = covered if mask is None else mask & covered

@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.pictures import read_mask
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_set import PosedSet, SparsePoints, without_invalid_poses
-from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
+from geogs.io.sources.posed.stored_pictures import stored_size
 from geogs.io.sources.reader import fingerprint_of, read_ahead, size_of
 from geogs.io.sources.working_images import check_large_enough
 
@@ -115,12 +114,7 @@ class PosedSource:
         """
         index = range(self.length)[index]
         file = self._files[index]
-        stored, needed = self._one_camera.stored_shape(index), self._one_camera.needed_shape(index)
-        picture = read_picture(file.path, stored, needed)
-        mask = None
-        if file.mask is not None:
-            mask = read_mask(file.mask, stored[::-1], of_alpha=file.mask == file.path)
-        image, mask = self._one_camera.view(index, picture, mask)
+        image, mask = self._one_camera.read(index)
         return PosedImage(index, self.label(index), file.timestamp, image, file.T_cw, mask)
 
     def __iter__(self) -> Iterator[PosedImage]:
