@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,10 +118,18 @@ class ImageList:
 
 def open_image_folder(folder: Path) -> ImageList:
     """Read a folder of images, or its sub-folder that holds them, in order of time or name."""
-    place = _folder_with_images(folder)
+    place = image_folder(folder)
+    if place is None:
+        raise InputError(
+            f"{folder} holds no images ({', '.join(sorted(SUFFIXES))}) and is no data set known "
+            "here; give a video, a folder of images, or a sequence of a data set as it was "
+            "unpacked."
+        )
     files = in_order_of_time(images_in(place))
-    calibration = find_calibration(*dict.fromkeys(_folders_of_project(folder, place)))
     usual = usual_file(files)
+    # A calibration lies with the images, or above a folder called images.
+    above = [place.parent] if place.resolve().name in _SUBFOLDERS else []
+    calibration = find_calibration(*dict.fromkeys((folder, place, *above)))
     calibration = calibration or calibration_from_exif(usual.path)
     return ImageList("images", folder.resolve().name, files, calibration, usual=usual)
 
@@ -180,9 +189,9 @@ def listed(
     return sorted(files, key=lambda file: file.timestamp)
 
 
-def finite(word: str) -> float:
-    """The number that a word is. Raises ValueError if it is none, or not finite."""
-    number = float(word)
+def finite(value: Any) -> float:
+    """A word or another value as a finite number. Raises ValueError or TypeError if it is none."""
+    number = float(value)
     if not math.isfinite(number):
         raise ValueError
     return number
@@ -195,12 +204,6 @@ def usual_file(files: Sequence[ImageFile]) -> ImageFile:
     sizes = [upright_size(file.path) for file in asked]
     counts = Counter(size for size in sizes if size is not None)
     return asked[sizes.index(counts.most_common(1)[0][0])] if counts else files[0]
-
-
-def _folders_of_project(folder: Path, place: Path) -> list[Path]:
-    """Folders that may hold a calibration: that of the images, or above one called images."""
-    above = [place.parent] if place.resolve().name in _SUBFOLDERS else []
-    return [folder, place, *above]
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -265,15 +268,6 @@ def images_in(folder: Path) -> list[Path]:
 
 def _is_image(name: str) -> bool:
     return Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
-
-
-def _folder_with_images(folder: Path) -> Path:
-    if place := image_folder(folder):
-        return place
-    raise InputError(
-        f"{folder} holds no images ({', '.join(sorted(SUFFIXES))}) and is no data set known here; "
-        f"give a video, a folder of images, or a sequence of a data set as it was unpacked."
-    )
 
 
 def file_names(folder: Path) -> list[str]:

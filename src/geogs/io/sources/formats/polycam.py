@@ -1,6 +1,5 @@
 """Raw data that Polycam exported: keyframes with their cameras, poses and depths."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,13 @@ from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
 from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import DepthFile, depth_beside
-from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_key
+from geogs.io.sources.depth_files import depth_beside
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, finite, natural_key
 from geogs.io.sources.pose_priors import rigid_pose
 
 _DIGITS, _LEAST_GAP = 18, 1e-3
 """Most digits of a time in microseconds, and least seconds from one keyframe to the next."""
+_LENS = ("fx", "fy", "cx", "cy", "width", "height")
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 
 
@@ -49,14 +49,11 @@ def open_polycam(folder: Path) -> ImageList:
         try:
             rows = [[document[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
             T_wc = np.array([*rows, [0, 0, 0, 1]], dtype=np.float64)
-            lens = [float(document[k]) for k in ("fx", "fy", "cx", "cy")]
-            lens += [float(document["width"]), float(document["height"])]
-            if not all(map(math.isfinite, lens)):
-                raise ValueError
-            lenses.append(lens)
+            lenses.append([finite(document[name]) for name in _LENS])
         except UNUSABLE:
             raise InputError(f"{path} holds no camera of Polycam; export it again.") from None
-        depth = _depth(folder / "keyframes", path.stem)
+        name = f"{path.stem}.png"  # confidences 0, 127 and 255 are low, medium and high
+        depth = depth_beside(cameras.parent / "depth" / name, cameras.parent / "confidence" / name)
         pose = rigid_pose(T_wc @ OPENCV_FROM_OPENGL)
         files.append(ImageFile(image, times[path.stem], depth, pose))
     if not files:
@@ -77,8 +74,3 @@ def _times(names: list[str]) -> dict[str, float]:
     seconds = {name: (int(name) - int(names[0])) * 1e-6 for name in names}
     gaps = np.diff([*seconds.values()])
     return seconds if len(gaps) and np.median(gaps) > _LEAST_GAP else evenly
-
-
-def _depth(keyframes: Path, name: str) -> DepthFile | None:
-    path, confidence = (keyframes / kind / f"{name}.png" for kind in ("depth", "confidence"))
-    return depth_beside(path, confidence)  # of which 0, 127 and 255 are low, medium and high
