@@ -17,7 +17,7 @@ from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.posed_views import PosedViews
-from geogs.application.progress.posed_plan import PosedPlan
+from geogs.application.progress.plan import PosedPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result, Written

@@ -14,8 +14,7 @@ from geogs.application.machine.compilation import compiling
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
-from geogs.application.progress.plan import Plan
-from geogs.application.progress.run_plan import RunPlan
+from geogs.application.progress.plan import Plan, RunPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder

@@ -14,7 +14,7 @@ from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
 from geogs.application.machine.compilation import OF_MAP, OF_SEARCH
-from geogs.application.progress.run_plan import RunPlan
+from geogs.application.progress.plan import RunPlan
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
