@@ -39,11 +39,10 @@ def without_overlay(source: Source, progress: RunProgress | None = None) -> Sour
     found = static_overlay([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
     if found is None:
         return source
-    if progress is not None:
-        progress.write(
-            f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
-            "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
-        )
+    (progress or RunProgress()).write(
+        f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
+        "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
+    )
     return source.without_overlay(found)
 
 

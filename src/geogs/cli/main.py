@@ -46,11 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    name = arguments[0] if arguments else "--help"
+    name, *rest = arguments or ["--help"]
     if name in ("-h", "--help", "help"):
         print(help_text())
         return 0
-    if arguments[1:] == [ASKED]:
+    if rest == [ASKED]:
         helps = {known: command.help for known, command in all_commands().items()}
         print(matching(helps, name))
         return 0
@@ -61,7 +61,7 @@ def _dispatch(arguments: list[str]) -> int:
     process.show_warnings()
     if _memory_limit() < _LEAST_MEMORY:
         raise MemoryError
-    return command.run(arguments[1:])
+    return command.run(rest)
 
 
 def help_text() -> str:
@@ -90,9 +90,9 @@ def print_error(sentence: str) -> None:
 
 
 def _guarded(run: Callable[[], int]) -> int:
-    """Run a command; errors of ours become one line and an exit code, others keep a traceback.
+    """Run a command; errors that a user can mend become one line and an exit code.
 
-    With ``GEOGS_DEBUG=1`` ours keep it, too.
+    Others keep their traceback, and with ``GEOGS_DEBUG=1`` all do.
     """
     try:
         code = run()
@@ -103,21 +103,16 @@ def _guarded(run: Callable[[], int]) -> int:
     except KeyboardInterrupt as interrupt:
         print_error(" ".join(["interrupted.", *map(str, interrupt.args)]).strip())
         return EXIT_INTERRUPTED
-    except GeogsError as error:
-        if os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
-            raise
-        print_error(str(error))
-        return EXIT_ERROR
     except Exception as error:
-        sentence = _of_the_system(error)
+        sentence = str(error) if isinstance(error, GeogsError) else _resource_error(error)
         if sentence is None or os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
             raise
         print_error(sentence)
         return EXIT_ERROR
 
 
-def _of_the_system(error: Exception) -> str | None:
-    """What to say where the system gave too little; nothing for other errors, which are ours."""
+def _resource_error(error: Exception) -> str | None:
+    """What to say where the system gave too little; nothing for other errors, which are bugs."""
     said = str(error)
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
         return "Too many files are open; raise the limit (ulimit -n)."

@@ -57,12 +57,9 @@ def parse(argv: Sequence[str]) -> ReconstructOptions:
 
 
 def _defaults(given: Given) -> ReconstructOptions:
-    name = _preset_name(given)
-    return ReconstructOptions(config=reconstruct_preset(name), preset=name)
-
-
-def _preset_name(given: Given) -> Preset:
     """The preset asked for, else the one that suits the device."""
-    if "preset" in given:
-        return cast(Preset, given["preset"])
-    return "accurate" if is_gpu(given.get("device", "auto")) else "default"
+    asked = given.get("preset")
+    if asked is None:
+        asked = "accurate" if is_gpu(given.get("device", "auto")) else "default"
+    name = cast(Preset, asked)
+    return ReconstructOptions(config=reconstruct_preset(name), preset=name)

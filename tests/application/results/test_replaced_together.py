@@ -122,7 +122,6 @@ def made(tmp_path_factory) -> Path:
 def quick(monkeypatch) -> None:
     """What takes time and is the same each time is not computed."""
     surface = Mesh(MESH.vertices + 1, MESH.faces, MESH.normals)
-    monkeypatch.setattr(remeshing, "extract_mesh", lambda *_: surface)
     monkeypatch.setattr(surfaces, "extract_mesh", lambda *_: surface)
     found = MetricScale("a known distance", FACTOR, 0.01)
     monkeypatch.setattr(rescaling, "find_scale", lambda *_: found)

@@ -80,7 +80,7 @@ def _one(
     focal = calibration.fx
     variance = 0.0
     for point, ray, deviation in zip(ends, rays, along, strict=True):
-        variance += 2 * (CLICK * point[2] / focal) ** 2 / 2
+        variance += (CLICK * point[2] / focal) ** 2
         towards = np.append(ray, 1.0) @ between / length
         variance += (towards * deviation) ** 2
     return known.metres / length, known.metres / length * variance**0.5 / length

@@ -184,7 +184,7 @@ def open_photographs(
     open_them = _registered("open_photographs")
     source: PosedSource = open_them(
         folder, config, kept, hold_out, again, progress, stop, seconds, expects
-    )  # fmt: skip
+    )
     return source
 
 

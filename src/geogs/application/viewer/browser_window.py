@@ -240,6 +240,12 @@ class Window:
                 part.visible = self._switches[name].value
 
 
+def reduced(picture: UInt8[np.ndarray, "h w 3"], longest: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Every so many-th pixel of a picture, so that no side is longer."""
+    step = -(-max(picture.shape[:2]) // longest)
+    return np.ascontiguousarray(picture[::step, ::step])
+
+
 def _look(client: Any, eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
     """Move the camera of somebody who looks."""
     client.camera.up_direction = up

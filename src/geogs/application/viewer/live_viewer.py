@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.application.viewer.browser_window import Window
+from geogs.application.viewer.browser_window import Window, reduced
 from geogs.application.viewer.observer import RunObserver
 from geogs.evaluation.held_camera import level_axes
 from geogs.evaluation.pages.keyframe_layers import layer_picture
@@ -108,7 +108,7 @@ class LiveViewer(RunObserver):
             disks = thinned(slam.snapshot())
         return Update(
             words,
-            _small(picture),
+            reduced(picture, _PICTURE_EDGE),
             slam.camera,
             None if seen is None else np.linalg.inv(seen.numpy()),
             ids,
@@ -153,8 +153,3 @@ def thinned(disks: MapSnapshot) -> MapSnapshot:
     step = -(-len(disks) // MOST_DISKS)
     kept = {name: getattr(disks, name)[::step].cpu() for name in MapSnapshot.__slots__}
     return replace(disks, **kept)
-
-
-def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    step = -(-max(picture.shape[:2]) // _PICTURE_EDGE)
-    return np.ascontiguousarray(picture[::step, ::step])

@@ -6,7 +6,7 @@ import numpy as np
 
 from geogs.application.results.result_page import stand
 from geogs.application.results.saved_result import SavedResult
-from geogs.application.viewer.browser_window import Window
+from geogs.application.viewer.browser_window import Window, reduced
 from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.pages.keyframe_layers import layer_picture
@@ -45,9 +45,7 @@ def _show_keyframes(result: SavedResult, window: Window) -> None:
     shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
     for number in shown.tolist():
         image = result.image(number)
-        if image is not None:
-            step = -(-max(image.shape) // _IMAGE_EDGE)
-            image = np.ascontiguousarray(image[::step, ::step])
+        image = None if image is None else reduced(image, _IMAGE_EDGE)
         id, T_wc = int(views.keyframe_id[number]), np.linalg.inv(views.T_cw[number])
         window.show_keyframe(id, T_wc, result.camera, image)
 
