@@ -26,7 +26,7 @@ class ReconstructionTable:
 
     map: MapTable
     frame: MapFrame
-    """In which the map is made."""
+    """Frame in which the map is made."""
     images: list[int]
     """Places in their source of the images, as they were added."""
     seconds: float = 0.0
@@ -41,7 +41,7 @@ class ReconstructionOutput:
     stopwatch: Stopwatch
     _keyframes: KeyframeSet
     _poses: list[Float[Tensor, "4 4"]]
-    """As they were given."""
+    """World-to-camera poses as given."""
     _all: Trajectory | None
     """Poses of images that were not added, too."""
     _begin: float | None

@@ -78,7 +78,7 @@ def self_calibrated(
         )
         return source
     calibration = refined(source.calibration, source.camera.fx, found)
-    progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
+    progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
 
 
@@ -130,7 +130,7 @@ def refined(
     )  # fmt: skip
 
 
-def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
+def _calibration_sentence(calibration: Calibration, assumed: str) -> str:
     failure = calibration.refinement.failure if calibration.refinement is not None else None
     if failure is None:
         return f"Intrinsics: {calibration.origin}."
@@ -141,7 +141,7 @@ def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
     )
 
 
-def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
+def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> str:
     """What was known of a lens, what all matches say of it, and what was done, in a sentence."""
     was = ",".join(f"{k:.4g}" for k in before.distortion) if before.is_distorted else "none"
     focal = ""

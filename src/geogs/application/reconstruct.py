@@ -14,7 +14,7 @@ from geogs.application.checkpoints.reconstruct_state import ReconstructState, fi
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
-from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.posed_views import PosedViews
 from geogs.application.progress.plan import PosedPlan
@@ -41,7 +41,7 @@ RECORDED = 4000
 """Pixels of the longer side of a photograph, about, where its size is taken as it is."""
 FIRST_BATCH = 24
 """Images read before it is known for how many the time lasts: some show what one costs."""
-_LEAST_BUDGET = 1.0
+_MIN_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
 
 
@@ -50,7 +50,7 @@ def left_of(budget: float | None, begin: float) -> float | None:
     there is no limit."""
     if budget is None:
         return None
-    return max(budget - (time.perf_counter() - begin), _LEAST_BUDGET)
+    return max(budget - (time.perf_counter() - begin), _MIN_BUDGET)
 
 
 def _compiled(
@@ -61,7 +61,7 @@ def _compiled(
         progress.write(
             "note: Kernels are compiled first, once on this machine; the --budget begins after it."
         )
-    return compiled_kernels(device) + kernels.wait(progress.stage)
+    return compile_gpu_kernels(device) + kernels.wait(progress.stage)
 
 
 @on_one_torch_thread
@@ -104,14 +104,14 @@ def reconstruct(
                 source = open_posed_source(source, config.input)
         begin += _compiled(used, kernels, budget, progress)
     checks = progress if check and poses == "given" else None
-    with full_memory_in_a_sentence():
+    with gpu_errors_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), left_of(budget, begin))
         _complete(scene, source, None, progress.stage, budget is not None, checks)
     return Result(scene, source, progress=progress)
 
 
 @on_one_torch_thread
-@full_memory_in_a_sentence()
+@gpu_errors_in_a_sentence()
 def reconstruct_to_folder(
     settings: ReconstructSettings,
     progress: RunProgress | None = None,

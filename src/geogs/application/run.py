@@ -11,7 +11,7 @@ from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import compiling
-from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
 from geogs.application.progress.plan import Plan, RunPlan
@@ -39,7 +39,7 @@ from geogs.threads import on_one_torch_thread
 
 
 @on_one_torch_thread
-@full_memory_in_a_sentence()
+@gpu_errors_in_a_sentence()
 def run(
     settings: RunSettings,
     progress: RunProgress | None = None,
@@ -74,20 +74,20 @@ def run(
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
     with claimed(wanted) as output, compiling(device) as kernels:
-        compiled_kernels(device)
+        compile_gpu_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
         opened = without_overlay(opened, progress)
         if (plan := _plan(driver, opened)) is not None:
             progress.plan(plan)
         if settings.offline:
             from geogs.application.structure_from_motion.offline import (
-                FEW,
+                MIN_CLIP_FPS,
                 PlacedOffline,
                 beginning_with,
             )
 
             told = self_calibrated(opened, config, device, progress, stop)
-            if told.recorded_fps >= FEW:
+            if told.recorded_fps >= MIN_CLIP_FPS:
                 told = with_shutter_found(told, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
@@ -176,7 +176,7 @@ def _begun(
 
 
 @on_one_torch_thread
-@full_memory_in_a_sentence()
+@gpu_errors_in_a_sentence()
 def resume(
     output: Path,
     settings: RunSettings | None = None,
@@ -202,7 +202,7 @@ def resume(
     opened = without_overlay(open_source(settings.source, config.input))
     source = saved.calibrated(opened)
     with claimed(output) as folder, compiling(device) as kernels:
-        compiled_kernels(device)
+        compile_gpu_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
         with saved.world(device) as world:
             slam = Slam(

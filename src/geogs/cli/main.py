@@ -25,10 +25,10 @@ _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN er
 """What errors of PyTorch begin with that no command has said in its own words."""
 _UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EIO, errno.ESTALE, errno.EROFS)
 """What systems say of paths, at the first look at them."""
-_LEAST_MEMORY = 1 << 30
+_MIN_MEMORY = 1 << 30
 """Bytes of addresses without which what is imported ends the process in words of its own."""
 _LONG_WORD = re.compile(r"(\S{80})\S{100,}(\S{80})")
-"""Such as a path that was put together by mistake, of which both ends are shown."""
+"""A word that is shown by both of its ends, such as a path put together by mistake."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,7 +59,7 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     command = find_command(name)
     process.show_warnings()
-    if _memory_limit() < _LEAST_MEMORY:
+    if _memory_limit() < _MIN_MEMORY:
         raise MemoryError
     return command.run(rest)
 

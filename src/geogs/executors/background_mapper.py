@@ -20,10 +20,10 @@ from geogs.world.keyframes import KeyframeTable
 R = TypeVar("R")
 
 MAX_WAIT_SECONDS = 0.05
-"""For which mapping waits at most, between two parts of its work, while a frame is tracked."""
+"""Longest wait of mapping between two parts of its work, while a frame is tracked."""
 MAX_WAITING = 12
-"""Tasks up to which it waits at all, so that it does not fall behind for ever; each
-keyframe makes two, and a correction another."""
+"""Waiting tasks from which on it does not wait, so as not to fall behind for ever; each keyframe
+makes two, and a correction another."""
 
 
 class BackgroundMapper:
@@ -50,7 +50,7 @@ class BackgroundMapper:
         self._is_closed = False
         self._failure: BaseException | None = None
         self.disks = 0
-        """In the map when a keyframe was last finished."""
+        """Disks in the map when a keyframe was last finished."""
         self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
         self._thread.start()
 

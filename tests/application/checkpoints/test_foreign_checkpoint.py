@@ -30,9 +30,7 @@ NAMING = [
     leaf for leaf in leaves(RunSettings)
     if (leaf.kind.base is Path or leaf.mark(NamesFile)) and leaf.name not in ("source", "output")
 ]  # fmt: skip
-PATH, TEXT = (
-    next(x for x in NAMING if (x.kind.base is Path) is is_path) for is_path in (True, False)
-)
+PATH, TEXT = (next(x for x in NAMING if x.kind.base is base) for base in (Path, str))
 OUTSIDE = [
     *((leaf, "/proc/self/mem") for leaf in NAMING),
     *((leaf, name) for leaf in (PATH, TEXT) for name in ("../secret", "http://host/file")),

@@ -35,7 +35,7 @@ class Result:
     progress: RunProgress = field(default_factory=RunProgress)
     """Follows the extraction of the mesh."""
     folder: Path | None = None
-    """Where it was written; none where it was not."""
+    """Folder to which it was written; none where it was not."""
 
     def __repr__(self) -> str:
         where = "not written" if self.folder is None else repr(str(self.folder))

@@ -10,7 +10,7 @@ from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_prese
 from geogs.io.sources.frame_source import Source
 
 _SECONDS_TO_CHOOSE = 0.02
-"""Of each frame."""
+"""Seconds for each frame."""
 
 
 def offline_config(config: Config) -> ReconstructConfig:

@@ -31,7 +31,7 @@ ROOM, BESIDE = 1.3, 0.1
 right of it one looks then, as a part of it."""
 _FAREWELL = 0.3
 """Seconds that the server takes to end."""
-_LEAST_MOVE = 1e-3
+_MIN_MOVE = 1e-3
 """Change of a number of its pose from which a keyframe is moved."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 """Parts of the scene, by the names of their switches."""
@@ -190,7 +190,7 @@ class Window:
             frustum.visible = self._switches["Keyframes"].value
         else:
             frustum, before = self._frusta[id]
-            if np.abs(before - T_wc).max() <= _LEAST_MOVE:
+            if np.abs(before - T_wc).max() <= _MIN_MOVE:
                 return
             frustum.wxyz, frustum.position = _place(T_wc)
         self._frusta[id] = frustum, T_wc

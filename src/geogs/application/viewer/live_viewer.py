@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MAX_TIME_FRACTION = 0.02
 """Fraction of the time that looking may take, of the run's thread and of the viewer's together."""
-MOST_DISKS = 30_000
+MAX_DISKS = 30_000
 _MAP_SECONDS = 3.0
 """Least time between two looks at the map."""
 _PICTURE_EDGE = 320
@@ -41,7 +41,7 @@ class Update:
     keyframes: Float[np.ndarray, "k 4 4"]
     """Camera to world."""
     disks: MapSnapshot | None = None
-    """None where they are as before."""
+    """Disks of the map; none where they are as before."""
 
 
 class LiveViewer(RunObserver):
@@ -149,7 +149,7 @@ class LiveViewer(RunObserver):
 
 
 def thinned(disks: MapSnapshot) -> MapSnapshot:
-    """Not more than can be sent."""
-    step = -(-len(disks) // MOST_DISKS)
+    """Every so many-th disk, so that no more are left than can be sent."""
+    step = -(-len(disks) // MAX_DISKS)
     kept = {name: getattr(disks, name)[::step].cpu() for name in MapSnapshot.__slots__}
     return replace(disks, **kept)

@@ -11,7 +11,7 @@ from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 
-MOST_FRUSTA = 24
+MAX_FRUSTA = 24
 """Most keyframes shown, evenly along the path."""
 _IMAGE_EDGE = 160
 
@@ -42,7 +42,7 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
 def _show_keyframes(result: SavedResult, window: Window) -> None:
     views = result.views
     count = len(views.keyframe_id)
-    shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
+    shown = np.unique(np.linspace(0, count - 1, min(count, MAX_FRUSTA)).round().astype(int))
     for number in shown.tolist():
         image = result.image(number)
         image = None if image is None else reduced(image, _IMAGE_EDGE)
