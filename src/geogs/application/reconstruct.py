@@ -32,8 +32,7 @@ from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
-from geogs.reconstruction import Reconstruction
-from geogs.reconstruction_output import ReconstructionTable
+from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
 
