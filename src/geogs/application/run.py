@@ -86,10 +86,10 @@ def run(
                 beginning_with,
             )
 
-            told = self_calibrated(opened, config, device, progress, stop)
-            if told.recorded_fps >= MIN_CLIP_FPS:
-                told = with_shutter_found(told, progress, stop)
-            return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
+            found = self_calibrated(opened, config, device, progress, stop)
+            if found.recorded_fps >= MIN_CLIP_FPS:
+                found = with_shutter_found(found, progress, stop)
+            return driver.complete(PlacedOffline(config, beginning_with(opened, found)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
         return _completed(driver, settings, work)
 

@@ -27,10 +27,10 @@ makes two, and a correction another."""
 
 
 class BackgroundMapper:
-    """What a mapper is told, done later by a thread, in the order in which it was told.
+    """Does the tasks of a mapper in a thread, in the order in which they were given.
 
     The thread's mapper has keyframes of its own: copies, which are brought up to date with each
-    task to what they were when it was told. So neither sees the other in the middle of its work,
+    task to what they were when it was given. So neither sees the other in the middle of its work,
     and tracking only ever pays for the copying of references. On a GPU the thread has a stream of
     its own, which gives way to the tracker's if that has a higher priority.
     """
@@ -58,7 +58,7 @@ class BackgroundMapper:
         """While a frame is tracked, for whose pose somebody waits."""
         return self._gate.taken()
 
-    # --- what tracking tells ---------------------------------------------------------------
+    # --- tasks from tracking ---------------------------------------------------------------
 
     def observe(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
         """See ``Mapper.observe``."""
@@ -83,9 +83,9 @@ class BackgroundMapper:
             torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
-        """An answer from the mapper as it is between two things that it was told.
+        """An answer from the mapper as it is between two tasks.
 
-        Waits for what is under way, and for nothing else that it was told before.
+        Waits for the task that is under way, and for no other that was given before.
         """
         answers: list[R] = []
         done = threading.Event()
@@ -107,7 +107,7 @@ class BackgroundMapper:
         return answers[0]
 
     def settled(self) -> Mapper:
-        """The mapper after all that it was told, on the keyframes of the store; the thread ends."""
+        """The mapper after all of its tasks, on the keyframes of the store; the thread ends."""
         with self._news:
             self._is_closed = True
             self._news.notify()

@@ -101,8 +101,8 @@ def verdict(
         reasons.append(_known_to(depth, known_to, "nothing tells the depths of what it sees"))
     if not known.focal <= MAX_FOCAL_DEVIATION:
         known_to = "the video tells it only to {:.0%}"
-        told = _known_to(known.focal, known_to, "the video does not tell it")
-        reasons.append(f"nobody said its focal length and {told}: give --intrinsics")
+        focal = _known_to(known.focal, known_to, "the video does not tell it")
+        reasons.append(f"nobody said its focal length and {focal}: give --intrinsics")
     elif not is_explained:
         reasons.append(
             "no camera explains how its first views move, as if much of what they show moves "

@@ -98,10 +98,10 @@ class PlacedOffline(Work):
         assert chosen is not None, "no frames have been chosen"
         self._chosen = None  # it takes much memory
         with self._stopwatch("structure from motion"):
-            told = video.calibration.refinement
+            refinement = video.calibration.refinement
             placed = place_frames(
                 chosen, video.camera, not video.is_calibration_open,
-                told is not None and told.failure is None,
+                refinement is not None and refinement.failure is None,
                 config.input.readout == "auto" and not video.shutter.readout, config.seed,
                 driver.report,
             )  # fmt: skip
@@ -152,9 +152,9 @@ def beginning_with(video: Source, found: Source) -> Source:
     begun = video if video.recorded_fps < MIN_CLIP_FPS else video.with_shutter(found.shutter)
     if not video.is_calibration_open:
         return begun
-    told = found.calibration
+    lens = found.calibration
     return begun.with_calibration(
-        replace(video.calibration, fx=told.fx, fy=told.fy, refinement=told.refinement)
+        replace(video.calibration, fx=lens.fx, fy=lens.fy, refinement=lens.refinement)
     )
 
 
