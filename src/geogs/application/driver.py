@@ -15,7 +15,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation
 from geogs.application.machine.device import REMEDY, gpu_errors_in_a_sentence
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.result import Result, Written
+from geogs.application.results.result import Result
 from geogs.application.results.surfaces import write_depth_mesh
 from geogs.application.results.write import write_files
 from geogs.application.run_settings import ReconstructSettings, RunSettings
@@ -117,7 +117,7 @@ class Driver:
         checkpoint.write()
         return Outcome.STOPPED
 
-    def complete(self, work: Work) -> Written:
+    def complete(self, work: Work) -> Result:
         """The work to its end, or until it is stopped, then the files of what there is by then.
 
         Raises:
@@ -138,7 +138,8 @@ class Driver:
                     outcome = work.complete(self, checkpoint, new)
                     finished, scene = outcome is Outcome.FINISHED, work.scene
                     self.kernels.wait(progress.stage)
-                    result = Result(scene, work.source, not finished, progress, output)
+                    can_resume = not finished and checkpoint.is_complete
+                    result = Result(scene, work.source, not finished, progress, output, can_resume)
                     write_more = partial(self._write_more, work, new)
                     write_files(new, result, write_more, settings.keyframe_images)
             except OutputError as error:
@@ -152,7 +153,7 @@ class Driver:
             )
         if finished and work.way_on:
             checkpoint.remove()
-        return Written(output, result, not finished and checkpoint.is_complete)
+        return result
 
     def _write_more(self, work: Work, new: Path) -> None:
         work.write_more(self, new)

@@ -20,7 +20,7 @@ from geogs.application.posed_views import PosedViews
 from geogs.application.progress.plan import PosedPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed, free_folder
-from geogs.application.results.result import Result, Written
+from geogs.application.results.result import Result
 from geogs.application.results.surfaces import Snapshots
 from geogs.application.run_settings import ReconstructSettings
 from geogs.application.structure_from_motion.photos import open_photographs
@@ -115,7 +115,7 @@ def reconstruct_to_folder(
     settings: ReconstructSettings,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
-) -> Written:
+) -> Result:
     """Reconstruct, and write the results, with checkpoints and snapshots on the way.
 
     Raises:

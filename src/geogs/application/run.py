@@ -18,7 +18,7 @@ from geogs.application.progress.plan import Plan, RunPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder
-from geogs.application.results.result import Written
+from geogs.application.results.result import Result
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
@@ -45,7 +45,7 @@ def run(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     observer: RunObserver | None = None,
-) -> Written:
+) -> Result:
     """Open the sources, calibrate, track and map every frame, write the results.
 
     Where ``settings.offline`` says so, frames are placed by structure from motion instead.
@@ -105,7 +105,7 @@ def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
     return opened if is_same or seen.field_of_view != "auto" else opened.with_focal(focal)
 
 
-def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Written:
+def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Result:
     """Raises TrackingLost, with what may help, if no frame could be tracked, nor placed."""
     try:
         return driver.complete(work)
@@ -183,7 +183,7 @@ def resume(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     observer: RunObserver | None = None,
-) -> Written:
+) -> Result:
     """Go on with the run whose checkpoint lies in a folder, as if nothing had happened.
 
     ``settings`` are those it was begun with if none are given. Given ones may differ in what does

@@ -38,10 +38,10 @@ def main(argv: Sequence[str]) -> int:
 
     # The budget counts from the start of the command.
     settings = replace(settings, budget=left_of(settings.budget, begin))
-    written = followed(
+    result = followed(
         options, lambda progress: reconstruct_to_folder(settings, progress, Interruption())
     )
-    if written.can_resume:
+    if result.can_resume:
         print("The same command with --resume goes on from here.")
     return 0
 

@@ -61,9 +61,9 @@ def main(argv: Sequence[str]) -> int:
     observer = _observer(options)
     has_keys = is_live and not any(str(source) == "-" for source in options.source)
     with quit_key(stop.request) if has_keys else nullcontext():
-        written = followed(options, lambda progress: go(settings, progress, stop, observer))
-    if written.can_resume:
-        print(f"geogs run --resume {written.output} goes on from here.")
+        result = followed(options, lambda progress: go(settings, progress, stop, observer))
+    if result.can_resume:
+        print(f"geogs run --resume {result.folder} goes on from here.")
     return 0
 
 
