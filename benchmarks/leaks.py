@@ -68,7 +68,7 @@ def repetitions(video: Path, folder: Path, repeats: int, seconds: float) -> dict
     for _ in range(repeats):
         begin = time.monotonic()
         settings = RunSettings((video,), preset("fast"), output=folder / "again", device="cpu")
-        frames = run(settings).result.scene.frames
+        frames = run(settings).scene.frames
         gc.collect()
         used.append(bytes_in_use())
         resident.append(resident_bytes())

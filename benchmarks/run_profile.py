@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 
 from geogs.application.calibrate import with_shutter_found
-from geogs.application.machine.device import compiled_kernels
+from geogs.application.machine.device import compile_gpu_kernels
 from geogs.application.results.result import Result
 from geogs.application.results.write import write_results
 from geogs.cli.options import parse_options
@@ -131,7 +131,7 @@ def measured_run(
     """A run from opening to report; its meter, CPU seconds to the first tracked frame, frames."""
     meter, start, first = StageMeter(profiles), time.process_time(), float("nan")
     with meter("opening"):
-        compiled_kernels(torch.device(device))
+        compile_gpu_kernels(torch.device(device))
         stream = open_source((source,), config.input)
     with meter("shutter"):
         stream = with_shutter_found(stream)

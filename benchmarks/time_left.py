@@ -29,9 +29,7 @@ import numpy as np  # noqa: E402  # the command's time counts all
 
 from geogs.application.interrupt import Interruption  # noqa: E402
 from geogs.application.progress.forecast import Forecast  # noqa: E402
-from geogs.application.progress.plan import Plan  # noqa: E402
-from geogs.application.progress.posed_plan import PosedPlan  # noqa: E402
-from geogs.application.progress.run_plan import RunPlan  # noqa: E402
+from geogs.application.progress.plan import Plan, PosedPlan, RunPlan  # noqa: E402
 from geogs.application.progress.run_progress import RunProgress  # noqa: E402
 from geogs.application.run_settings import ReconstructSettings, RunSettings  # noqa: E402
 from geogs.cli.options import record  # noqa: E402

@@ -98,7 +98,7 @@ class Slam(SlamOutput):
                 self.executor = (Deferred if self.world.maps_at_end else InOrder)(*parts)
         self.world.map = self.executor.mapper.table
         self.pose: PoseEstimate | None = None
-        """After the last frame; none before the first."""
+        """Estimate after the last frame; none before the first."""
 
     @on_one_torch_thread
     def process(
@@ -116,7 +116,7 @@ class Slam(SlamOutput):
         return self.pose
 
     def _advance(self, tracked: TrackResult, is_last: bool = False) -> None:
-        """After tracking: close loops, let the map follow, map what became final."""
+        """Close loops after tracking, let the map follow, map what became final."""
         with self.stopwatch("loops"):
             joined = self.loops.update(tracked, is_last)
         self._update_map()
@@ -136,7 +136,7 @@ class Slam(SlamOutput):
 
     @on_one_torch_thread
     def end_stream(self) -> None:
-        """After the last frame: map what waits. What there is then is the online result."""
+        """Map what waits after the last frame. What there is then is the online result."""
         with self.stopwatch("waiting"):
             self.settle()
         self.world.is_ended = True

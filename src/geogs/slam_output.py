@@ -62,7 +62,7 @@ class SlamOutput:
 
     @property
     def metric_scale(self) -> MetricScale | None:
-        """By what lengths are metres: a known length, or a depth sensor; None where they are not.
+        """What makes lengths metres: a known length, or a depth sensor; None where they are not.
 
         All depths of a sensor share a part of their error, which is the scale's.
         """

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.application.calibrate import lens_said, refined, self_calibrated
+from geogs.application.calibrate import lens_sentence, refined, self_calibrated
 from geogs.application.interrupt import Interruption
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import GUESS, Calibration
@@ -198,6 +198,6 @@ def test_a_focal_length_that_all_matches_find_takes_the_place_of_the_guess():
     assert known.distortion == pytest.approx((0.1, -0.2, 0, 0), abs=1e-9)
     assert known.refinement is not None
     assert known.refinement.deviation == pytest.approx(1.9)
-    said = lens_said(guess, found, known)
+    said = lens_sentence(guess, found, known)
     assert "fx 190.0 +- 1.9 instead of 200.0, k1 0.1000 +- 0.0020" in said
     assert "--intrinsics 190,191.9,159.5,119.5,0.1,-0.2," in said

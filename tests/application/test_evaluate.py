@@ -49,7 +49,8 @@ def result(tmp_path):
     return truth, out
 
 
-def test_eval_command_writes_everything(result, capsys):
+def test_eval_command_writes_everything(result, capsys, monkeypatch):
+    monkeypatch.setattr("geogs.evaluation.pages.shading._WIDTH", 120)
     truth, out = result
     mesh = str(truth / "mesh.ply")
     assert main([str(out), "--gt", str(truth), "--gt-mesh", mesh, "--samples", "20000"]) == 0

@@ -133,15 +133,15 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
     settings = RunSettings(
         (small_room,), run_config(), tmp_path / "out", "cpu", checkpoint_every=900.0
     )
-    written = run(settings, progress, stop)
+    result = run(settings, progress, stop)
     assert progress.seen == 22
     assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
-    assert written.result.verdict is None
-    assert closing_message(written, 3.0)[0] == NOT_JUDGED
-    assert written.output == tmp_path / "out"
-    assert written.can_resume
-    assert written.result.is_interrupted
-    assert len(written.result.trajectory.timestamps) == 22
+    assert result.verdict is None
+    assert closing_message(result, 3.0)[0] == NOT_JUDGED
+    assert result.folder == tmp_path / "out"
+    assert result.can_resume
+    assert result.is_interrupted
+    assert len(result.trajectory.timestamps) == 22
     assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == 22
     assert capfd.readouterr() == ("", "")
 

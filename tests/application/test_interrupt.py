@@ -10,7 +10,7 @@ import torch
 
 from geogs.application.checkpoints.run_state import RunMetadata
 from geogs.application.interrupt import Interruption
-from geogs.application.machine.device import full_memory_in_a_sentence
+from geogs.application.machine.device import gpu_errors_in_a_sentence
 from geogs.application.run import continued
 from geogs.application.run_settings import RunSettings
 from geogs.errors import DeviceError, InputError
@@ -43,14 +43,14 @@ def test_a_signal_that_is_ignored_asks_for_nothing():
 
 
 def test_the_second_signal_names_the_way_on():
-    with pytest.raises(KeyboardInterrupt) as quits, full_memory_in_a_sentence(lambda: WAY):
+    with pytest.raises(KeyboardInterrupt) as quits, gpu_errors_in_a_sentence(lambda: WAY):
         raise KeyboardInterrupt
     assert str(quits.value) == WAY.strip()
 
 
 def test_of_blocks_in_blocks_the_inner_one_names_the_way_on():
-    inner = full_memory_in_a_sentence(lambda: WAY)
-    with pytest.raises(KeyboardInterrupt) as quits, full_memory_in_a_sentence(), inner:
+    inner = gpu_errors_in_a_sentence(lambda: WAY)
+    with pytest.raises(KeyboardInterrupt) as quits, gpu_errors_in_a_sentence(), inner:
         raise KeyboardInterrupt
     assert str(quits.value) == WAY.strip()
 
@@ -65,7 +65,7 @@ def test_of_blocks_in_blocks_the_inner_one_names_the_way_on():
     ],
 )
 def test_a_gpu_that_fails_is_told_with_the_way_on(error, said):
-    with pytest.raises(DeviceError) as failed, full_memory_in_a_sentence(lambda: WAY):
+    with pytest.raises(DeviceError) as failed, gpu_errors_in_a_sentence(lambda: WAY):
         raise error
     assert str(failed.value).startswith(said)
     assert str(failed.value).endswith(WAY)
@@ -73,7 +73,7 @@ def test_a_gpu_that_fails_is_told_with_the_way_on(error, said):
 
 
 def test_errors_of_ours_stay_what_they_are():
-    with pytest.raises(RuntimeError, match="shapes"), full_memory_in_a_sentence(lambda: WAY):
+    with pytest.raises(RuntimeError, match="shapes"), gpu_errors_in_a_sentence(lambda: WAY):
         raise RuntimeError("shapes do not fit")
 
 

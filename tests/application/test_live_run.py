@@ -65,10 +65,10 @@ def test_a_live_run_ends_when_asked_and_finishes_its_map(
     monkeypatch.setattr("geogs.io.sources.live.feeds.Played", InStep)
     stop = Stop()
     onlooker = Onlooker(stop)
-    written = run(settings(f"play:{small_room}", tmp_path / "out"), None, stop, onlooker)
+    result = run(settings(f"play:{small_room}", tmp_path / "out"), None, stop, onlooker)
     assert onlooker.states[-1] == "tracking"
-    assert not written.result.is_interrupted
-    assert not written.can_resume
+    assert not result.is_interrupted
+    assert not result.can_resume
     assert not (tmp_path / "out" / "checkpoint").exists()
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["kind"], summary["frames"], summary["refined"]) == ("play", LAST + 1, True)

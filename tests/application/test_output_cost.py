@@ -42,8 +42,8 @@ def test_what_comes_before_the_first_view_of_a_stage_is_of_the_surface():
     assert times.seconds == {"surface": 10.0, "views": 1.5}
 
 
-@pytest.fixture
-def scene() -> Reconstruction:
+@pytest.fixture(scope="module")
+def searched() -> Reconstruction:
     """Five views with their depths."""
     scene = ball_and_wall()
 
@@ -54,6 +54,13 @@ def scene() -> Reconstruction:
     with pytest.raises(KeyboardInterrupt):
         scene.finish(progress=interrupt)
     return scene
+
+
+@pytest.fixture
+def scene(searched, monkeypatch) -> Reconstruction:
+    """The same for each test, with settings that a forecast may change."""
+    monkeypatch.setattr(searched, "config", searched.config)
+    return searched
 
 
 @pytest.fixture

@@ -29,6 +29,13 @@ def machine(monkeypatch):
     return pretend
 
 
+@pytest.fixture
+def untested(monkeypatch) -> None:
+    """Nothing is compiled, compared or timed."""
+    monkeypatch.setattr(doctor.compilation, "is_compiled", lambda: True)
+    monkeypatch.setattr(doctor, "_self_test", lambda device: ())
+
+
 def test_healthy_cpu_machine(machine, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("GEOGS_CACHE", str(tmp_path))
     monkeypatch.setattr(doctor, "cache_from_source", lambda source: __file__)
@@ -45,6 +52,7 @@ def test_healthy_cpu_machine(machine, capsys, monkeypatch, tmp_path):
     assert text.rstrip().endswith("everything works")
 
 
+@pytest.mark.usefixtures("untested")
 def test_a_python_that_keeps_no_bytecode_is_slow(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(doctor, "cache_from_source", lambda source: str(tmp_path / "none.pyc"))
     assert main(["--device", "cpu"]) == 0
@@ -121,6 +129,7 @@ def test_unknown_devices(name):
         installation.require_device(name)
 
 
+@pytest.mark.usefixtures("untested")
 def test_driver_without_cuda_build_is_to_be_mended(machine, capsys):
     machine((13, 0), None)
     assert main([]) == 0  # the CPU works all the same

@@ -96,9 +96,12 @@ def test_without_a_home_and_a_terminal():
     assert line.startswith("error: /no/such/video.mp4 does not exist")
 
 
-@pytest.mark.system
+@pytest.mark.long
 def test_where_only_results_can_be_written_a_scene_is_rendered(tmp_path):
-    """Neither the program's folder, nor the home, nor /dev/shm: as in many containers."""
+    """Neither the program's folder, nor the home, nor /dev/shm: as in many containers.
+
+    Kernels are compiled anew; where they are kept is what tests/test_kernel_folder.py looks at.
+    """
     if subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False).returncode:
         pytest.skip("the system lets nobody change what is mounted")
     source = Path(geogs_package.__file__).parent

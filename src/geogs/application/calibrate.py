@@ -39,11 +39,10 @@ def without_overlay(source: Source, progress: RunProgress | None = None) -> Sour
     found = static_overlay([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images])
     if found is None:
         return source
-    if progress is not None:
-        progress.write(
-            f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
-            "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
-        )
+    (progress or RunProgress()).write(
+        f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
+        "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
+    )
     return source.without_overlay(found)
 
 
@@ -79,7 +78,7 @@ def self_calibrated(
         )
         return source
     calibration = refined(source.calibration, source.camera.fx, found)
-    progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
+    progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
 
 
@@ -131,7 +130,7 @@ def refined(
     )  # fmt: skip
 
 
-def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
+def _calibration_sentence(calibration: Calibration, assumed: str) -> str:
     failure = calibration.refinement.failure if calibration.refinement is not None else None
     if failure is None:
         return f"Intrinsics: {calibration.origin}."
@@ -142,7 +141,7 @@ def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
     )
 
 
-def lens_said(before: Calibration, found: FoundLens, after: Calibration) -> str:
+def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> str:
     """What was known of a lens, what all matches say of it, and what was done, in a sentence."""
     was = ",".join(f"{k:.4g}" for k in before.distortion) if before.is_distorted else "none"
     focal = ""

@@ -13,9 +13,9 @@ import torch
 from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation
-from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
+from geogs.application.machine.device import REMEDY, gpu_errors_in_a_sentence
 from geogs.application.progress.run_progress import RunProgress
-from geogs.application.results.result import Result, Written
+from geogs.application.results.result import Result
 from geogs.application.results.surfaces import write_depth_mesh
 from geogs.application.results.write import write_files
 from geogs.application.run_settings import ReconstructSettings, RunSettings
@@ -36,9 +36,9 @@ class Outcome(Enum):
 
     FINISHED = auto()
     STOPPED = auto()
-    """By a request; there is something to keep."""
+    """A request ended it; there is something to keep."""
     MEMORY_FULL = auto()
-    """That of a GPU; there is something to keep."""
+    """The memory of a GPU was full; there is something to keep."""
 
 
 class Work(ABC):
@@ -86,7 +86,7 @@ class Driver:
     stop: Stop
     observer: RunObserver | None = None
     kernels: Compilation = field(default_factory=Compilation)
-    """For the CPU, compiled meanwhile."""
+    """Kernels for the CPU, compiled meanwhile."""
 
     def report(self, stage: str, fraction: float) -> None:
         """Tell how far a stage is; raises KeyboardInterrupt after a request to stop."""
@@ -117,7 +117,7 @@ class Driver:
         checkpoint.write()
         return Outcome.STOPPED
 
-    def complete(self, work: Work) -> Written:
+    def complete(self, work: Work) -> Result:
         """The work to its end, or until it is stopped, then the files of what there is by then.
 
         Raises:
@@ -132,13 +132,14 @@ class Driver:
         def way_on() -> str:
             return f" {work.way_on}" if work.way_on and has_checkpoint(output) else ""
 
-        with full_memory_in_a_sentence(way_on), self.stop:
+        with gpu_errors_in_a_sentence(way_on), self.stop:
             try:
                 with replaced(output, "result") as new:
                     outcome = work.complete(self, checkpoint, new)
                     finished, scene = outcome is Outcome.FINISHED, work.scene
                     self.kernels.wait(progress.stage)
-                    result = Result(scene, work.source, not finished, progress, output)
+                    can_resume = not finished and checkpoint.is_complete
+                    result = Result(scene, work.source, not finished, progress, output, can_resume)
                     write_more = partial(self._write_more, work, new)
                     write_files(new, result, write_more, settings.keyframe_images)
             except OutputError as error:
@@ -152,7 +153,7 @@ class Driver:
             )
         if finished and work.way_on:
             checkpoint.remove()
-        return Written(output, result, not finished and checkpoint.is_complete)
+        return result
 
     def _write_more(self, work: Work, new: Path) -> None:
         work.write_more(self, new)

@@ -38,7 +38,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.types import Trajectory
 
 _ICP_PROTOCOLS = ("samples", "vertex")
-"""Those whose definition holds an alignment by ICP."""
+"""Protocols whose definition holds an alignment by ICP."""
 
 
 @on_one_torch_thread

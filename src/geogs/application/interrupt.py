@@ -7,15 +7,15 @@ from collections.abc import Callable
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Those that ask to stop: of a terminal, of systems and schedulers, of a terminal that is gone."""
-_AGAIN = 0.02
+"""Signals that ask to stop: of a terminal, of schedulers, of a terminal that is gone."""
+_RETRY_SECONDS = 0.02
 """Seconds until it is looked again whether modules are still being imported."""
-_PATIENCE = 5.0
+_MAX_IMPORT_SECONDS = 5.0
 """Seconds after which an import that was asked to end counts as hanging."""
 
 
-def asking() -> list[signal.Signals]:
-    """Those of them that nobody has asked to be ignored, as nohup and shells in scripts do."""
+def handled_signals() -> list[signal.Signals]:
+    """The ``SIGNALS`` that nobody has asked to be ignored, as nohup and shells in scripts do."""
     return [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
@@ -31,11 +31,11 @@ def interrupt(number: int, frame: FrameType | None) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0)
         raise KeyboardInterrupt
     # The timer's interval, which is never reached, is what is left of the patience.
-    left = max(left - _AGAIN, _AGAIN) if is_waiting or left else _PATIENCE
-    if number in SIGNALS and left <= _AGAIN:
+    left = max(left - _RETRY_SECONDS, _RETRY_SECONDS) if is_waiting or left else _MAX_IMPORT_SECONDS
+    if number in SIGNALS and left <= _RETRY_SECONDS:
         os._exit(128 + number)
     signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, _AGAIN, left)
+    signal.setitimer(signal.ITIMER_REAL, _RETRY_SECONDS, left)
 
 
 def _is_importing(frame: FrameType | None) -> bool:
@@ -90,7 +90,7 @@ class Interruption(Stop):
         # Python takes signals in the main thread alone.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
-            self._before = {n: signal.signal(n, self._handle) for n in asking()}
+            self._before = {n: signal.signal(n, self._handle) for n in handled_signals()}
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -29,13 +29,12 @@ ONE_VIEW = 0.3
 """Weight from which a surface counts in a rehearsal: what one view has seen is part of it, too, as
 all views together are going to confirm it."""
 COARSER = 2.0
-"""Times the voxels that all views are going to have, in a rehearsal."""
+"""Size of a voxel of a rehearsal, in voxels that all views are going to have."""
 CAUTION = 1.1
-"""By how much more is kept than was measured: the whole volume is larger, and the disks are not
-there yet."""
+"""Factor on what was measured: the whole volume is larger, and the disks are not there yet."""
 MAX_SURFACE = 4.0
-"""Times the surface of the rehearsal that is expected at most before the depths tell it: of a large
-scene only a few views may be affordable, and then what was kept for its mesh is lost to them."""
+"""Largest surface that is expected before the depths tell it, in surfaces of the rehearsal: of a
+large scene only a few views may be affordable, and what is kept for its mesh is lost to them."""
 MAX_MESH_TIME = 0.3
 """Fraction of the time left which mesh and files may take; where they would take more, the mesh
 gets fewer triangles."""
@@ -50,10 +49,10 @@ class MeshTimes:
         self._clock = clock
         self._last = clock()
         self.seconds: dict[str, float] = {}
-        """By stage: "fuse" and "colour" of the views, all else of the surface."""
+        """Seconds of "views" ("fuse" and "colour") and "surface" (all else)."""
 
     def __call__(self, stage: str, done: int, of: int) -> None:
-        """As ``extract_mesh`` reports; time before the first part of a stage is the surface's."""
+        """Take a report of ``extract_mesh``; time before a stage's first part is the surface's."""
         now = self._clock()
         of_views = stage in ("fuse", "colour") and done > 1
         name = "views" if of_views else "surface"

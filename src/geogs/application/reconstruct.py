@@ -14,13 +14,13 @@ from geogs.application.checkpoints.reconstruct_state import ReconstructState, fi
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import Compilation, compiling
-from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.posed_views import PosedViews
-from geogs.application.progress.posed_plan import PosedPlan
+from geogs.application.progress.plan import PosedPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed, free_folder
-from geogs.application.results.result import Result, Written
+from geogs.application.results.result import Result
 from geogs.application.results.surfaces import Snapshots
 from geogs.application.run_settings import ReconstructSettings
 from geogs.application.structure_from_motion.photos import open_photographs
@@ -32,8 +32,7 @@ from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
-from geogs.reconstruction import Reconstruction
-from geogs.reconstruction_output import ReconstructionTable
+from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.stopwatch import StageProgress
 from geogs.threads import on_one_torch_thread
 
@@ -41,7 +40,7 @@ RECORDED = 4000
 """Pixels of the longer side of a photograph, about, where its size is taken as it is."""
 FIRST_BATCH = 24
 """Images read before it is known for how many the time lasts: some show what one costs."""
-_LEAST_BUDGET = 1.0
+_MIN_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
 
 
@@ -50,7 +49,7 @@ def left_of(budget: float | None, begin: float) -> float | None:
     there is no limit."""
     if budget is None:
         return None
-    return max(budget - (time.perf_counter() - begin), _LEAST_BUDGET)
+    return max(budget - (time.perf_counter() - begin), _MIN_BUDGET)
 
 
 def _compiled(
@@ -61,7 +60,7 @@ def _compiled(
         progress.write(
             "note: Kernels are compiled first, once on this machine; the --budget begins after it."
         )
-    return compiled_kernels(device) + kernels.wait(progress.stage)
+    return compile_gpu_kernels(device) + kernels.wait(progress.stage)
 
 
 @on_one_torch_thread
@@ -104,19 +103,19 @@ def reconstruct(
                 source = open_posed_source(source, config.input)
         begin += _compiled(used, kernels, budget, progress)
     checks = progress if check and poses == "given" else None
-    with full_memory_in_a_sentence():
+    with gpu_errors_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), left_of(budget, begin))
         _complete(scene, source, None, progress.stage, budget is not None, checks)
     return Result(scene, source, progress=progress)
 
 
 @on_one_torch_thread
-@full_memory_in_a_sentence()
+@gpu_errors_in_a_sentence()
 def reconstruct_to_folder(
     settings: ReconstructSettings,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
-) -> Written:
+) -> Result:
     """Reconstruct, and write the results, with checkpoints and snapshots on the way.
 
     Raises:

@@ -11,15 +11,14 @@ from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver
 from geogs.application.interrupt import Stop
 from geogs.application.machine.compilation import compiling
-from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
-from geogs.application.progress.plan import Plan
-from geogs.application.progress.run_plan import RunPlan
+from geogs.application.progress.plan import Plan, RunPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder
-from geogs.application.results.result import Written
+from geogs.application.results.result import Result
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
@@ -40,13 +39,13 @@ from geogs.threads import on_one_torch_thread
 
 
 @on_one_torch_thread
-@full_memory_in_a_sentence()
+@gpu_errors_in_a_sentence()
 def run(
     settings: RunSettings,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     observer: RunObserver | None = None,
-) -> Written:
+) -> Result:
     """Open the sources, calibrate, track and map every frame, write the results.
 
     Where ``settings.offline`` says so, frames are placed by structure from motion instead.
@@ -75,22 +74,22 @@ def run(
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
     with claimed(wanted) as output, compiling(device) as kernels:
-        compiled_kernels(device)
+        compile_gpu_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
         opened = without_overlay(opened, progress)
         if (plan := _plan(driver, opened)) is not None:
             progress.plan(plan)
         if settings.offline:
             from geogs.application.structure_from_motion.offline import (
-                FEW,
+                MIN_CLIP_FPS,
                 PlacedOffline,
                 beginning_with,
             )
 
-            told = self_calibrated(opened, config, device, progress, stop)
-            if told.recorded_fps >= FEW:
-                told = with_shutter_found(told, progress, stop)
-            return driver.complete(PlacedOffline(config, beginning_with(opened, told)))
+            found = self_calibrated(opened, config, device, progress, stop)
+            if found.recorded_fps >= MIN_CLIP_FPS:
+                found = with_shutter_found(found, progress, stop)
+            return driver.complete(PlacedOffline(config, beginning_with(opened, found)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
         return _completed(driver, settings, work)
 
@@ -106,7 +105,7 @@ def opened_for(settings: RunSettings, base: SavedResult | None) -> Source:
     return opened if is_same or seen.field_of_view != "auto" else opened.with_focal(focal)
 
 
-def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Written:
+def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> Result:
     """Raises TrackingLost, with what may help, if no frame could be tracked, nor placed."""
     try:
         return driver.complete(work)
@@ -177,14 +176,14 @@ def _begun(
 
 
 @on_one_torch_thread
-@full_memory_in_a_sentence()
+@gpu_errors_in_a_sentence()
 def resume(
     output: Path,
     settings: RunSettings | None = None,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     observer: RunObserver | None = None,
-) -> Written:
+) -> Result:
     """Go on with the run whose checkpoint lies in a folder, as if nothing had happened.
 
     ``settings`` are those it was begun with if none are given. Given ones may differ in what does
@@ -203,7 +202,7 @@ def resume(
     opened = without_overlay(open_source(settings.source, config.input))
     source = saved.calibrated(opened)
     with claimed(output) as folder, compiling(device) as kernels:
-        compiled_kernels(device)
+        compile_gpu_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
         with saved.world(device) as world:
             slam = Slam(

@@ -38,4 +38,4 @@ def run(
     folder = None if output is None else Path(output)
     config = config or preset("default", is_gpu(device))
     settings = RunSettings(tuple(map(Path, several)), config, folder, device)
-    return run_to_folder(settings, progress).result
+    return run_to_folder(settings, progress)

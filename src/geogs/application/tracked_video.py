@@ -9,12 +9,12 @@ from typing import Literal
 
 import torch
 
-from geogs.application.calibrate import lens_said
+from geogs.application.calibrate import lens_sentence
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
-from geogs.application.machine.compilation import OF_MAP, OF_SEARCH
-from geogs.application.progress.run_plan import RunPlan
+from geogs.application.machine.compilation import KERNELS_OF_MAP, KERNELS_OF_SEARCH
+from geogs.application.progress.plan import RunPlan
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
@@ -24,9 +24,9 @@ from geogs.slam import Slam
 from geogs.stopwatch import Stopwatch
 from geogs.types import Frame
 
-LONG = 15.0
+MIN_PREVIEW_SECONDS = 15.0
 """Seconds for map and mesh, on the machine of reference, from which there is a preview."""
-BRIEFLY = 40.0
+INTERRUPTED_SECONDS = 40.0
 """Seconds for a map after an interruption, where there is none yet."""
 
 
@@ -38,7 +38,7 @@ class TrackedVideo:
     source: Source
     """Calibrated."""
     frames: Generator[Frame, None, None]
-    """That are left."""
+    """Frames that are left."""
     metadata: RunMetadata
     output: Path
 
@@ -81,7 +81,7 @@ class TrackedVideo:
             self._write_preview(driver)
         outcome = _finished(driver, outcome, lambda: self._refine(driver))
         if was_cut or outcome is Outcome.STOPPED:
-            briefly = partial(slam.refine, driver.progress.stage, BRIEFLY)
+            briefly = partial(slam.refine, driver.progress.stage, INTERRUPTED_SECONDS)
             _finished(driver, Outcome.FINISHED, briefly)
         scale = scale_source(self.metadata.settings.scale_from)
         make_metric(slam, self.source, scale, driver.progress)
@@ -124,12 +124,12 @@ class TrackedVideo:
     def _refine(self, driver: Driver) -> None:
         """The map; compiled is first what its depths need."""
         kernels = driver.kernels
-        kernels.wait(driver.report, OF_SEARCH)
+        kernels.wait(driver.report, KERNELS_OF_SEARCH)
 
         def report(stage: str, fraction: float) -> None:
             driver.report(stage, fraction)
             if fraction >= SEARCHED:
-                kernels.wait(driver.report, OF_MAP)
+                kernels.wait(driver.report, KERNELS_OF_MAP)
 
         self.scene.refine(report)
 
@@ -140,7 +140,7 @@ class TrackedVideo:
             return
         size = slam.camera.width, slam.camera.height
         plan = RunPlan(settings.config, slam.frames, size, False, False, maps_at_end=True)
-        if plan.seconds_to_map(len(slam.segments.main.segment.ids)) < LONG:
+        if plan.seconds_to_map(len(slam.segments.main.segment.ids)) < MIN_PREVIEW_SECONDS:
             return
         from geogs.application.results.preview import NAME, write_preview
 
@@ -155,7 +155,7 @@ class TrackedVideo:
         self.scene.adjust(driver.report)
         if (lens := self.scene.lens) is not None:
             before, self.source = self.source, self.source.with_lens(lens)
-            driver.progress.write(lens_said(before.calibration, lens, self.source.calibration))
+            driver.progress.write(lens_sentence(before.calibration, lens, self.source.calibration))
         if self.scene.will_refine:
             self._write_stage("adjusted", driver, new)
 

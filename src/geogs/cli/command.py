@@ -44,7 +44,7 @@ COMMANDS = {
     ),
     "completion": Command("geogs.cli.completion", "make the Tab key of a shell complete geogs"),
 }
-"""Those of this package."""
+"""Commands of this package."""
 
 
 def all_commands() -> dict[str, Command]:

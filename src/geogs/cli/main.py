@@ -25,10 +25,10 @@ _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN er
 """What errors of PyTorch begin with that no command has said in its own words."""
 _UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EIO, errno.ESTALE, errno.EROFS)
 """What systems say of paths, at the first look at them."""
-_LEAST_MEMORY = 1 << 30
+_MIN_MEMORY = 1 << 30
 """Bytes of addresses without which what is imported ends the process in words of its own."""
 _LONG_WORD = re.compile(r"(\S{80})\S{100,}(\S{80})")
-"""Such as a path that was put together by mistake, of which both ends are shown."""
+"""A word that is shown by both of its ends, such as a path put together by mistake."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,11 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    name = arguments[0] if arguments else "--help"
+    name, *rest = arguments or ["--help"]
     if name in ("-h", "--help", "help"):
         print(help_text())
         return 0
-    if arguments[1:] == [ASKED]:
+    if rest == [ASKED]:
         helps = {known: command.help for known, command in all_commands().items()}
         print(matching(helps, name))
         return 0
@@ -59,9 +59,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     command = find_command(name)
     process.show_warnings()
-    if _memory_limit() < _LEAST_MEMORY:
+    if _memory_limit() < _MIN_MEMORY:
         raise MemoryError
-    return command.run(arguments[1:])
+    return command.run(rest)
 
 
 def help_text() -> str:
@@ -90,9 +90,9 @@ def print_error(sentence: str) -> None:
 
 
 def _guarded(run: Callable[[], int]) -> int:
-    """Run a command; errors of ours become one line and an exit code, others keep a traceback.
+    """Run a command; errors that a user can mend become one line and an exit code.
 
-    With ``GEOGS_DEBUG=1`` ours keep it, too.
+    Others keep their traceback, and with ``GEOGS_DEBUG=1`` all do.
     """
     try:
         code = run()
@@ -103,21 +103,16 @@ def _guarded(run: Callable[[], int]) -> int:
     except KeyboardInterrupt as interrupt:
         print_error(" ".join(["interrupted.", *map(str, interrupt.args)]).strip())
         return EXIT_INTERRUPTED
-    except GeogsError as error:
-        if os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
-            raise
-        print_error(str(error))
-        return EXIT_ERROR
     except Exception as error:
-        sentence = _of_the_system(error)
+        sentence = str(error) if isinstance(error, GeogsError) else _resource_error(error)
         if sentence is None or os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
             raise
         print_error(sentence)
         return EXIT_ERROR
 
 
-def _of_the_system(error: Exception) -> str | None:
-    """What to say where the system gave too little; nothing for other errors, which are ours."""
+def _resource_error(error: Exception) -> str | None:
+    """What to say where the system gave too little; nothing for other errors, which are bugs."""
     said = str(error)
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
         return "Too many files are open; raise the limit (ulimit -n)."

@@ -38,10 +38,10 @@ def main(argv: Sequence[str]) -> int:
 
     # The budget counts from the start of the command.
     settings = replace(settings, budget=left_of(settings.budget, begin))
-    written = followed(
+    result = followed(
         options, lambda progress: reconstruct_to_folder(settings, progress, Interruption())
     )
-    if written.can_resume:
+    if result.can_resume:
         print("The same command with --resume goes on from here.")
     return 0
 
@@ -57,12 +57,9 @@ def parse(argv: Sequence[str]) -> ReconstructOptions:
 
 
 def _defaults(given: Given) -> ReconstructOptions:
-    name = _preset_name(given)
-    return ReconstructOptions(config=reconstruct_preset(name), preset=name)
-
-
-def _preset_name(given: Given) -> Preset:
     """The preset asked for, else the one that suits the device."""
-    if "preset" in given:
-        return cast(Preset, given["preset"])
-    return "accurate" if is_gpu(given.get("device", "auto")) else "default"
+    asked = given.get("preset")
+    if asked is None:
+        asked = "accurate" if is_gpu(given.get("device", "auto")) else "default"
+    name = cast(Preset, asked)
+    return ReconstructOptions(config=reconstruct_preset(name), preset=name)

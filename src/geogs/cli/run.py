@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 from geogs.application.result_settings import HERE
 from geogs.application.run_settings import LiveSettings, RunSettings, Verbosity
 from geogs.cli.options import Given, parse_options, record
+from geogs.cli.terminal.quit_key import quit_key
 from geogs.cli.terminal.speech import followed, say_loading
 from geogs.config import Preset, preset
 from geogs.errors import InputError
@@ -18,7 +19,6 @@ from geogs.gpu.early_start import is_gpu, start_gpu
 from geogs.io.sources.address import live_address
 
 if TYPE_CHECKING:
-    from geogs.application.interrupt import Stop
     from geogs.application.viewer.observer import RunObserver
 
 
@@ -43,7 +43,8 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse(argv)
-    if options.offline and any(live_address(source) is not None for source in options.source):
+    is_live = any(live_address(source) is not None for source in options.source)
+    if options.offline and is_live:
         raise InputError("--offline reads a video several times; a live source comes but once.")
     if options.offline and options.map is not None:
         raise InputError("--map is gone on with by tracking; leave out --offline.")
@@ -58,21 +59,12 @@ def main(argv: Sequence[str]) -> int:
         raise InputError("--viewer and --record follow tracking, which --offline has none of.")
     go = run if options.resume is None else partial(resume, options.resume)
     observer = _observer(options)
-    with _keys(options, stop):
-        written = followed(options, lambda progress: go(settings, progress, stop, observer))
-    if written.can_resume:
-        print(f"geogs run --resume {written.output} goes on from here.")
+    has_keys = is_live and not any(str(source) == "-" for source in options.source)
+    with quit_key(stop.request) if has_keys else nullcontext():
+        result = followed(options, lambda progress: go(settings, progress, stop, observer))
+    if result.can_resume:
+        print(f"geogs run --resume {result.folder} goes on from here.")
     return 0
-
-
-def _keys(options: RunOptions, stop: "Stop") -> AbstractContextManager[bool]:
-    """Hears the key q during a live run."""
-    from geogs.cli.terminal.quit_key import quit_key
-
-    is_live = any(live_address(source) is not None for source in options.source)
-    if not is_live or any(str(source) == "-" for source in options.source):
-        return nullcontext(False)
-    return quit_key(stop.request)
 
 
 def _observer(options: LiveSettings) -> "RunObserver | None":

@@ -11,7 +11,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse_options(RescaleSettings, argv, "scale")
 
     from geogs.application.results.rescale import rescale
-    from geogs.application.scale.measurable_scene import said
+    from geogs.application.scale.measurable_scene import scale_sentence
 
-    print(said(rescale(options)))
+    print(scale_sentence(rescale(options)))
     return 0

@@ -37,16 +37,15 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns 0, or raises InputError for a file that cannot be used."""
     options = parse_options(WeightsOptions, argv, "weights")
 
+    file = options.file
     if options.action == "list":
-        if options.file is not None:
-            raise InputError(
-                f"geogs weights list takes no file; did you mean verify {options.file}?"
-            )
+        if file is not None:
+            raise InputError(f"geogs weights list takes no file; did you mean verify {file}?")
         print(listing())
     else:
-        if options.file is None:
+        if file is None:
             raise InputError("geogs weights verify needs a file.")
-        print(verification(options.file))
+        print(verification(file))
     return 0
 
 

@@ -69,7 +69,7 @@ class Range:
         return tuple(bound for bound in self.bounds if isinstance(bound, str))
 
     def __str__(self) -> str:
-        """Such as ``from 1 to 8``, ``above 0 and at most 1``, ``from 3 to 15 and odd``."""
+        """In words: ``from 1 to 8``, ``above 0 and at most 1``, ``from 3 to 15 and odd``."""
         words = {"above": self.above, "at least": self.least, "below": self.below}
         words |= {"at most": self.most}
         if self.least is not None and self.most is not None:

@@ -20,17 +20,17 @@ from geogs.world.keyframes import KeyframeTable
 R = TypeVar("R")
 
 MAX_WAIT_SECONDS = 0.05
-"""For which mapping waits at most, between two parts of its work, while a frame is tracked."""
+"""Longest wait of mapping between two parts of its work, while a frame is tracked."""
 MAX_WAITING = 12
-"""Tasks up to which it waits at all, so that it does not fall behind for ever; each
-keyframe makes two, and a correction another."""
+"""Waiting tasks from which on it does not wait, so as not to fall behind for ever; each keyframe
+makes two, and a correction another."""
 
 
 class BackgroundMapper:
-    """What a mapper is told, done later by a thread, in the order in which it was told.
+    """Does the tasks of a mapper in a thread, in the order in which they were given.
 
     The thread's mapper has keyframes of its own: copies, which are brought up to date with each
-    task to what they were when it was told. So neither sees the other in the middle of its work,
+    task to what they were when it was given. So neither sees the other in the middle of its work,
     and tracking only ever pays for the copying of references. On a GPU the thread has a stream of
     its own, which gives way to the tracker's if that has a higher priority.
     """
@@ -50,7 +50,7 @@ class BackgroundMapper:
         self._is_closed = False
         self._failure: BaseException | None = None
         self.disks = 0
-        """In the map when a keyframe was last finished."""
+        """Disks in the map when a keyframe was last finished."""
         self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
         self._thread.start()
 
@@ -58,7 +58,7 @@ class BackgroundMapper:
         """While a frame is tracked, for whose pose somebody waits."""
         return self._gate.taken()
 
-    # --- what tracking tells ---------------------------------------------------------------
+    # --- tasks from tracking ---------------------------------------------------------------
 
     def observe(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
         """See ``Mapper.observe``."""
@@ -83,9 +83,9 @@ class BackgroundMapper:
             torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
-        """An answer from the mapper as it is between two things that it was told.
+        """An answer from the mapper as it is between two tasks.
 
-        Waits for what is under way, and for nothing else that it was told before.
+        Waits for the task that is under way, and for no other that was given before.
         """
         answers: list[R] = []
         done = threading.Event()
@@ -107,7 +107,7 @@ class BackgroundMapper:
         return answers[0]
 
     def settled(self) -> Mapper:
-        """The mapper after all that it was told, on the keyframes of the store; the thread ends."""
+        """The mapper after all of its tasks, on the keyframes of the store; the thread ends."""
         with self._news:
             self._is_closed = True
             self._news.notify()

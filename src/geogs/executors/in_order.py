@@ -36,7 +36,7 @@ class InOrder:
     ) -> None:
         self.segments, self.mapper = segments, mapper
         self.mapping: Mapper | BackgroundMapper = mapper
-        """Whom keyframes and corrections are told: the mapper, or a thread that has one."""
+        """Takes keyframes and corrections: the mapper, or a thread that has one."""
         self.stopwatch, self.mask = stopwatch, mask
 
     # --- a frame -----------------------------------------------------------------------------

@@ -42,7 +42,7 @@ class KeyframeMirror:
         return changed
 
     def update(self, changed: Handover, stream: "torch.cuda.Stream | None") -> None:
-        """In the other thread, which works in a ``stream`` of a GPU: take over what changed."""
+        """Take over what changed, in the other thread, which works in a ``stream`` of a GPU."""
         for keyframe, T_cw in changed:
             keyframe.T_cw = T_cw
             if keyframe.id in self._copies:

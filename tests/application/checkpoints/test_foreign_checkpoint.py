@@ -30,6 +30,12 @@ NAMING = [
     leaf for leaf in leaves(RunSettings)
     if (leaf.kind.base is Path or leaf.mark(NamesFile)) and leaf.name not in ("source", "output")
 ]  # fmt: skip
+PATH, TEXT = (next(x for x in NAMING if x.kind.base is base) for base in (Path, str))
+OUTSIDE = [
+    *((leaf, "/proc/self/mem") for leaf in NAMING),
+    *((leaf, name) for leaf in (PATH, TEXT) for name in ("../secret", "http://host/file")),
+]
+"""Every setting that names a file, and for a path and a text every kind of name."""
 ADDRESSES = [
     "http://host/v.mp4", "https:/host/v.mp4", "rtsp://host/1", "rtmp://host/1", "tcp://host:1",
     "udp://host:1", "camera:0", "-", "play:/dev/zero",
@@ -103,8 +109,7 @@ def test_what_lies_in_the_folder_that_the_user_named_may_be_opened(tmp_path, mon
         assert bool(SavedRun(out).settings.source) is is_inside
 
 
-@pytest.mark.parametrize("leaf", NAMING, ids=lambda leaf: leaf.name)
-@pytest.mark.parametrize("name", ["/proc/self/mem", "../secret", "http://host/file"])
+@pytest.mark.parametrize(("leaf", "name"), OUTSIDE, ids=lambda case: getattr(case, "name", case))
 def test_no_other_file_is_opened_on_its_word(tmp_path, monkeypatch, capsys, leaf, name):
     """Masks, weights, priors, calibrations, poses, maps: every setting that names a file."""
     out, usual = tmp_path / "out", RunSettings((tmp_path / "out" / "v.mp4",))
@@ -115,8 +120,9 @@ def test_no_other_file_is_opened_on_its_word(tmp_path, monkeypatch, capsys, leaf
     assert f"{leaf.options[-1]} {leaf.path[-1].upper()}" in refused(out, monkeypatch, capsys)
 
 
-@pytest.mark.parametrize("address", ADDRESSES)
-@pytest.mark.parametrize("is_own", [True, False])
+@pytest.mark.parametrize(
+    ("address", "is_own"), [*((address, True) for address in ADDRESSES), (ADDRESSES[0], False)]
+)
 def test_no_address_is_opened(tmp_path, monkeypatch, capsys, address, is_own):
     """Not even where the checkpoint is one's own: a run of a live source makes none."""
     begun(tmp_path / "out", RunSettings((Path(address),)))

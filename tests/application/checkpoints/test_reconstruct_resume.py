@@ -72,12 +72,19 @@ def test_work_that_was_cut_off_is_gone_on_with(whole, tmp_path, fraction):
     assert np.median(errors) < 1.15 * np.median(wanted)
 
 
-def test_a_restored_mapper_is_the_same(tmp_path):
-    first = ball_and_wall()
-    interrupted(first, 0.5)
-    write_work(tmp_path, first)
+@pytest.fixture(scope="module")
+def half(tmp_path_factory) -> tuple[Reconstruction, Path]:
+    """One that was cut off in the middle of its training, and where its checkpoint lies."""
+    scene, output = ball_and_wall(), tmp_path_factory.mktemp("half")
+    interrupted(scene, 0.5)
+    write_work(output, scene)
+    return scene, output
+
+
+def test_a_restored_mapper_is_the_same(half):
+    first, output = half
     second = ball_and_wall()
-    state = read_work(tmp_path, "these")
+    state = read_work(output, "these")
     second._work_on(state)
     second._place_keyframes()
     assert second.mapper.table.place == first.mapper.table.place
@@ -100,14 +107,11 @@ def test_a_restored_mapper_is_the_same(tmp_path):
         assert all(torch.equal(a, b) for a, b in rows)
 
 
-def test_a_wrong_checkpoint_is_one_sentence(tmp_path):
+def test_a_wrong_checkpoint_is_one_sentence(half, tmp_path):
     with pytest.raises(InputError, match="nothing to resume"):
         read_work(tmp_path, "these")
-    scene = ball_and_wall()
-    interrupted(scene, 0.0)
-    write_work(tmp_path, scene)
     with pytest.raises(InputError, match="other settings or images"):
-        read_work(tmp_path, "those")
+        read_work(half[1], "those")
 
 
 def test_fingerprints_change_with_settings_and_images():
@@ -124,7 +128,7 @@ def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
     call = [
         "reconstruct", small_room, "-o", tmp_path, "--stride", 6, "--mapping.render-long-edge", 96,
-        "--search.least-steps", 120, "--search.no-repeat", "--device", "cpu",
+        "--search.least-steps", 60, "--search.no-repeat", "--device", "cpu",
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
     said = stop([*map(str, call)], signal.SIGINT, checkpoints=1)

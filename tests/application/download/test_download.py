@@ -202,7 +202,7 @@ def test_archives_cannot_reach_out_of_their_folder(tmp_path, write):
 
 
 def test_an_archive_of_next_to_nothing_does_not_fill_the_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr("geogs.application.download.unpack._SMALL", 1 << 20)
+    monkeypatch.setattr("geogs.application.download.unpack._MIN_LIMIT", 1 << 20)
     with zipfile.ZipFile(tmp_path / "archive", "w", zipfile.ZIP_DEFLATED) as packed:
         for k in range(3):
             packed.writestr(f"{k}.bin", bytes(400 << 10))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geogs.application.machine import compilation, rehearsal
-from geogs.application.machine.compilation import OF_SEARCH, Compilation, compiling
+from geogs.application.machine.compilation import KERNELS_OF_SEARCH, Compilation, compiling
 
 USED = """
 import sys
@@ -106,7 +106,7 @@ def test_what_is_compiled_is_known_until_a_source_changes(tmp_path, monkeypatch)
     compilation.compile_now()
     assert compilation.is_compiled()
     with compiling(torch.device("cpu")) as kernels:
-        assert kernels.wait(lambda stage, part: pytest.fail("all is there"), OF_SEARCH) < 0.1
+        assert kernels.wait(lambda *_: pytest.fail("all is there"), KERNELS_OF_SEARCH) < 0.1
     source = tmp_path / "some_kernels.py"
     source.touch()
     monkeypatch.setattr(compilation, "PACKAGE", tmp_path)

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from geogs.application.progress.forecast import Forecast
-from geogs.application.progress.posed_plan import PosedPlan
-from geogs.application.progress.run_plan import RunPlan
+from geogs.application.progress.plan import PosedPlan, RunPlan
 from geogs.config import Config, ReconstructConfig, preset
 from time_left import said
 

@@ -36,18 +36,18 @@ class Looked(RunProgress):
 @pytest.mark.system
 @pytest.mark.usefixtures("no_report")
 def test_it_is_there_before_the_map_and_gone_with_the_result(small_room, tmp_path, monkeypatch):
-    monkeypatch.setattr(tracked_video, "LONG", 0.0)
+    monkeypatch.setattr(tracked_video, "MIN_PREVIEW_SECONDS", 0.0)
     config = quick_config(pose_iterations=0, final_iterations=40)
     config = replace(config, input=InputConfig(stop=FRAMES))
     output = tmp_path / "out"
     looked = Looked(output)
-    written = run(RunSettings((small_room,), config, output, "cpu"), looked)
+    result = run(RunSettings((small_room,), config, output, "cpu"), looked)
     assert looked.seen
     (said,) = [text for text in looked.said if "rough mesh" in text]
     assert str(output / NAME) in said
     assert not (output / NAME).exists()
-    slam = written.result.scene
-    rough, mesh = preview(slam), written.result.mesh
+    slam = result.scene
+    rough, mesh = preview(slam), result.mesh
     (tmp_path / "seen.ply").write_bytes(looked.seen)
     assert len(read_mesh(tmp_path / "seen.ply").faces) == len(rough.faces) > 100
     # Most of it is where the map has its surface.

@@ -47,10 +47,10 @@ def extent(T_wc: np.ndarray) -> float:
 
 
 def test_measured_depth_makes_metres(small_room, tmp_path, no_report):
-    written = run(
+    result = run(
         RunSettings((small_room,), quick("sensor"), tmp_path / "out", "cpu", scale_from="sensor")
     )
-    trajectory = written.result.trajectory
+    trajectory = result.trajectory
     assert trajectory.tracked.all()
     assert extent(trajectory.T_wc) == pytest.approx(extent(truth(small_room)), rel=0.02)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -58,7 +58,7 @@ def test_measured_depth_makes_metres(small_room, tmp_path, no_report):
     assert summary["metric_scale"] == {
         "origin": "depth sensor", "factor": 1.0, "deviation": pytest.approx(0.005),
     }  # fmt: skip
-    for render in written.result.renders:
+    for render in result.renders:
         exact = cv2.imread(
             str(small_room / f"results/depth{round(30 * render.timestamp):06d}.png"), -1
         )
@@ -79,10 +79,10 @@ def test_a_known_distance_makes_metres(small_room, tmp_path, no_report):
     ]
     metres = np.linalg.norm(ends[0] - ends[1])
     known = f"12:{a[0]},{a[1]},{b[0]},{b[1]}={metres}m"
-    written = run(
+    result = run(
         RunSettings((small_room,), quick("none"), tmp_path / "out", "cpu", scale_from=known)
     )
-    assert extent(written.result.trajectory.T_wc) == pytest.approx(
+    assert extent(result.trajectory.T_wc) == pytest.approx(
         extent(truth(small_room)), rel=0.05
     )  # of a map of 64 x 48 pixels that was hardly trained
     said = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -91,7 +91,7 @@ def test_a_known_distance_makes_metres(small_room, tmp_path, no_report):
     source = scale_source(known)
     assert isinstance(source, KnownDistances)
     calibration = open_source(small_room).calibration
-    again = scale_by_distances(measurable_run(written.result.scene), source, calibration)
+    again = scale_by_distances(measurable_run(result.scene), source, calibration)
     assert again.factor == pytest.approx(1, abs=1e-3)
 
 

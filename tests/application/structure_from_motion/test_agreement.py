@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.structure_from_motion.agreement import is_joined_otherwise, turn_alike
+from geogs.application.structure_from_motion.agreement import has_wrong_joint, rotations_agree
 from geogs.types import Trajectory
 
 
@@ -37,16 +37,16 @@ def test_other_turns_are_noticed_whatever_the_world(other: Trajectory, alike: bo
     S = Rotation.from_euler("xyz", [40, 20, 10], degrees=True).as_matrix()
     turned = other.T_wc.copy()
     turned[:, :3] = S @ turned[:, :3]
-    assert turn_alike(walk(), Trajectory(other.timestamps, turned, other.tracked)) is alike
+    assert rotations_agree(walk(), Trajectory(other.timestamps, turned, other.tracked)) is alike
 
 
 def test_only_frames_count_that_both_place():
     other = walk(factor=0.5)
     few = np.arange(40) < 14
-    assert turn_alike(walk(), Trajectory(other.timestamps, other.T_wc, few))
+    assert rotations_agree(walk(), Trajectory(other.timestamps, other.T_wc, few))
     half = np.arange(40) % 2 == 0
     some = Trajectory(other.timestamps[half], other.T_wc[half], other.tracked[half])
-    assert not turn_alike(walk(), some)
+    assert not rotations_agree(walk(), some)
 
 
 @pytest.mark.parametrize(("turn", "is_broken"), [(25.0, False), (35.0, True)])
@@ -56,7 +56,7 @@ def test_a_single_joint_of_two_parts_that_turns_otherwise_is_noticed(turn, is_br
     other.T_wc[20:, :3] = R @ other.T_wc[20:, :3]
     some = np.arange(40) % 3 == 0
     sharp = Trajectory(other.timestamps[some], other.T_wc[some], other.tracked[some])
-    assert is_joined_otherwise(walk(), sharp) is is_broken
-    assert turn_alike(walk(), other)
+    assert has_wrong_joint(walk(), sharp) is is_broken
+    assert rotations_agree(walk(), other)
     lost = np.arange(40) != 19  # what tracking says of a turn during which it was lost is no truth
-    assert not is_joined_otherwise(Trajectory(other.timestamps, walk().T_wc, lost), sharp)
+    assert not has_wrong_joint(Trajectory(other.timestamps, walk().T_wc, lost), sharp)

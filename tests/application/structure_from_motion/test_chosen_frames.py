@@ -50,7 +50,7 @@ def test_frames_that_hardly_overlap_are_all_taken():
 
 
 def test_a_stretch_ends_where_the_image_has_moved(monkeypatch):
-    monkeypatch.setattr(chosen_frames, "FEWEST", 5)
+    monkeypatch.setattr(chosen_frames, "MIN_FRAMES", 5)
     slow = [0] * 60
     fast = np.concatenate([slow, np.arange(60) * 8])  # a twentieth of the width each
     found = chosen(panned(fast))
@@ -61,7 +61,7 @@ def test_a_stretch_ends_where_the_image_has_moved(monkeypatch):
 
 
 def test_there_are_not_more_than_can_be_placed(monkeypatch):
-    monkeypatch.setattr(chosen_frames, "MOST_MOVING", 30)
+    monkeypatch.setattr(chosen_frames, "MAX_MOVING_FRAMES", 30)
     found = chosen(panned(range(0, 1600, 40)))
     assert 20 <= len(found) <= 30
 

@@ -2,7 +2,9 @@
 
 import functools
 import json
+import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +12,9 @@ import numpy as np
 import pytest
 
 from geogs.application import remedy
+from geogs.application.calibrate import with_shutter_found
+from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
+from geogs.application.checkpoints.run_state import RunMetadata, run_state
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
@@ -18,9 +23,13 @@ from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.fallback import impossible, is_better, is_wanted
 from geogs.application.structure_from_motion.offline import PlacedOffline
 from geogs.cli.main import main
+from geogs.cli.options import record
+from geogs.cli.run import parse
 from geogs.config import Config, preset, preset_of
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.frame_source import Source
+from geogs.io.sources.sniff import open_source
+from geogs.slam import Slam
 from geogs.types import FoundFrames
 from io_samples import write_image
 from posed_layouts import Room, render_room
@@ -99,36 +108,63 @@ def filmed() -> Room:
     return render_room(FRAMES, 3, 160, 120)
 
 
-@pytest.fixture
-def video(tmp_path, monkeypatch):
-    """A few small frames of a room, of which tracking is taken to have lost too many."""
-    pytest.importorskip("pycolmap")
+def write_video(folder: Path) -> list[str]:
+    """The room as a folder of images, and what a run of it is told."""
     room = filmed()
     for k, image in enumerate(room.images):
-        write_image(tmp_path / "video" / f"{k:03d}.png", image)
+        write_image(folder / f"{k:03d}.png", image)
+    c = room.camera
+    return [
+        "run", str(folder), "--device", "cpu", "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}",
+        "--mapping.render-long-edge", "64", "--mapping.final-iterations", "5",
+        "--tracking.init-keyframes", "6", "--mapping.depth.planes", "32",
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def _lost(monkeypatch) -> None:
+    """Tracking is taken to have lost too many of the frames."""
+    pytest.importorskip("pycolmap")
     monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: True)
-    for part in ("write_page", "write_pictures"):
-        monkeypatch.setattr(f"geogs.application.results.write.{part}", lambda *_: None)
-    return tmp_path / "video", room.camera, room.T_wc
 
 
-def run(video, output, *more: str) -> dict:
-    folder, c, _ = video
-    code = main([
-        "run", str(folder), "-o", str(output), "--device", "cpu",
-        "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}", "--mapping.render-long-edge", "64",
-        "--mapping.final-iterations", "5", "--tracking.init-keyframes", "6",
-        "--mapping.depth.planes", "32", *more,
-    ])  # fmt: skip
-    assert code == 0
-    return json.loads((output / "summary.json").read_text())
+@pytest.fixture(scope="session")
+def tracked(once) -> Path:
+    """The checkpoint of a run whose frames have been tracked; all else is still to come."""
+
+    def track(folder: Path) -> None:
+        settings = record(RunSettings, parse(write_video(folder.parent / "video")[1:]))
+        source = with_shutter_found(open_source(settings.source, settings.config.input))
+        slam = Slam(source.camera, settings.config, "cpu", defers_map=True)
+        for frame in source:
+            slam.process(frame)
+        slam.end_stream()
+        metadata = RunMetadata(
+            settings.absolute(), "cpu", source.fingerprint(), None, shutter=source.shutter
+        )
+        state = run_state(metadata, slam, source)
+        write_checkpoint(checkpoint_folder(folder), state)
+
+    return once("tracked-video", track)
+
+
+@pytest.fixture
+def ended(_lost, tracked, tmp_path, no_report) -> Callable[[], dict]:
+    """Goes on with the tracked video to the end of its run; the summary."""
+
+    def go_on(name: str = "out") -> dict:
+        shutil.copytree(tracked, tmp_path / name)
+        assert main(["run", "--resume", str(tmp_path / name)]) == 0
+        return json.loads((tmp_path / name / "summary.json").read_text())
+
+    return go_on
 
 
 @pytest.mark.system
-def test_placed_frames_are_taken_where_they_are_better(video, tmp_path, monkeypatch, capfd):
+def test_placed_frames_are_taken_where_they_are_better(ended, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(fallback, "is_better", lambda *_: True)
-    summary = run(video, tmp_path / "out")
+    summary = ended()
     assert summary["offline"]["sharp_frames"] == FRAMES
     assert "eliable" in summary["offline"]["instead_of"]
     assert summary["seconds"]["tracking"] > 0
@@ -139,7 +175,7 @@ def test_placed_frames_are_taken_where_they_are_better(video, tmp_path, monkeypa
     assert "that is mapped now" in said
     placed = read_tum_trajectory(tmp_path / "out" / "trajectory.tum").T_wc[:, :3, 3]
     steps, truth = (
-        np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (placed, video[2][:, :3, 3])
+        np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (placed, filmed().T_wc[:, :3, 3])
     )
     np.testing.assert_allclose(steps / steps.sum(), truth / truth.sum(), atol=0.01)
     assert not (tmp_path / "out" / "checkpoint").exists()
@@ -147,7 +183,7 @@ def test_placed_frames_are_taken_where_they_are_better(video, tmp_path, monkeypa
 
 @pytest.mark.system
 def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
-    video, tmp_path, monkeypatch, capfd
+    ended, tmp_path, monkeypatch, capfd
 ):
     def fails(*_: object) -> None:
         raise RuntimeError("Of 16 sharp frames no three tell where they were taken.")
@@ -155,13 +191,13 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     for module in (fallback, remedy):
         monkeypatch.setattr(module, "has_pycolmap", lambda: False)
     monkeypatch.setattr(remedy, "is_wanted", lambda _: True)
-    plain = run(video, tmp_path / "plain")
+    plain = ended("plain")
     last = capfd.readouterr().out.splitlines()[-1]
     assert "pip install 'geogs[photos]' && geogs run" in last
     assert "--offline places the frames by structure from motion, in about " in last
     monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
     monkeypatch.setattr(PlacedOffline, "place", fails)
-    summary = run(video, tmp_path / "out")
+    summary = ended()
     assert "what was tracked stays" in capfd.readouterr().err
     assert "offline" not in summary
     assert summary["verdict"] == plain["verdict"]
@@ -170,8 +206,10 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
 
 
 @pytest.mark.system
-def test_frames_that_are_found_about_the_keyframes_have_a_place(video, tmp_path, monkeypatch):
-    write_image(video[0] / "009.png", np.zeros_like(filmed().images[9]))
+@pytest.mark.usefixtures("_lost", "no_report")
+def test_frames_that_are_found_about_the_keyframes_have_a_place(tmp_path, monkeypatch):
+    command = write_video(tmp_path / "video")
+    write_image(tmp_path / "video" / "009.png", np.zeros_like(filmed().images[9]))
     asked, judged = list[LostFrames](), Result.verdict.func
 
     def relied_on(self: Result) -> Verdict:
@@ -187,14 +225,15 @@ def test_frames_that_are_found_about_the_keyframes_have_a_place(video, tmp_path,
     monkeypatch.setattr(LostFrames, "search", finds)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: False)
     monkeypatch.setattr(Result, "verdict", property(relied_on))
-    summary = run(video, tmp_path / "out")
+    assert main([*command, "-o", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert 9 in asked[0].numbers
     assert summary["verdict"]["lost"] == 0
     assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == FRAMES
 
 
 @pytest.mark.system
-def test_what_turns_the_camera_otherwise_is_not_taken(video, tmp_path, monkeypatch, capfd):
+def test_what_turns_the_camera_otherwise_is_not_taken(ended, monkeypatch, capfd):
     judged = PlacedOffline.judged
 
     def turned(self: PlacedOffline) -> Verdict:
@@ -207,21 +246,21 @@ def test_what_turns_the_camera_otherwise_is_not_taken(video, tmp_path, monkeypat
     monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
     monkeypatch.setattr(fallback, "is_better", lambda *_: True)
     monkeypatch.setattr(PlacedOffline, "judged", turned)
-    summary = run(video, tmp_path / "out")
+    summary = ended()
     assert "turns the camera otherwise than tracking saw it" in capfd.readouterr().err
     assert "offline" not in summary
 
 
 @pytest.mark.system
 @pytest.mark.parametrize("stage", ["place", pytest.param("map", marks=pytest.mark.long)])
-def test_ctrl_c_keeps_what_was_tracked(video, tmp_path, monkeypatch, capfd, stage):
+def test_ctrl_c_keeps_what_was_tracked(ended, tmp_path, monkeypatch, capfd, stage):
     def is_stopped(self: PlacedOffline, driver: object, *_: object) -> None:
         signal.raise_signal(signal.SIGINT)
         driver.report("features", 0.5)
 
     monkeypatch.setattr(fallback, "is_better", lambda *_: True)
     monkeypatch.setattr(PlacedOffline, stage, is_stopped)
-    summary = run(video, tmp_path / "out")
+    summary = ended()
     assert "keeping what there is" in capfd.readouterr().err
     assert "offline" not in summary
     assert summary["interrupted"] is True

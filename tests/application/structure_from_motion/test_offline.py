@@ -38,7 +38,7 @@ def test_a_readout_found_of_few_images_a_second_is_left_to_their_residuals(
 @pytest.mark.usefixtures("no_report")
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(chosen_frames, "FEWEST", FRAMES // 2)
+    monkeypatch.setattr(chosen_frames, "MIN_FRAMES", FRAMES // 2)
     monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
     place, others = Localiser.place, list[int]()
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from geogs.application.viewer.browser_window import Window
-from geogs.application.viewer.live_viewer import MOST_DISKS, LiveViewer
+from geogs.application.viewer.live_viewer import MAX_DISKS, LiveViewer
 from geogs.geometry.camera import Camera
 from geogs.pose_estimate import PoseEstimate
 from geogs.types import Frame, MapSnapshot
@@ -82,7 +82,7 @@ class FakeSlam:
         self.segments = SimpleNamespace(keyframe_ids=[0, 1, 2])
 
     def snapshot(self) -> MapSnapshot:
-        n = MOST_DISKS + 1
+        n = MAX_DISKS + 1
         return MapSnapshot(
             torch.zeros(n, 3), torch.zeros(n, 4), torch.ones(n, 2), torch.full((n,), 0.5)
         )
@@ -98,7 +98,7 @@ def window() -> FakeWindow:
 
 def look(viewer: LiveViewer, slam: FakeSlam, number: int = 5) -> None:
     image = np.zeros((96, 128, 3), np.uint8)
-    status = PoseEstimate(TrackState.TRACKING, number, 3, MOST_DISKS + 1)
+    status = PoseEstimate(TrackState.TRACKING, number, 3, MAX_DISKS + 1)
     viewer.frame(Frame(number, number / 30, image), status, slam)
 
 
@@ -116,7 +116,7 @@ def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
     wait(viewer)
     frusta = [c for c in window.calls if c.startswith("/keyframes")]
     assert frusta == ["/keyframes/0", "/keyframes/1", "/keyframes/2"]
-    assert len(window.disks) == MOST_DISKS // 2 + 1  # every second
+    assert len(window.disks) == MAX_DISKS // 2 + 1  # every second
     for call in ("show_path", "show_camera", "show_picture", "follow", "say"):
         assert call in window.calls
     window.calls.clear()

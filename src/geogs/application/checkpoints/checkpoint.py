@@ -48,7 +48,7 @@ class Checkpoint:
         progress: RunProgress,
         stopwatch: Stopwatch,
     ) -> None:
-        """In a folder of results, every so many seconds, never if 0.
+        """Write into a folder of results, every so many seconds, never if 0.
 
         ``state`` gives the record to write; none while there is nothing to go on from.
         """
@@ -87,7 +87,7 @@ class Checkpoint:
         return self._every > 0
 
     def remove(self) -> None:
-        """After success: all that geogs wrote there."""
+        """Delete all that geogs wrote there, after success."""
         self._folder.remove()
 
 
@@ -169,7 +169,7 @@ def write_checkpoint(folder: CheckpointFolder, state: object) -> None:
 
 
 def checkpoint_folder(output: Path) -> CheckpointFolder:
-    """Where the checkpoint of results lies."""
+    """The checkpoint of a folder of results."""
     return CheckpointFolder(output / "checkpoint")
 
 

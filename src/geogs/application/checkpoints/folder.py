@@ -43,7 +43,7 @@ class Sum:
 
     @staticmethod
     def of(data: bytes) -> "Sum":
-        """That of a file with these bytes."""
+        """The sum of a file with these bytes."""
         return Sum(len(data), hashlib.sha256(data).hexdigest())
 
 

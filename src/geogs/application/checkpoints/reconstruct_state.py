@@ -9,7 +9,7 @@ from pathlib import Path
 from geogs.application.checkpoints.checkpoint import SavedState
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
-from geogs.reconstruction_output import ReconstructionTable
+from geogs.reconstruction import ReconstructionTable
 
 
 @dataclass(frozen=True)

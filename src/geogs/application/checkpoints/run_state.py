@@ -24,7 +24,7 @@ class RunMetadata:
     """What a run is made of, beside its state."""
 
     settings: RunSettings
-    """With absolute paths."""
+    """Settings with absolute paths."""
     device: str
     """cpu or cuda."""
     fingerprint: str
@@ -61,7 +61,7 @@ class SavedRun:
         self.metadata: RunMetadata = self._saved.plain("metadata")
         with self._saved.in_a_sentence():
             self.settings = self._trusted(output)
-            """Those that the run was begun with, without the files that only a stranger names."""
+            """Settings that the run was begun with, without files that only a stranger names."""
 
     def _trusted(self, output: Path) -> RunSettings:
         begun = self.metadata.settings

@@ -17,7 +17,7 @@ class PublicFile:
 
     url: str
     sha256: str = ""
-    """As published; empty where it is not."""
+    """Published checksum; empty where there is none."""
 
     @property
     def name(self) -> str:
@@ -30,7 +30,7 @@ class PublicSequence:
     """A sequence of a data set."""
 
     name: str
-    """As the command takes it."""
+    """Name on the command line."""
     folder: str
     """What its folder is called: by it the camera of some is known."""
     archive: PublicFile

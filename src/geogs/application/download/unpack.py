@@ -12,9 +12,9 @@ from typing import IO
 
 from geogs.errors import InputError, OutputError
 
-_MOST_TIMES = 50
-"""Times the size of the archive that its files may have: images hardly shrink."""
-_SMALL = 1 << 30
+_MAX_RATIO = 50
+"""Largest size of its files, in sizes of the archive: images hardly shrink."""
+_MIN_LIMIT = 1 << 30
 """Bytes that are let pass in any case."""
 
 Member = tuple[str, int, Callable[[], IO[bytes] | None]]
@@ -28,7 +28,7 @@ def unpack(archive: Path, folder: Path) -> None:
         InputError: it is damaged, or holds links, devices, or names that lead out of the folder.
         OutputError: a file cannot be written.
     """
-    most = max(_MOST_TIMES * archive.stat().st_size, _SMALL)
+    most = max(_MAX_RATIO * archive.stat().st_size, _MIN_LIMIT)
     try:
         folder.mkdir(parents=True)
         for name, size, opened in _members(archive):
@@ -82,7 +82,7 @@ def _write(path: Path, opened: Callable[[], IO[bytes] | None]) -> None:
 
 
 def _lift(folder: Path) -> None:
-    """Where all lies in one folder, take its place."""
+    """Let the only folder inside take the place of the folder, if all lies in it."""
     inside = list(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir():
         own = inside[0].rename(folder.with_name(f"{folder.name}.inner"))

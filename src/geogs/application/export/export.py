@@ -39,8 +39,6 @@ _FILES: dict[Format, tuple[str, ...]] = {
     "tum": ("trajectory.txt", ".txt", ".tum"),
 }
 """Formats of a single file: its usual name, and how it may end."""
-_WITH_OTHERS = ("kitti",)
-"""Those of a file that has another beside it."""
 _SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
 """Endings of files; a folder is not named so."""
 
@@ -60,7 +58,7 @@ def export(settings: ExportSettings) -> Path:
     if to == "glb" and settings.textured:  # beside the plain one
         name = "mesh_textured.glb"
     path = _file(place, name, *suffixes) if to in _FILES else place
-    if path == settings.output and to in _FILES and to not in _WITH_OTHERS:
+    if path == settings.output and to in _FILES and to != "kitti":  # of two files
         _write(path, result, settings)
         return path
     # Nothing below the folder that the user named, or that of the result, is believed to be there.

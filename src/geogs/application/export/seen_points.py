@@ -15,7 +15,7 @@ from geogs.types import RenderedKeyframe
 
 AGREEMENT = 0.01
 """Relative difference of depths up to which a keyframe sees a point."""
-_LEAST_COSINE = 0.1
+_MIN_COSINE = 0.1
 
 
 def seen_points(keyframes: Sequence[RenderedKeyframe], camera: Camera, count: int) -> SeenPoints:
@@ -118,7 +118,7 @@ def _observed(
     index = inside.nonzero()[:, 0]
     depth = keyframe.depth.cpu().double()[v[index], u[index]]
     agrees = (depth - z[index]).abs() < AGREEMENT * z[index]
-    facing = _cosines(points[index], torch.from_numpy(normals)[index], T_cw) > _LEAST_COSINE
+    facing = _cosines(points[index], torch.from_numpy(normals)[index], T_cw) > _MIN_COSINE
     index = index[agrees & facing]
     return index.numpy(), pixels[index].numpy()
 

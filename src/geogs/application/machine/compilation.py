@@ -20,15 +20,15 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-OF_SEARCH, OF_MAP, KERNELS = 18, 39, 53
-"""How many a rehearsal compiles, those counted that are called from Python: first what depths are
-searched by, up to what a map needs, up to a mesh."""
-PARTS = {"map": OF_MAP, "mesh": KERNELS - OF_MAP}
+KERNELS_OF_SEARCH, KERNELS_OF_MAP, KERNELS = 18, 39, 53
+"""How many kernels that are called from Python a rehearsal compiles: up to what searches depths,
+up to what makes a map, up to a mesh."""
+PARTS = {"map": KERNELS_OF_MAP, "mesh": KERNELS - KERNELS_OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
 ON_GPU = {"planes": 4, "turn": 2, "lens": 3}
-"""Likewise with a GPU, which calls nothing else of it; what takes longest goes first."""
-_POLITELY = 5
-"""By which each part is nicer than what goes before it, images first of all."""
+"""The same with a GPU, which calls nothing else of it; what takes longest goes first."""
+_NICENESS = 5
+"""Added to the niceness of each part over what goes before it, images first of all."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 
 
@@ -156,7 +156,7 @@ def main(arguments: list[str]) -> None:
     """Compile all, or the parts that are named, with a line for each kernel."""
     parts = arguments or [*PARTS]
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_POLITELY * (1 + [*(ON_GPU | PARTS)].index(parts[0])))
+        os.nice(_NICENESS * (1 + [*(ON_GPU | PARTS)].index(parts[0])))
     if not is_compiled(parts):
         compile_now(parts, lambda name: print(name, flush=True))
 

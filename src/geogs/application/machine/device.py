@@ -21,7 +21,7 @@ REMEDY = (
 _GPU_FAILS = ("CUDA error", "CUDA driver error", "cuDNN error", "cuBLAS", "CUBLAS", "NVRTC")
 
 
-def compiled_kernels(device: torch.device) -> float:
+def compile_gpu_kernels(device: torch.device) -> float:
     """Have all kernels of a GPU compiled, once per machine; the seconds that took."""
     start = time.perf_counter()
     if device.type == "cuda":
@@ -30,7 +30,7 @@ def compiled_kernels(device: torch.device) -> float:
 
 
 @contextmanager
-def full_memory_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]:
+def gpu_errors_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]:
     """Inside, errors of a GPU that fails or is full become a DeviceError with the remedy.
 
     ``way_on`` gives a sentence on how to go on with the work, behind a space, or nothing; a second

@@ -13,25 +13,25 @@ Clock = Callable[[], float]
 
 FIRST_KEYFRAMES, KEYFRAMES_PER_FRAME = 12.0, 0.13
 """Keyframes that are expected of a video before it has shown how many it has."""
-SURE_OF_KEYFRAMES = 15
-"""Frames after the first keyframes by which their rate is known as well as it was expected."""
-SOON_STARTED = 45
+PRIOR_FRAMES = 15
+"""Frames that the expected rate of keyframes weighs as much as, against those that were seen."""
+MIN_START_FRAMES = 45
 """Frames within which a start of the map says nothing of that rate."""
-SURE_OF_PACE, SAYS = 5.0, 5.0
-"""Seconds of the reference that a stage takes to say half of what a long one says of the pace, and
-how much that is, against the pace of the reference."""
-SOON = 0.5
+QUARTER_WEIGHT_SECONDS, STAGE_WEIGHT = 5.0, 5.0
+"""Seconds of the reference at which a stage weighs a quarter of a long one for the pace, and the
+weight of that one, where the pace of the reference weighs 1."""
+TOLERANCE_SECONDS = 0.5
 """Seconds by which stages may differ without saying anything."""
-MOST = math.log(3.0)
-"""Logarithm of the pace that a stage says at most: one may have had nothing to do."""
-LONGER = 0.3
+MAX_LOG_PACE = math.log(3.0)
+"""Largest logarithm of the pace of a single stage: one may have had nothing to do."""
+MIN_FRACTION_LEFT = 0.3
 """Fraction of what was left at the last report that stays left, however long ago that was."""
-LEAST_LEFT = 0.5
+MIN_SECONDS_LEFT = 0.5
 """Seconds that are left until the end, where the time that was given is over."""
-LEAST_REST = 17.0
+MIN_MAP_SECONDS = 17.0
 """Seconds that the smallest map takes with mesh and files where poses have used up the time."""
-STEADY = 0.04
-"""Fraction of the time left within which it follows what has changed."""
+SMOOTHING = 0.04
+"""Time constant of the shown figure, as a fraction of the time left."""
 
 
 @dataclass
@@ -40,10 +40,10 @@ class _Stage:
 
     name: str
     began: float
-    """By the clock, later by what was done aside since."""
+    """Time of its beginning, later by what was done aside since."""
     part: float = 0.0
     reported: float = 0.0
-    """Last, by the same clock."""
+    """Time of its last report, by the same clock."""
 
 
 class Forecast:
@@ -88,9 +88,9 @@ class Forecast:
             self._first = self._now
         seen, more = frames - self._first[0], keyframes - self._first[1]
         # What has not come yet by now comes seldom.
-        of_start = FIRST_KEYFRAMES / max(self._first[0] - self._begun[0], SOON_STARTED)
+        of_start = FIRST_KEYFRAMES / max(self._first[0] - self._begun[0], MIN_START_FRAMES)
         expected = min(math.sqrt(KEYFRAMES_PER_FRAME * of_start), 1.0)
-        rate = (more + SURE_OF_KEYFRAMES * expected) / (seen + SURE_OF_KEYFRAMES)
+        rate = (more + PRIOR_FRAMES * expected) / (seen + PRIOR_FRAMES)
         left = max(self._plan.frames - frames, 0)
         self._keyframes = (keyframes or FIRST_KEYFRAMES) + rate * left
         self.stage("frames", frames / max(self._plan.frames, frames))
@@ -112,7 +112,7 @@ class Forecast:
         self._found, self._found_at = self._by_now(), now
 
     def _end_stage(self, now: float) -> float:
-        """How long it took tells of the pace. Returns when it ended: what comes between it and the
+        """Count how long it took for the pace. Returns when it ended: what comes between it and the
         next one's first report counts for that."""
         if (stage := self._stage) is None:
             return now
@@ -124,14 +124,14 @@ class Forecast:
         return end
 
     def _end_aside(self, now: float) -> None:
-        """What was done aside counts for no stage, nor for the pace."""
+        """Count what was done aside for no stage, nor for the pace."""
         if self._aside is not None and self._stage is not None:
             self._stage.began += now - self._aside.began
             self._stage.reported += now - self._aside.began
         self._aside = None
 
     def _planned(self) -> dict[str, float]:
-        """Of each stage, without what was done before."""
+        """Seconds of each stage, without what was done before."""
         planned = self._plan.seconds(self._keyframes)
         if "frames" in planned:
             planned["frames"] -= self._plan.tracked(*self._begun)
@@ -141,12 +141,12 @@ class Forecast:
         """Seconds left now: it goes down with the clock, and follows news by and by."""
         now = self._clock()
         passed, self._said_at = now - self._said_at, now
-        found = max(self._found - (now - self._found_at), LONGER * self._found)
+        found = max(self._found - (now - self._found_at), MIN_FRACTION_LEFT * self._found)
         if math.isnan(self._said):
             self._said = found
         else:
             expected = max(self._said - passed, 0.0)
-            news = 1 - math.exp(-passed / max(STEADY * found, 1e-3))
+            news = 1 - math.exp(-passed / max(SMOOTHING * found, 1e-3))
             self._said = expected + news * (found - expected)
         return self._said
 
@@ -168,16 +168,16 @@ class Forecast:
         of_poses = pace_of(paces[False]) * seconds[False]
         if self._plan.end is None:
             return own + of_poses + pace_of(paces[True]) * seconds[True]
-        rest = LEAST_REST
+        rest = MIN_MAP_SECONDS
         if stage is None or stage.name in self._plan.fixed:
             of_poses += own
         else:
             rest -= until - self._rest_began
         # The map takes what the poses leave, but for the smallest one.
-        return max(self._plan.end - now, of_poses + max(rest, LEAST_LEFT))
+        return max(self._plan.end - now, of_poses + max(rest, MIN_SECONDS_LEFT))
 
     def _part_of(self, stage: _Stage, stages: dict[str, float]) -> float:
-        """How much of it is done, by time; of the frames those with keyframes take most."""
+        """Finished fraction of its time; of the frames those with keyframes take most."""
         if stage.name != "frames":
             return stage.part
         done = self._plan.tracked(*self._now) - self._plan.tracked(*self._begun)
@@ -185,17 +185,17 @@ class Forecast:
 
 
 def pace_of(stages: Sequence[tuple[float, float]]) -> float:
-    """Times the seconds of the reference that a machine takes, by those that stages took of both.
+    """Time of a machine over that of the reference, by the seconds that stages took of both.
 
-    Stages say so much whatever their length, as each is expected wrongly for reasons of its own.
+    Long stages all weigh the same, as each is expected wrongly for reasons of its own.
     """
-    weight, said = 1.0, 0.0
+    total_weight, total = 1.0, 0.0
     for took, expected in stages:
-        of_this = (expected / (expected + SURE_OF_PACE)) ** 2
-        weight += SAYS * of_this
-        ratio = math.log((took + SOON) / (expected + SOON))
-        said += SAYS * of_this * min(max(ratio, -MOST), MOST)
-    return math.exp(said / weight)
+        weight = STAGE_WEIGHT * (expected / (expected + QUARTER_WEIGHT_SECONDS)) ** 2
+        pace = math.log((took + TOLERANCE_SECONDS) / (expected + TOLERANCE_SECONDS))
+        total_weight += weight
+        total += weight * min(max(pace, -MAX_LOG_PACE), MAX_LOG_PACE)
+    return math.exp(total / total_weight)
 
 
 def _left(expected: float, since: float, part: float) -> float:

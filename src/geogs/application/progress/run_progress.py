@@ -14,16 +14,16 @@ class RunProgress:
         """A sentence for the user; nothing if it is empty."""
 
     def plan(self, plan: "Plan") -> None:
-        """Before the work of which so much is known."""
+        """Called before the work that is planned so."""
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
-        """Before the first frame of so many, if known, of which ``begun`` were done before."""
+        """Called before the first of so many frames, if known; ``begun`` were done before."""
 
     def frame(self, status: "PoseEstimate") -> None:
-        """After each frame."""
+        """Called after each frame."""
 
     def dropped(self, frames: int) -> None:
-        """When more frames of a live source came too fast to be used; so many so far."""
+        """Called when more frames of a live source came too fast to be used; so many so far."""
 
     def stage(self, name: str, fraction: float) -> None:
-        """After each part of another stage; ``fraction`` in [0, 1]."""
+        """Called after each part of another stage; ``fraction`` in [0, 1]."""

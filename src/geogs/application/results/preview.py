@@ -20,7 +20,7 @@ NAME = "preview.ply"
 _EDGE = 128
 """Longer side of the depth maps, pixels: cells of the tracker are eight pixels of its images."""
 _TRIANGLES = 60_000
-_MOST_VIEWS = 60
+_MAX_VIEWS = 60
 """Keyframes that are fused, evenly spread."""
 
 
@@ -45,7 +45,7 @@ def write_preview(output: Path, slam: Slam) -> bool:
 def preview(slam: Slam) -> Mesh | None:
     """The surface of the depths of tracking, which know a cell in 64 pixels; none without any."""
     keyframes = slam.segments.main.segment.keyframes
-    stride = -(-max(len(keyframes), 1) // _MOST_VIEWS)
+    stride = -(-max(len(keyframes), 1) // _MAX_VIEWS)
     camera = slam.camera
     shrink = min(_EDGE / max(camera.width, camera.height), 1.0)
     small = camera.resized(round(shrink * camera.width), round(shrink * camera.height))

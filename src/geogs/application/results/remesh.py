@@ -7,15 +7,13 @@ from geogs.application.progress.run_progress import RunProgress
 from geogs.application.result_settings import RemeshSettings
 from geogs.application.results.output_folder import claimed
 from geogs.application.results.result_page import write_page_anew
-from geogs.application.results.saved_result import SavedResult, load_result, result_folder
-from geogs.application.results.surfaces import fusion_views
+from geogs.application.results.saved_result import load_result, result_folder
+from geogs.application.results.surfaces import fused
 from geogs.config import MeshConfig
 from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.writers.replacement import replaced
-from geogs.mesh.extract import extract_mesh
-from geogs.mesh.triangle_mesh import Mesh
 
 
 def mesh_settings(folder: Path) -> MeshConfig:
@@ -55,20 +53,12 @@ def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Pat
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path} should end in .ply; geogs export writes other formats.")
     if path != folder / "mesh.ply":
-        mesh = _mesh_of(load_result(folder, require_device(settings.device)), settings, follow)
-        mesh.save(path)
+        result = load_result(folder, require_device(settings.device))
+        fused(result.keyframes, settings.mesh, follow).save(path)
         return path
     with claimed(folder), replaced(folder, "part") as new:
         result = load_result(folder, require_device(settings.device))
-        mesh = _mesh_of(result, settings, follow)
+        mesh = fused(result.keyframes, settings.mesh, follow)
         mesh.save(new / "mesh.ply")
         write_page_anew(new, result, mesh)
     return path
-
-
-def _mesh_of(result: SavedResult, settings: RemeshSettings, progress: RunProgress) -> Mesh:
-    return extract_mesh(
-        fusion_views(result.keyframes),
-        settings.mesh,
-        lambda part, done, of: progress.stage(f"mesh: {part}", done / of),
-    )

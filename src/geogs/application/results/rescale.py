@@ -46,7 +46,7 @@ _STAGES = ("", "online/", "adjusted/")
 def rescale(settings: RescaleSettings) -> MetricScale:
     """Find metres to the map unit, and write trajectories, map, meshes and summary in metres.
 
-    All take the places of the former together. Exports that were made before stay what they are.
+    All take the places of the previous ones together. Earlier exports stay what they are.
 
     Raises:
         InputError: there is no result, nothing is known, or the result does not tell its scale.

@@ -35,7 +35,9 @@ class Result:
     progress: RunProgress = field(default_factory=RunProgress)
     """Follows the extraction of the mesh."""
     folder: Path | None = None
-    """Where it was written; none where it was not."""
+    """Folder to which it was written; none where it was not."""
+    can_resume: bool = False
+    """Whether it was interrupted, and a checkpoint in the folder holds the work so far."""
 
     def __repr__(self) -> str:
         where = "not written" if self.folder is None else repr(str(self.folder))
@@ -105,14 +107,3 @@ class Result:
         renders = self.renders
         with self.scene.stopwatch("mesh"):
             return surface_of(renders, self.scene.config.mesh, self.progress)
-
-
-@dataclass(frozen=True)
-class Written:
-    """A result whose files have been written."""
-
-    output: Path
-    """Their folder."""
-    result: Result
-    can_resume: bool
-    """Whether it was interrupted, and a checkpoint holds the work that had been done."""

@@ -30,12 +30,12 @@ from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import ordered_map, worker_count
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
-MOST_FACES, MOST_DISKS, MOST_IMAGES = 240_000, 50_000, 240
+MAX_FACES, MAX_DISKS, MAX_IMAGES = 240_000, 50_000, 240
 """Most of each on a page, which then has less than 8 MB."""
 IMAGE_BYTES = 1_500_000
 """Bytes of all images of a page together, about."""
 _BYTES_A_PIXEL = 0.2
-_LONGEST_EDGE, _SHORTEST_EDGE = 480, 128
+_MAX_EDGE, _MIN_EDGE = 480, 128
 _QUALITY = 75
 
 
@@ -51,7 +51,7 @@ class ShownView:
 def write_pictures(
     folder: Path, trajectory: Trajectory, renders: Sequence[RenderedKeyframe]
 ) -> None:
-    """Those of the page that need no mesh: the path, and renders beside images.
+    """Draw the pictures of the page that need no mesh: the path, and renders beside images.
 
     Raises:
         OutputError: a file cannot be written.
@@ -169,14 +169,14 @@ def shown_model(
     """
     notes, surface, seen, disk_model = [], None, None, None
     if mesh is not None and len(mesh.faces):
-        surface = _surface(with_at_most(mesh, MOST_FACES), more_colourings)
+        surface = _surface(with_at_most(mesh, MAX_FACES), more_colourings)
         if len(surface.faces) < len(mesh.faces):
             notes.append(f"Shown with {len(surface.faces):,} of {len(mesh.faces):,} triangles.")
         seen = facets(surface.vertices, surface.faces, surface.normals)
     if disks is not None and len(disks):
         disk_model = _disks(disks)
         if len(disk_model.position) < len(disks):
-            notes.append(f"The {MOST_DISKS:,} largest of {len(disks):,} disks are shown.")
+            notes.append(f"The {MAX_DISKS:,} largest of {len(disks):,} disks are shown.")
     paths = [PathModel("Path", trajectory.T_wc[:, :3, 3], trajectory.states)]
     if true_path is not None:
         paths.append(PathModel("True path", true_path))
@@ -231,20 +231,20 @@ def _disks(disks: MapSnapshot) -> DiskModel:
         part.cpu().numpy() for part in (disks.position, disks.quaternion, disks.scale)
     )
     kept = np.arange(len(position))
-    if len(kept) > MOST_DISKS:
-        kept = np.sort(np.argsort(-scale.prod(1), kind="stable")[:MOST_DISKS])
+    if len(kept) > MAX_DISKS:
+        kept = np.sort(np.argsort(-scale.prod(1), kind="stable")[:MAX_DISKS])
     return DiskModel(position[kept], quaternion[kept], scale[kept])
 
 
 def _keyframes(views: Sequence[ShownView], camera: Camera) -> list[KeyframeModel]:
     """All keyframes; of many only some with images, and the more the smaller these."""
-    count = min(len(views), MOST_IMAGES)
+    count = min(len(views), MAX_IMAGES)
     with_image = set(np.linspace(0, len(views) - 1, count).round().astype(int).tolist())
     pixels = IMAGE_BYTES / max(count, 1) / _BYTES_A_PIXEL
     edge = int(
         (pixels * max(camera.width, camera.height) / min(camera.width, camera.height)) ** 0.5
     )
-    edge = min(max(edge, _SHORTEST_EDGE), _LONGEST_EDGE)
+    edge = min(max(edge, _MIN_EDGE), _MAX_EDGE)
     start = views[0].timestamp if views else 0.0
 
     def shown(number: int) -> KeyframeModel:

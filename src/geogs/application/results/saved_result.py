@@ -49,7 +49,7 @@ class SavedResult:
 
     folder: Path
     disks: MapSnapshot
-    """In the world, on the device asked for."""
+    """Disks in the world, on the device asked for."""
     views: MapViews
 
     def __repr__(self) -> str:

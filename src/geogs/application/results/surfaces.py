@@ -27,6 +27,20 @@ def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
     return OnDemand(renders, lambda r: DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image))
 
 
+def fused(
+    renders: Sequence[RenderedKeyframe],
+    config: MeshConfig,
+    progress: RunProgress,
+    name: str = "mesh",
+) -> Mesh:
+    """Fuse depth maps to a mesh, called ``name``. Raises InputError where there is no surface."""
+    return extract_mesh(
+        fusion_views(renders),
+        config,
+        lambda part, done, of: progress.stage(f"{name}: {part}", done / of),
+    )
+
+
 def surface_of(
     renders: Sequence[RenderedKeyframe],
     config: MeshConfig,
@@ -35,11 +49,7 @@ def surface_of(
 ) -> Mesh | None:
     """Fuse depth maps to a mesh; where there is no surface, say so as ``name``."""
     try:
-        return extract_mesh(
-            fusion_views(renders),
-            config,
-            lambda part, done, of: progress.stage(f"{name}: {part}", done / of),
-        )
+        return fused(renders, config, progress, name)
     except InputError as error:
         progress.write(f"No {name}: {error}")
         return None

@@ -10,8 +10,8 @@ from geogs.types import Trajectory, Uncertainty
 MAX_LOST = 0.2
 """Fraction of the frames without a pose above which nothing is called reliable."""
 MAX_ORIENTATION_ONLY = 0.5
-"""Likewise of frames of which no more than the orientation is known: what there is of a map is
-right, but it is not what the video is about."""
+"""Fraction of frames with no more than an orientation above which nothing is: what there is of a
+map is right, but it is not what the video is about."""
 MAX_POSITION_DEVIATION = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MAX_DEPTH_DEVIATION = 0.2
@@ -37,7 +37,7 @@ class Verdict:
 
     is_reliable: bool
     sentence: str
-    """For the terminal."""
+    """What the terminal says."""
     lost: float
     """Fraction of the frames of which nothing is known."""
     orientation_only: float
@@ -101,8 +101,8 @@ def verdict(
         reasons.append(_known_to(depth, known_to, "nothing tells the depths of what it sees"))
     if not known.focal <= MAX_FOCAL_DEVIATION:
         known_to = "the video tells it only to {:.0%}"
-        told = _known_to(known.focal, known_to, "the video does not tell it")
-        reasons.append(f"nobody said its focal length and {told}: give --intrinsics")
+        focal = _known_to(known.focal, known_to, "the video does not tell it")
+        reasons.append(f"nobody said its focal length and {focal}: give --intrinsics")
     elif not is_explained:
         reasons.append(
             "no camera explains how its first views move, as if much of what they show moves "
@@ -141,7 +141,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def _finely(value: float) -> str:
-    """In percent, of small parts the first digit."""
+    """A fraction in percent, of a small one the first digit."""
     return f"{value:.1%}" if value >= 0.001 else f"{100 * value:.1g}%"
 
 

@@ -102,7 +102,7 @@ def _write_map(
 
 @on_one_torch_thread
 def _write_pictures(output: Path, result: Result, shown: Sequence[RenderedKeyframe]) -> None:
-    """Those of the report, beside the mesh."""
+    """Draw the pictures of the report, beside the mesh."""
     with result.scene.stopwatch.aside():
         write_pictures(output / "report", result.trajectory, shown)
 

@@ -18,7 +18,7 @@ from geogs.io.sources.undistort import Rectifier
 from geogs.slam import Slam
 
 _log = logging.getLogger(__name__)
-MOST_POSES = 10_000
+MAX_POSES = 10_000
 """Most poses of a path that is published; of a longer one the latest."""
 
 
@@ -117,7 +117,7 @@ class CameraNode:
             return
         if found.T_wc is not None:
             pose = self._messages.pose(seconds, torch.as_tensor(found.T_wc))
-            self._poses = [*self._poses, pose][-MOST_POSES:]
+            self._poses = [*self._poses, pose][-MAX_POSES:]
             self._publish["pose"](pose)
             self._publish["path"](self._messages.path(seconds, self._poses))
         if time.monotonic() - self._shown >= self._settings.every:

@@ -6,7 +6,7 @@ from geogs.application.scale.measurable_scene import (
     MeasurableScene,
     SeenKeyframe,
     measurable,
-    said,
+    scale_sentence,
 )
 from geogs.errors import InputError
 from geogs.io.sources.frame_source import Source
@@ -36,7 +36,7 @@ def make_metric(
         progress.write(f"warning: the scale stays unknown. {why}")
         return
     slam.rescale(found)
-    progress.write(said(found))
+    progress.write(scale_sentence(found))
 
 
 def sentences_on_poses(found: OdometryAgreement) -> list[str]:

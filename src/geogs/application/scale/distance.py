@@ -11,9 +11,9 @@ from geogs.geometry.distortion import undistorted_rays
 from geogs.io.sources.calibration import Calibration
 from geogs.types import MetricScale
 
-CLICK = 1.0
+CLICK_ERROR = 1.0
 """Pixels of the image as it came by which a point that somebody gives is off."""
-_AROUND = 2
+_RADIUS = 2
 """Pixels of the depth map on each side of a point that say how far it is."""
 
 
@@ -31,7 +31,7 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class KnownDistances:
-    """Some of them, which vote."""
+    """Several distances, which vote."""
 
     each: tuple[KnownDistance, ...]
 
@@ -80,7 +80,7 @@ def _one(
     focal = calibration.fx
     variance = 0.0
     for point, ray, deviation in zip(ends, rays, along, strict=True):
-        variance += 2 * (CLICK * point[2] / focal) ** 2 / 2
+        variance += (CLICK_ERROR * point[2] / focal) ** 2
         towards = np.append(ray, 1.0) @ between / length
         variance += (towards * deviation) ** 2
     return known.metres / length, known.metres / length * variance**0.5 / length
@@ -101,8 +101,8 @@ def _lifted(
     column, row = round(float(u)), round(float(v))
     if not (0 <= column < camera.width and 0 <= row < camera.height):
         raise InputError(f"--scale-from: a pixel lies outside the working image of {known.frame}.")
-    rows = slice(max(row - _AROUND, 0), row + _AROUND + 1)
-    columns = slice(max(column - _AROUND, 0), column + _AROUND + 1)
+    rows = slice(max(row - _RADIUS, 0), row + _RADIUS + 1)
+    columns = slice(max(column - _RADIUS, 0), column + _RADIUS + 1)
     y, x = np.mgrid[rows, columns]
     y, x = y[: depth[rows, columns].shape[0]], x[:, : depth[rows, columns].shape[1]]
     near = depth[rows, columns]

@@ -9,20 +9,20 @@ from geogs.application.scale.measurable_scene import MeasurableScene
 from geogs.errors import InputError
 from geogs.types import MetricScale
 
-VIEWS = 40
+MAX_VIEWS = 40
 """Keyframes whose surfaces are looked at, at most."""
-POINTS = 400
+POINTS_PER_VIEW = 400
 """Points of each."""
-LEVEL = np.radians(35.0)
+MAX_TILT = np.radians(35.0)
 """Angle by which the ground's normal may differ from the mean of the cameras' own upward axes."""
-NEAR = 0.02
+MAX_DISTANCE = 0.02
 """Distance of a point from the plane, as a part of the cameras' height, that makes it ground."""
 _SAMPLES = 1000
-_JUDGES = 3000
+_MAX_SCORED = 3000
 """Points that say how good a plane is, at most."""
-_BELOW = 0.05
+_MAX_BELOW = 0.05
 """Fraction of all points that may lie clearly under the ground."""
-_LEAST = 0.03
+_MIN_SUPPORT = 0.03
 """Fraction of all points that the ground has, at least."""
 
 
@@ -41,7 +41,7 @@ def scale_by_height(scene: MeasurableScene, known: CameraHeight) -> MetricScale:
     Raises:
         InputError: there is no such plane.
     """
-    step = max(1, -(-len(scene.keyframes) // VIEWS))
+    step = max(1, -(-len(scene.keyframes) // MAX_VIEWS))
     poses = np.array([k.T_cw for k in scene.keyframes])
     if not len(poses):
         raise InputError("--scale-from: there is no keyframe, and so no ground.")
@@ -49,7 +49,7 @@ def scale_by_height(scene: MeasurableScene, known: CameraHeight) -> MetricScale:
     clouds = []
     for T_cw in poses[::step]:
         points, _ = scene.points(T_cw)
-        chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
+        chosen = rng.choice(len(points), min(POINTS_PER_VIEW, len(points)), replace=False)
         clouds.append(points[chosen])
     cloud = np.concatenate(clouds)
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
@@ -80,8 +80,8 @@ def ground_plane(
     if len(cloud) < 3:
         return None
     up = up / max(float(np.linalg.norm(up)), 1e-12)
-    judges = cloud[rng.permutation(len(cloud))[:_JUDGES]]
-    best, most = None, _LEAST * len(judges)
+    judges = cloud[rng.permutation(len(cloud))[:_MAX_SCORED]]
+    best, most = None, _MIN_SUPPORT * len(judges)
     for a, b, c in cloud[rng.integers(len(cloud), size=(_SAMPLES, 3))]:
         plane = _through(a, b, c, up)
         count = 0.0 if plane is None else _support(plane, judges, centres)
@@ -91,7 +91,7 @@ def ground_plane(
         return None
     for _ in range(3):
         height = float(np.median(centres @ best[:3] + best[3]))
-        near = cloud[np.abs(cloud @ best[:3] + best[3]) < NEAR * height]
+        near = cloud[np.abs(cloud @ best[:3] + best[3]) < MAX_DISTANCE * height]
         middle = near.mean(0)
         normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
         normal = normal if normal @ up > 0 else -normal
@@ -110,7 +110,7 @@ def _through(
     if length < 1e-12:
         return None
     normal = normal / length if normal @ up > 0 else -normal / length
-    return np.append(normal, -normal @ a) if normal @ up > np.cos(LEVEL) else None
+    return np.append(normal, -normal @ a) if normal @ up > np.cos(MAX_TILT) else None
 
 
 def _support(
@@ -124,6 +124,6 @@ def _support(
     if heights.min() <= 0:
         return 0.0
     above = cloud @ plane[:3] + plane[3]
-    if (above < -4 * NEAR * height).mean() > _BELOW:
+    if (above < -4 * MAX_DISTANCE * height).mean() > _MAX_BELOW:
         return 0.0
-    return float((np.abs(above) < NEAR * height).sum())
+    return float((np.abs(above) < MAX_DISTANCE * height).sum())

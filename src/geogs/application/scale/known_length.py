@@ -15,7 +15,7 @@ _NUMBER = r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 _DISTANCE = re.compile(rf"(\d+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER}m?")
 _TAG = re.compile(rf"aruco:(DICT_\w+):{_NUMBER}m?")
 _HEIGHT = re.compile(rf"height:{_NUMBER}m?")
-LONGEST = 1e6
+MAX_LENGTH = 1e6
 """Metres of anything that is known."""
 HOW = (
     "give FRAME:u1,v1,u2,v2=1.25m, several of them with semicolons, aruco:DICT_5X5_50:0.12, "
@@ -73,6 +73,6 @@ def _distance(text: str, found: re.Match[str]) -> KnownDistance:
 
 def _length(text: str, number: str) -> float:
     metres = float(number)
-    if not 0 < metres < LONGEST:
+    if not 0 < metres < MAX_LENGTH:
         raise InputError(f"--scale-from {text[:60]} has a length of {metres:g} m; give a real one.")
     return metres

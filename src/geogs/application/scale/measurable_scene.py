@@ -61,7 +61,7 @@ def measurable(
     return MeasurableScene(camera, renderer.camera, keyframes, trajectory, surface)
 
 
-def said(found: MetricScale) -> str:
+def scale_sentence(found: MetricScale) -> str:
     """A found scale in a sentence."""
     metres = f"{found.factor:.5g} metres to the map unit (+- {found.deviation:.1%})"
     return f"Scale: {metres}, by {found.origin}."

@@ -14,9 +14,9 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.types import MetricScale
 
-ANGLE = np.radians(1.5)
+MIN_PARALLAX = np.radians(1.5)
 """Least angle between two rays to a corner."""
-OUTLIER = 3.0
+MAX_REPROJECTION_ERROR = 3.0
 """Pixels by which a corner may miss its triangulated place."""
 _COMMON_ERROR = 0.003
 """Fraction of a tag's size by which printing, focal length and blur leave it wrong in common."""
@@ -32,7 +32,7 @@ class TagSize:
     """Square tags of one family, whose black squares have so long a side."""
 
     family: str
-    """As OpenCV calls its dictionary."""
+    """Name of OpenCV's dictionary."""
     metres: float
 
 
@@ -176,12 +176,12 @@ def triangulated(
         seen = P @ np.append(point, 1.0)
         depth = np.where(seen[:, 2] > 0, seen[:, 2], 1.0)
         error = np.linalg.norm(seen[:, :2] / depth[:, None] - pixels, axis=1)
-        used = (seen[:, 2] > 0) & (error < max(OUTLIER, 3 * float(np.median(error))))
+        used = (seen[:, 2] > 0) & (error < max(MAX_REPROJECTION_ERROR, 3 * float(np.median(error))))
     centres = np.array([-T[:3, :3].T @ T[:3, 3] for T, _ in rays])[used]
     towards = point - centres
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     widest = np.arccos(np.clip(towards @ towards.T, -1, 1)).max(initial=0.0)
-    return point if widest > ANGLE else None
+    return point if widest > MIN_PARALLAX else None
 
 
 def _sides(points: Sequence[Float64[np.ndarray, "3"] | None]) -> list[float]:

@@ -1,9 +1,9 @@
-"""Whether two ways to place the frames of a video turn its camera alike.
+"""Whether two trajectories of a video agree in how its camera rotates.
 
-Where the camera is a start may mistake; how it turns from frame to frame hardly: a location that
-was followed and checked against the images is right to a fraction of a degree, whatever became of
-scale and drift. So a second way that turns otherwise, however well it knows itself, is wrong; and
-one that turns much otherwise just between two frames joins its parts wrongly there.
+A wrong start may misplace the camera, but hardly its rotation from frame to frame: what was tracked
+and checked against the images is right to a fraction of a degree, whatever became of scale and
+drift. So a second trajectory that rotates otherwise is wrong, however small its deviations; and one
+that does so just between two frames joins its parts wrongly there.
 """
 
 import numpy as np
@@ -12,41 +12,42 @@ from jaxtyping import Float64
 from geogs.evaluation.rotation_errors import relative_rotation_error, rotation_angle
 from geogs.types import Trajectory
 
-APART = 5
+FRAMES_APART = 5
 """Frames, of those that both place, from the first to the second of a pair."""
-FEWEST = 10
+MIN_PAIRS = 10
 """Pairs below which nothing can be said."""
-TOLERANCE = 1.0
-"""Degrees by which the turns of a pair may differ, ..."""
-OF_TURN = 0.15
-"""... and part of the turn: focal lengths that differ so much turn so differently."""
-JOINT = 30.0
-"""Degrees by which no two frames that follow one another may turn otherwise."""
+MAX_DIFFERENCE_DEG = 1.0
+"""Degrees by which the rotations of a pair may differ, ..."""
+MAX_RELATIVE_DIFFERENCE = 0.15
+"""... and fraction of the rotation: by so much do wrong focal lengths scale it."""
+MAX_JOINT_DEG = 30.0
+"""Degrees by which the rotation between two frames in a row may differ at most."""
 
 
-def turn_alike(first: Trajectory, second: Trajectory) -> bool:
-    """Whether most pairs of frames are turned alike by both, or there are too few of them.
+def rotations_agree(first: Trajectory, second: Trajectory) -> bool:
+    """Whether most pairs of frames are rotated alike by both, or there are too few of them.
 
     Frames are known by their times; those count whose places both know.
     """
     known = first.of("tracked"), second.of("tracked")
     _, R = _common(*known)
-    begin = np.arange(len(R[0]) - APART)
-    if len(begin) < FEWEST:
+    begin = np.arange(len(R[0]) - FRAMES_APART)
+    if len(begin) < MIN_PAIRS:
         return True
-    apart = relative_rotation_error(R[1], R[0], begin, begin + APART)
-    allowed = TOLERANCE + OF_TURN * rotation_angle(R[0][begin], R[0][begin + APART])
-    return bool((apart <= allowed).mean() > 0.5)
+    end = begin + FRAMES_APART
+    difference = relative_rotation_error(R[1], R[0], begin, end)
+    angle = rotation_angle(R[0][begin], R[0][end])
+    return bool((difference <= MAX_DIFFERENCE_DEG + MAX_RELATIVE_DIFFERENCE * angle).mean() > 0.5)
 
 
-def is_joined_otherwise(tracked: Trajectory, sharp: Trajectory) -> bool:
-    """Whether two sharp frames, of which the second is the next, are turned quite otherwise than
-    tracking, which lost none between them, saw it."""
+def has_wrong_joint(tracked: Trajectory, sharp: Trajectory) -> bool:
+    """Whether two sharp frames in a row are rotated quite otherwise than by tracking, which lost
+    no frame between them."""
     times, R = _common(tracked.of("tracked"), sharp)
     number = np.searchsorted(tracked.timestamps, times)
     lost = np.cumsum([state != "tracked" for state in tracked.states])[number]
     begin = np.flatnonzero(np.diff(lost) == 0)
-    return bool((relative_rotation_error(R[1], R[0], begin, begin + 1) > JOINT).any())
+    return bool((relative_rotation_error(R[1], R[0], begin, begin + 1) > MAX_JOINT_DEG).any())
 
 
 def _common(

@@ -11,17 +11,17 @@ from jaxtyping import Float32, Float64, UInt8
 from geogs.stopwatch import StageProgress, unwatched
 from geogs.types import Frame
 
-SECONDS = 0.33
+MAX_STRETCH_SECONDS = 0.33
 """Time of a video of which one frame is chosen at least."""
-SPARSE = 6.0
+SPARSE_FPS = 6.0
 """Frames a second up to which all are: neighbours share little enough as it is."""
-FEWEST, MOST = 40, 250
+MIN_FRAMES, MAX_FRAMES = 40, 250
 """Frames that are chosen of a video whose length is known, at least and, for the time, at most."""
-MOST_MOVING = 500
+MAX_MOVING_FRAMES = 500
 """Frames that are chosen at most."""
-SHIFT = 0.15
+MAX_SHIFT = 0.15
 """Motion in the image after which another frame is chosen, of its longer side."""
-_EDGE, _CORNERS, _QUALITY, _APART = 320, 200, 0.01, 7
+_EDGE, _CORNERS, _QUALITY, _CORNER_DISTANCE = 320, 200, 0.01, 7
 """Motion is followed at this longer side, by so many corners so far apart."""
 
 
@@ -66,9 +66,9 @@ def choose_frames(
 
 def stretch_length(fps: float, length: int | None) -> int:
     """Frames of a video of which one is chosen at least."""
-    every = max(1, round(SECONDS * fps)) if fps > SPARSE else 1
+    every = max(1, round(MAX_STRETCH_SECONDS * fps)) if fps > SPARSE_FPS else 1
     if length is not None:
-        every = max(math.ceil(length / MOST), min(every, max(1, length // FEWEST)))
+        every = max(math.ceil(length / MAX_FRAMES), min(every, max(1, length // MIN_FRAMES)))
     return every
 
 
@@ -83,7 +83,7 @@ def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) ->
     Corners that are not found again count as far away: where they are most, it is 1. So it is where
     there are none; what the camera does then is not known.
     """
-    corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _APART)
+    corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _CORNER_DISTANCE)
     if corners is None:
         return 1.0
     there, found = _followed(before, after, corners)
@@ -114,14 +114,14 @@ def _reduced(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
 def _sharpest(sharp: Sequence[float], moved: Sequence[float], every: int) -> list[int]:
     """The sharpest frame of each stretch, by the motion of each frame since the one before.
 
-    Stretches grow until there are no more than ``MOST_MOVING``.
+    Stretches grow until there are no more than ``MAX_MOVING_FRAMES``.
     """
     longer = 1.0
     while True:
-        starts = _stretches(moved, longer * SHIFT, round(longer * every))
-        if len(starts) <= MOST_MOVING:
+        starts = _stretches(moved, longer * MAX_SHIFT, round(longer * every))
+        if len(starts) <= MAX_MOVING_FRAMES:
             break
-        longer *= 1.05 * len(starts) / MOST_MOVING
+        longer *= 1.05 * len(starts) / MAX_MOVING_FRAMES
     ends = [*starts[1:], len(sharp)]
     return [a + int(np.argmax(sharp[a:b])) for a, b in zip(starts, ends, strict=True)]
 

@@ -24,13 +24,13 @@ from geogs.threads import worker_count
 from geogs.types import FoundFrames, FoundLens, Frame, Trajectory, Uncertainty
 from geogs.world.straight_view import StraightView
 
-AROUND = 10
+NEIGHBOURS = 10
 """Frames with a place before each lost one, and as many after it, about which it is looked for."""
-MOST = 250
+MAX_LOST = 250
 """Lost frames that are looked for at once, for time and memory; of more every second one comes
 first, or every third, ..."""
-UNREAD = 3.0
-"""Times deviations are larger where no readout is known by which the rows could be rectified.
+FACTOR_WITHOUT_READOUT = 3.0
+"""Factor on deviations where no readout is known by which the rows could be rectified.
 Measured on a phone's video with a truth (docs/photographs.md)."""
 STAGE = "lost frames"
 
@@ -74,7 +74,7 @@ class LostFrames:
         return looked_at * sum(SECONDS_PER_FRAME.values()) / worker_count()
 
     def search(self, driver: Driver, stopwatch: Stopwatch) -> FoundFrames:
-        """Those that have a place after all, with what is to be said of it; none where that fails.
+        """Frames that have a place after all, with what is to be said of it; none where that fails.
 
         Raises KeyboardInterrupt if it was stopped.
         """
@@ -95,7 +95,7 @@ class LostFrames:
         return found
 
     def _found(self, report: StageProgress) -> FoundFrames:
-        known, rounds = dict(self.known), math.ceil(len(self.numbers) / MOST)
+        known, rounds = dict(self.known), math.ceil(len(self.numbers) / MAX_LOST)
         at = np.array([self._times[k] for k in sorted(known)])
         beside = Uncertainty(at, *np.zeros((3, len(at))))
         poses: dict[int, Float64[np.ndarray, "4 4"]] = {}
@@ -115,14 +115,14 @@ class LostFrames:
         wanted: Sequence[int],
         report: StageProgress,
     ) -> FoundFrames:
-        """Those of some lost frames that are found about known ones, and known well enough."""
+        """Lost frames that are found about known ones, and known well enough."""
         near = about(wanted, known)
         if not near:
             return FoundFrames.none()
         frames = _read(self._video, {*wanted, *near})
         T_cw = [known.get(frame.index) for frame in frames]
         found = place_lost(frames, T_cw, self._seen_by, self._seed, report)
-        times = 1.0 if self._video.shutter.readout else UNREAD
+        times = 1.0 if self._video.shutter.readout else FACTOR_WITHOUT_READOUT
         found = replace(found, position=times * found.position, rotation=times * found.rotation)
         return found.of(found.position <= self._most_deviation)
 
@@ -132,7 +132,7 @@ def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
     near, ascending = set[int](), sorted(known)
     for number in wanted:
         at = bisect_left(ascending, number)
-        near.update(ascending[max(0, at - AROUND) : at + AROUND])
+        near.update(ascending[max(0, at - NEIGHBOURS) : at + NEIGHBOURS])
     return near
 
 

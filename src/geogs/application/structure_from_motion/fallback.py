@@ -17,7 +17,7 @@ from geogs.application.results.verdict import (
     Verdict,
 )
 from geogs.application.run_settings import RunSettings
-from geogs.application.structure_from_motion.agreement import is_joined_otherwise, turn_alike
+from geogs.application.structure_from_motion.agreement import has_wrong_joint, rotations_agree
 from geogs.application.structure_from_motion.completion import LostFrames, as_seen
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
@@ -53,11 +53,11 @@ class TrackedOrPlaced(Work):
 
     @property
     def way_on(self) -> str:
-        """As of the tracked video."""
+        """How to go on with the tracked video."""
         return self._tracked.way_on
 
     def state(self) -> object | None:
-        """That of tracking."""
+        """The state of tracking."""
         return self._tracked.state()
 
     def complete(self, driver: Driver, checkpoint: Checkpoint, new: Path) -> Outcome:
@@ -155,7 +155,7 @@ class TrackedOrPlaced(Work):
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
         found = placed.judged()
-        is_other = tracked is not None and self._turns_otherwise(placed)
+        is_other = tracked is not None and self._rotates_otherwise(placed)
         is_taken = is_better(found, tracked) and not is_other
         say(
             f"Structure from motion places {_placed_part(found):.0%} of the frames, tracking "
@@ -166,9 +166,9 @@ class TrackedOrPlaced(Work):
         placed.scene.instead_of = _in_words(tracked)
         return placed if is_taken else None
 
-    def _turns_otherwise(self, placed: "PlacedOffline") -> bool:
+    def _rotates_otherwise(self, placed: "PlacedOffline") -> bool:
         was, sharp = self._tracked.scene.trajectory(), placed.scene.keyframe_trajectory()
-        return not turn_alike(was, placed.trajectory) or is_joined_otherwise(was, sharp)
+        return not rotations_agree(was, placed.trajectory) or has_wrong_joint(was, sharp)
 
     def _is_mapped(self, placed: "PlacedOffline", driver: Driver, checkpoint: Checkpoint) -> bool:
         """Map the placed frames; false where nothing came of it."""

@@ -29,7 +29,7 @@ from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
 
-FEW = 8.0
+MIN_CLIP_FPS = 8.0
 """Images a second, as recorded, below which a readout that nobody gave is not searched in clips:
 all images are placed then, and their residuals tell it with its error (docs/photographs.md)."""
 
@@ -98,10 +98,10 @@ class PlacedOffline(Work):
         assert chosen is not None, "no frames have been chosen"
         self._chosen = None  # it takes much memory
         with self._stopwatch("structure from motion"):
-            told = video.calibration.refinement
+            refinement = video.calibration.refinement
             placed = place_frames(
                 chosen, video.camera, not video.is_calibration_open,
-                told is not None and told.failure is None,
+                refinement is not None and refinement.failure is None,
                 config.input.readout == "auto" and not video.shutter.readout, config.seed,
                 driver.report,
             )  # fmt: skip
@@ -148,13 +148,13 @@ class PlacedOffline(Work):
 
 def beginning_with(video: Source, found: Source) -> Source:
     """A video with the shutter that was found of it, and the focal length, where nobody gave one:
-    that is where structure from motion begins, which finds its own; the shutter of ``FEW``, too."""
-    begun = video if video.recorded_fps < FEW else video.with_shutter(found.shutter)
+    that is where structure from motion begins, which finds its own; see ``MIN_CLIP_FPS``, too."""
+    begun = video if video.recorded_fps < MIN_CLIP_FPS else video.with_shutter(found.shutter)
     if not video.is_calibration_open:
         return begun
-    told = found.calibration
+    lens = found.calibration
     return begun.with_calibration(
-        replace(video.calibration, fx=told.fx, fy=told.fy, refinement=told.refinement)
+        replace(video.calibration, fx=lens.fx, fy=lens.fy, refinement=lens.refinement)
     )
 
 
@@ -185,7 +185,7 @@ class OfflineScene(Reconstruction):
         return known.with_found(self.found)
 
     def statistics(self) -> dict[str, object]:
-        """That nothing was tracked, and how the poses were found."""
+        """How the poses were found, as nothing was tracked."""
         return {
             "offline": {
                 "sharp_frames": self._placed.sharp_frames,

@@ -3,15 +3,14 @@
 import math
 from dataclasses import replace
 
-from geogs.application.progress.posed_plan import PosedPlan
-from geogs.application.progress.run_plan import RunPlan
+from geogs.application.progress.plan import PosedPlan, RunPlan
 from geogs.application.structure_from_motion.chosen_frames import stretch_length
 from geogs.application.structure_from_motion.photos import seconds_to_place
 from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_preset
 from geogs.io.sources.frame_source import Source
 
 _SECONDS_TO_CHOOSE = 0.02
-"""Of each frame."""
+"""Seconds for each frame."""
 
 
 def offline_config(config: Config) -> ReconstructConfig:

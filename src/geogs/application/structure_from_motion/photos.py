@@ -32,11 +32,11 @@ Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 SECONDS_PER_FRAME = {
     "features": 0.1, "choosing pairs": 0.13, "matching": 0.9, "finding poses": 0.25
 }  # fmt: skip
-"""Of one core, by stage, to find where such a frame was taken: some 22 pairs of each are matched
-(50 frames of 512 pixels)."""
+"""Seconds of one core, by stage, to find where such a frame was taken: some 22 pairs of each are
+matched (50 frames of 512 pixels)."""
 SECONDS_PER_OTHER, SECONDS_TO_ADD = 0.3, 0.1
-"""Of one core, to place another frame against their points, and to take one that has been placed
-into the map."""
+"""Seconds of one core to place another frame against their points, and to take one that has been
+placed into the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ def open_photographs(
     open_them = _registered("open_photographs")
     source: PosedSource = open_them(
         folder, config, kept, hold_out, again, progress, stop, seconds, expects
-    )  # fmt: skip
+    )
     return source
 
 

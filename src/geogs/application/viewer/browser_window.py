@@ -31,7 +31,7 @@ ROOM, BESIDE = 1.3, 0.1
 right of it one looks then, as a part of it."""
 _FAREWELL = 0.3
 """Seconds that the server takes to end."""
-_LEAST_MOVE = 1e-3
+_MIN_MOVE = 1e-3
 """Change of a number of its pose from which a keyframe is moved."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 """Parts of the scene, by the names of their switches."""
@@ -190,7 +190,7 @@ class Window:
             frustum.visible = self._switches["Keyframes"].value
         else:
             frustum, before = self._frusta[id]
-            if np.abs(before - T_wc).max() <= _LEAST_MOVE:
+            if np.abs(before - T_wc).max() <= _MIN_MOVE:
                 return
             frustum.wxyz, frustum.position = _place(T_wc)
         self._frusta[id] = frustum, T_wc
@@ -238,6 +238,12 @@ class Window:
         for name, parts in self._parts.items():
             for part in parts:
                 part.visible = self._switches[name].value
+
+
+def reduced(picture: UInt8[np.ndarray, "h w 3"], longest: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Every so many-th pixel of a picture, so that no side is longer."""
+    step = -(-max(picture.shape[:2]) // longest)
+    return np.ascontiguousarray(picture[::step, ::step])
 
 
 def _look(client: Any, eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:

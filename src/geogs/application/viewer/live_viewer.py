@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.application.viewer.browser_window import Window
+from geogs.application.viewer.browser_window import Window, reduced
 from geogs.application.viewer.observer import RunObserver
 from geogs.evaluation.held_camera import level_axes
 from geogs.evaluation.pages.keyframe_layers import layer_picture
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MAX_TIME_FRACTION = 0.02
 """Fraction of the time that looking may take, of the run's thread and of the viewer's together."""
-MOST_DISKS = 30_000
+MAX_DISKS = 30_000
 _MAP_SECONDS = 3.0
 """Least time between two looks at the map."""
 _PICTURE_EDGE = 320
@@ -41,7 +41,7 @@ class Update:
     keyframes: Float[np.ndarray, "k 4 4"]
     """Camera to world."""
     disks: MapSnapshot | None = None
-    """None where they are as before."""
+    """Disks of the map; none where they are as before."""
 
 
 class LiveViewer(RunObserver):
@@ -108,7 +108,7 @@ class LiveViewer(RunObserver):
             disks = thinned(slam.snapshot())
         return Update(
             words,
-            _small(picture),
+            reduced(picture, _PICTURE_EDGE),
             slam.camera,
             None if seen is None else np.linalg.inv(seen.numpy()),
             ids,
@@ -149,12 +149,7 @@ class LiveViewer(RunObserver):
 
 
 def thinned(disks: MapSnapshot) -> MapSnapshot:
-    """Not more than can be sent."""
-    step = -(-len(disks) // MOST_DISKS)
+    """Every so many-th disk, so that no more are left than can be sent."""
+    step = -(-len(disks) // MAX_DISKS)
     kept = {name: getattr(disks, name)[::step].cpu() for name in MapSnapshot.__slots__}
     return replace(disks, **kept)
-
-
-def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    step = -(-max(picture.shape[:2]) // _PICTURE_EDGE)
-    return np.ascontiguousarray(picture[::step, ::step])

@@ -19,10 +19,10 @@ class RunObserver:
     """
 
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
-        """After each frame."""
+        """Called after each frame."""
 
     def result(self, result: "Result") -> None:
-        """After all files have been written."""
+        """Called after all files have been written."""
 
 
 class Observers(RunObserver):

@@ -6,12 +6,12 @@ import numpy as np
 
 from geogs.application.results.result_page import stand
 from geogs.application.results.saved_result import SavedResult
-from geogs.application.viewer.browser_window import Window
+from geogs.application.viewer.browser_window import Window, reduced
 from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import facets
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 
-MOST_FRUSTA = 24
+MAX_FRUSTA = 24
 """Most keyframes shown, evenly along the path."""
 _IMAGE_EDGE = 160
 
@@ -42,12 +42,10 @@ def open_window(result: SavedResult, host: str, port: int) -> Window:
 def _show_keyframes(result: SavedResult, window: Window) -> None:
     views = result.views
     count = len(views.keyframe_id)
-    shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
+    shown = np.unique(np.linspace(0, count - 1, min(count, MAX_FRUSTA)).round().astype(int))
     for number in shown.tolist():
         image = result.image(number)
-        if image is not None:
-            step = -(-max(image.shape) // _IMAGE_EDGE)
-            image = np.ascontiguousarray(image[::step, ::step])
+        image = None if image is None else reduced(image, _IMAGE_EDGE)
         id, T_wc = int(views.keyframe_id[number]), np.linalg.inv(views.T_cw[number])
         window.show_keyframe(id, T_wc, result.camera, image)
 

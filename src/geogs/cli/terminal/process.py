@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
-from geogs.application.interrupt import asking, interrupt
+from geogs.application.interrupt import handled_signals, interrupt
 from geogs.cli.terminal.streams import make_unbreakable
 
 _IMPORTED = 500_000
@@ -20,7 +20,7 @@ _IMPORTED = 500_000
 
 
 def take_over() -> None:
-    """Before anything heavy is imported.
+    """Make the process ready for a command, before anything heavy is imported.
 
     NumPy's BLAS gets one thread, since our own threads use the cores. Those of BLAS spin while they
     wait for each other, for matrices that are small here: the search for a readout took eight times
@@ -85,5 +85,5 @@ def leave(code: int) -> None:
 
 def _handle_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
     if threading.current_thread() is threading.main_thread():
-        for number in asking():
+        for number in handled_signals():
             signal.signal(number, handler)

@@ -11,7 +11,7 @@ from geogs.errors import TrackingLost
 
 if TYPE_CHECKING:
     from geogs.application.progress.run_progress import RunProgress
-    from geogs.application.results.result import Written
+    from geogs.application.results.result import Result
 
 
 NOT_JUDGED = (
@@ -27,7 +27,7 @@ def say_loading(options: Verbosity) -> None:
         print("loading ...", end="\r", file=sys.stderr, flush=True)
 
 
-def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> "Written":
+def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "Result":
     """Do the work of a command, with a line of progress on the standard error, and say at its end
     on the standard output what came of it.
 
@@ -43,37 +43,36 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
             handler.setLevel(logging.INFO)
             handler.setFormatter(logging.Formatter("%(message)s"))
     with TerminalProgress(options) as progress:
-        written = work(progress)
+        result = work(progress)
         progress.end_phase()
-        words = closing_message(written, time.perf_counter() - begin)
-        words += _remedy(options, written)
+        words = closing_message(result, time.perf_counter() - begin)
+        words += _remedy(options, result)
         progress.note("\n".join(words))
     if not options.quiet:
         print("\n".join(words))
-    result = written.result
     if result.mesh is None and not result.is_interrupted:
         why = result.why_no_map or "Of what was seen no surface is known."
-        raise TrackingLost(f"There is no mesh; the rest is in {written.output}/. {why}")
-    return written
+        raise TrackingLost(f"There is no mesh; the rest is in {result.folder}/. {why}")
+    return result
 
 
-def _remedy(options: Verbosity, written: "Written") -> list[str]:
+def _remedy(options: Verbosity, result: "Result") -> list[str]:
     """The command that may help where a run came to its end and is not to be relied on."""
     from geogs.application.remedy import remedy
 
-    result = written.result
     if not isinstance(options, RunSettings) or result.is_interrupted:
         return []
     said = remedy(options, result.source, result.verdict, result.scene.stopwatch.total)
     return [f"What may help: {said}"] if said else []
 
 
-def closing_message(written: "Written", seconds: float) -> list[str]:
+def closing_message(result: "Result", seconds: float) -> list[str]:
     """Lines for the user after a run or a reconstruction, which took so many seconds."""
     from geogs.evaluation.duration import duration
     from geogs.io.sources.posed.posed_source import PosedSource
 
-    result, output = written.result, written.output
+    output = result.folder
+    assert output is not None, "it has been written"
     lines = []
     if result.verdict is not None:
         lines.append(result.verdict.sentence)
