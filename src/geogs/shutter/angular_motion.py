@@ -49,7 +49,7 @@ class AngularStep:
     """What the camera did between two images of a video."""
 
     rate: Float[np.ndarray, "3"]
-    """Its mean angular velocity, radians per second."""
+    """Mean angular velocity, radians per second."""
     interval: float
     """Seconds between the two."""
     parallax: tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]] | None = None
@@ -80,7 +80,7 @@ def angular_motion_between(before: AngularStep | None, after: AngularStep | None
 def _agreed(
     before: Float[np.ndarray, "gh gw 2"], after: Float[np.ndarray, "gh gw 2"], fraction: float
 ) -> Float[np.ndarray, "gh gw 2"]:
-    """Between the two, and the less of it the more they differ: flow that fails differs."""
+    """Mean of the two, shrunk the more they differ: flow that fails differs."""
     mean, change = before + fraction * (after - before), after - before
     square, error = (mean**2).sum(2, keepdims=True), (change**2).sum(2, keepdims=True)
     weight: Float[np.ndarray, "gh gw 1"] = square / np.maximum(square + error, 1e-12)
