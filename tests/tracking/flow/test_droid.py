@@ -16,8 +16,16 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.networks.tensor_files import read_tensors
+from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
-from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize, load_droid
+from geogs.tracking.flow.droid_network import (
+    CORRELATION_SCALE,
+    LEVELS,
+    RADIUS,
+    DroidNetwork,
+    DroidSize,
+    load_droid,
+)
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
@@ -177,7 +185,8 @@ def test_the_start_of_an_edge_is_the_context_of_its_source(operator, views, star
         position = ((start[0] - 4) / 8).reshape(1, GRID.height, GRID.width, 2)
         flow = position - ((GRID.pixels - 4) / 8).reshape(1, GRID.height, GRID.width, 2)
         motion = torch.cat([flow, 0 * flow], -1).permute(0, 3, 1, 2)
-        correlation = once._lookup([views[0]], [views[1]])(position)
+        features = [view.features[None] for view in views[:2]]
+        correlation = CorrelationVolume(*features, LEVELS, RADIUS, CORRELATION_SCALE)(position)
         out = once.network.update(hidden, static, correlation, motion)
     expected = position + out.delta.permute(0, 2, 3, 1)
     torch.testing.assert_close(there.pixels, (4 + 8 * expected).flatten(1, 2), rtol=1e-4, atol=1e-3)
