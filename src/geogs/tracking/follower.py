@@ -20,7 +20,7 @@ FARTHER = 1.0
 """Part of the motion that calls for a keyframe by which a frame may be farther than that from the
 one that is not finished."""
 MOST_FRAMES = 60
-"""Whose images wait with a follower."""
+"""Most frames whose images wait with a follower."""
 
 
 @dataclass(frozen=True)

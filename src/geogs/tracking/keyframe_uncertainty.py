@@ -145,7 +145,7 @@ class _Matches:
 
     @staticmethod
     def among(tracker: Tracker, ids: list[int]) -> "_Matches | None":
-        """Those of some keyframes; none where no edge joins them."""
+        """The matches of some keyframes; none where no edge joins them."""
         free = ids if tracker.segment.fixed else ids[1:]
         among = {*ids, *tracker.segment.fixed}
         edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
@@ -156,7 +156,7 @@ class _Matches:
 
     @property
     def grid(self) -> SampleGrid:
-        """Of their cells."""
+        """The grid of their cells."""
         return self.keyframes.grid
 
     def lens(self, rows: RowErrors | None = None, of_depths: bool = False) -> LensEvidence | None:
@@ -201,7 +201,7 @@ class _Matches:
     def _slope(
         self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
     ) -> Float[Tensor, "e p 2"]:
-        """By how much matches, where cells fall, change with a readout longer by a part of it."""
+        """Derivatives of matches, where cells fall, by the factor on the readout."""
         i, j = ([self.keyframes[self.frames[n]].frame_index for n in x] for x in (
             part.source.tolist(), part.target.tolist()
         ))  # fmt: skip

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from geogs.bundle.lens import RadialLens
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
-from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import USUAL_BEND
 from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
@@ -31,17 +30,12 @@ class Estimate:
 
     lens: RadialLens
     covariance: Float64[Tensor, "3 3"]
-    """Of the logarithm of the focal length, k1 and k2; zero for those that are known."""
+    """Covariance of log focal length, k1 and k2; zero for those that are known."""
     keyframes: int
 
     @property
-    def camera(self) -> Camera:
-        """The lens' pinhole."""
-        return self.lens.camera
-
-    @property
     def deviations(self) -> tuple[float, float, float]:
-        """Of each of the sizes."""
+        """Standard deviation of each of these."""
         focal, k1, k2 = self.covariance.diagonal().sqrt().tolist()
         return focal, k1, k2
 
@@ -59,9 +53,8 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     angle = 2 * math.degrees(math.atan(lens.camera.long_edge / 2 / lens.camera.fx))
     if not FIELDS_OF_VIEW[0] < angle < FIELDS_OF_VIEW[1]:
         return f"it seems to have a field of view of {angle:.0f} degrees"
-    if any(
-        abs(k) > MOST_BEND * usual for k, usual in zip((lens.k1, lens.k2), USUAL_BEND, strict=True)
-    ):
+    bends = zip((lens.k1, lens.k2), USUAL_BEND, strict=True)
+    if any(abs(k) > MOST_BEND * usual for k, usual in bends):
         return "its lens seems to bend as none does"
     if bundle.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
@@ -74,8 +67,8 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
 
 
 def with_prior(said: Estimate) -> Estimate:
-    """With what is known of lenses before any match is asked: k1 and k2 are about none. A narrow
-    field of view does not tell them."""
+    """The estimate joined with what is known of any lens: k1 and k2 are about zero, which a narrow
+    field of view does not tell."""
     lens = said.lens
     size = torch.tensor([0.0, lens.k1, lens.k2], dtype=torch.float64)
     told = LensEstimate(size, said.covariance)

@@ -85,9 +85,8 @@ class Stretch:
 
     def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
-        count = max(START_KEYFRAMES, 2 * LEAST_VIEWS)
         failure = Degeneracy.BLANK
-        while failure is not Degeneracy.UNEXPLAINED and self._gather(count):
+        while failure is not Degeneracy.UNEXPLAINED and self._gather(START_KEYFRAMES):
             if len(self._views) < LEAST_VIEWS:
                 return Degeneracy.STILL
             flows = flows_from_first(self.grid, self.operator, self._views)

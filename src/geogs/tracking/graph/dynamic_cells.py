@@ -81,8 +81,8 @@ def update_dynamic(
 
     ``decided`` are all edges of these sources that have a say; where they say too little of a cell,
     it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
-    residual around a cell must be. One that was held for moving and keeps its place in the image
-    (``STANDING``) is held on.
+    residual around a cell must be. One that was dynamic and keeps its place in the image
+    (``STANDING``) stays dynamic.
     """
     directed = sorted(decided)
     if not directed:
@@ -96,14 +96,14 @@ def update_dynamic(
         total = ratio.new_zeros(len(ids), ratio.shape[1])
         count = total.index_add(0, row, (~ratio.isnan()).to(ratio))
         total = total.index_add(0, row, ratio.nan_to_num(0.0))
-        before = [keyframes[k].moving for k in ids.tolist()]
         none = torch.zeros_like(static[0])
-        held = torch.stack([none if b is None else b for b in before])
+        moving = [keyframes[k].moving for k in ids.tolist()]
+        before = torch.stack([none if cells is None else cells for cells in moving])
         # The median over the static cells of an edge is its usual parallax.
         usual = torch.where(static, parallax, torch.nan).nanmedian(1).values[:, None]
         moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
-        stands = held & (moved < STANDING * count)
-        dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
+        stands = before & (moved < STANDING * count)
+        dynamic = dynamic_cells(keyframes.grid, total, count, before, threshold)
         border = _mean(keyframes.grid, stands.to(total), 5) >= REGION
         dynamic |= stands | border
         for n, k in enumerate(ids.tolist()):

@@ -88,8 +88,8 @@ def _by_distance(
     if wanted.any():
         wanted = wanted & alike_in_size(store, first, second)
     if int(wanted.sum()) > PAIRS_TOGETHER[0]:
-        wanted = wanted & may_overlap(store, first, second, LEAST_OVERLAP, 2)
-        wanted &= may_overlap(store, second, first, LEAST_OVERLAP, 2).T
+        wanted = wanted & may_overlap(store, first, second, LEAST_OVERLAP)
+        wanted &= may_overlap(store, second, first, LEAST_OVERLAP).T
     at = np.stack(np.nonzero(wanted), 1)
     pairs = np.stack([rows[at[:, 0]], columns[at[:, 1]]], 1)
 

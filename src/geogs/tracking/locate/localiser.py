@@ -6,12 +6,7 @@ from typing import Any
 import torch
 
 from geogs.tracking.keyframes.segment_map import SegmentMap
-from geogs.tracking.locate.frame_locator import (
-    FrameLocator,
-    FrameMotion,
-    Recognition,
-    with_depth,
-)
+from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, Recognition, with_depth
 from geogs.tracking.locate.orientation_follower import Followed
 from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.tracking.matching.flow_chain import MIN_MATCHED
@@ -80,8 +75,7 @@ class SegmentLocaliser:
             if candidate.keyframe not in self.map.keyframes:
                 continue
             keyframe = self.map.keyframes[candidate.keyframe]
-            motion = self.locator.locate_relative(keyframe, encoded, candidate.T_rel)
-            motion = with_depth(motion)
+            motion = with_depth(self.locator.locate_relative(keyframe, encoded, candidate.T_rel))
             if motion is not None and motion.matched >= RECOGNISED:
                 return motion
         return None

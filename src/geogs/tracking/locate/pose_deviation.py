@@ -29,7 +29,7 @@ class PoseDeviation:
     position: float
     """The camera's centre, all axes together, map units; infinite where nothing is known."""
     rotation: float
-    """Its orientation, radians."""
+    """The camera's orientation, radians."""
 
 
 def pose_deviation(
@@ -63,6 +63,6 @@ def left_open(H: Float[Tensor, "6 6"]) -> PoseDeviation:
 
 
 def deviation_of(grid: SampleGrid, keyframe: Keyframe, motion: FrameMotion) -> DeviationOf:
-    """The same of a frame located at a keyframe, by what is known now, when it is asked for."""
+    """Computes the same later of a frame located at a keyframe, by what is known now."""
     T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw).to(motion.T_cw)
     return partial(pose_deviation, grid, copy(keyframe), T_rel, motion.match)

@@ -92,9 +92,8 @@ def correlation_matched(
         return _on_gpu(grid, first, second, pixels=pixels)
     some = _spread(grid)
     positions = pixels[some, None] + _offsets(grid)
-    return _median_correlation(
-        grid, first, second, positions, torch.ones_like(positions[:, 0, 0]) > 0
-    )
+    every = torch.ones(len(positions), dtype=torch.bool)
+    return _median_correlation(grid, first, second, positions, every)
 
 
 def matched_motion(

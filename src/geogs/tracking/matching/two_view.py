@@ -24,7 +24,7 @@ COMPARED = 5
 """Pairs of views that are compared by what other views say of their depths."""
 LASTING = 2 / 3
 """Fraction of the views that a cell is matched in which is followed longest."""
-SHARE = 0.05, 0.8
+LASTING_FRACTION = 0.05, 0.8
 """Fractions of the first matches that those followed longest may be, for the rest to be asked."""
 CLEARLY = 1.2
 """Times as much must the rest agree without them for them to move by themselves. In streets and
@@ -88,8 +88,9 @@ def followed_longest(grid: SampleGrid, flows: Sequence[FlowMatch]) -> Bool[Tenso
     sure = torch.stack([match.sure()[0] for match in flows])
     lasting = (sure.float().mean(0) >= LASTING).view(grid.height, grid.width)
     lasting = widened(lasting, 1).view(-1)
-    share = float((lasting & sure[0]).sum()) / max(int(sure[0].sum()), 1)
-    return lasting & (SHARE[0] <= share <= SHARE[1])
+    fraction = float((lasting & sure[0]).sum()) / max(int(sure[0].sum()), 1)
+    least, most = LASTING_FRACTION
+    return lasting & (least <= fraction <= most)
 
 
 def without(match: FlowMatch, cells: Bool[Tensor, "p"]) -> FlowMatch:
