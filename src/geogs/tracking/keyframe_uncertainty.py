@@ -1,7 +1,7 @@
 """How well a tracker knows its keyframes, by what all its matches leave open."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -65,8 +65,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
     propagated, focal, change, lenses = np.zeros(2), 0.0, 0.0, 0.0
     lens = tracker.keyframes.table.lens
-    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        part = slice(first, first + TOGETHER + 1)
+    for part in _parts(ids):
         found = _marginals(tracker, ids[part], rows)
         if found is None:
             continue
@@ -110,11 +109,11 @@ def said_of_lens(
     And of the readout by which ``rows`` err, where there are any.
     """
     found = None
-    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
-        part = None if matches is None else matches.lens(rows)
-        if part is not None:
-            found = part if found is None else found.joined(part)
+    for part in _parts(ids):
+        matches = _Matches.among(tracker, ids[part])
+        said = None if matches is None else matches.lens(rows)
+        if said is not None:
+            found = said if found is None else found.joined(said)
     return found
 
 
@@ -127,12 +126,18 @@ def said_of_frame_lenses(
     and the first of the next.
     """
     found = []
-    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
+    for part in _parts(ids):
+        matches = _Matches.among(tracker, ids[part])
         said = None if matches is None else matches.frame_lenses()
         if matches is not None and said is not None:
             found.append((matches.frames, said))
     return found
+
+
+def _parts(ids: list[int]) -> Iterator[slice]:
+    """Spans of ids that are solved jointly; the last of one is the first of the next."""
+    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
+        yield slice(first, first + TOGETHER + 1)
 
 
 @dataclass(frozen=True)
@@ -159,7 +164,7 @@ class _Matches:
         """The grid of their cells."""
         return self.keyframes.grid
 
-    def lens(self, rows: RowErrors | None = None, of_depths: bool = False) -> LensEvidence | None:
+    def lens(self, rows: RowErrors | None, of_depths: bool = False) -> LensEvidence | None:
         """What they say of the lens, and of the readout that ``rows`` are for; nothing where they
         do not tell of all poses."""
         slope = None if rows is None else partial(self._slope, rows)

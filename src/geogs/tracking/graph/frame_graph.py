@@ -165,8 +165,7 @@ class FrameGraph:
 
         size = PAIRS_TOGETHER[grid.on_gpu]
         parts = [directed[k : k + size] for k in range(0, len(directed), size)]
-        concurrent = len(parts) > 1 and not grid.on_gpu
-        return torch.cat(thread_map(moved, parts) if concurrent else [moved(p) for p in parts])
+        return torch.cat([moved(p) for p in parts] if grid.on_gpu else thread_map(moved, parts))
 
     def problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]

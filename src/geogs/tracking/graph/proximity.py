@@ -103,8 +103,7 @@ def _by_distance(
         return []
     size = PAIRS_TOGETHER[store.grid.on_gpu] // 2
     parts = [pairs[k : k + size] for k in range(0, len(pairs), size)]
-    side_by_side = len(parts) > 1 and not store.grid.on_gpu
-    found = thread_map(distances, parts) if side_by_side else [distances(p) for p in parts]
+    found = [distances(p) for p in parts] if store.grid.on_gpu else thread_map(distances, parts)
     distance = np.concatenate(found)
     near = np.nonzero(distance <= max_distance)[0]
     order = near[np.argsort(distance[near], kind="stable")]
