@@ -1,5 +1,7 @@
 """A small textured room of planes, rendered exactly: images, depth and poses for tracker tests."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import torch
@@ -35,8 +37,16 @@ TEXTURES = [_texture(k) for k in range(len(PLANES))]
 
 def render(T_wc: np.ndarray, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
     """Grey RGB image and z-depth from a camera at T_wc inside the box."""
-    rays = camera.rays(torch.float64).numpy()
-    return seen(T_wc[:3, 3], rays @ T_wc[:3, :3].T)
+    room = (*PLANES, *map(id, TEXTURES))
+    image, depth = _rendered(T_wc.astype(np.float64).tobytes(), camera, room)
+    return image.copy(), depth.copy()
+
+
+@lru_cache(maxsize=256)
+def _rendered(T_wc: bytes, camera: Camera, room: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """The same, kept as many tests look from the same poses; ``room`` tells it from another."""
+    T, rays = np.frombuffer(T_wc).reshape(4, 4), camera.rays(torch.float64).numpy()
+    return seen(T[:3, 3], rays @ T[:3, :3].T)
 
 
 def seen(centre: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -122,20 +122,20 @@ def test_the_largest_segment_becomes_the_world():
     assert segments.trajectory().tracked.tolist() == [False] * 8 + [True] * 30
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
-def test_moving_keyframes_keeps_what_they_see(scale):
+def test_moving_keyframes_keeps_what_they_see():
     tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     for frame in stream(np.arange(0, 16, 2.0)):
         tracker.track(frame)
     tracker.finish()
-    before = tracker.map.graph.reprojections([(0, 2), (3, 1)])
-    centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.keyframes]
-    xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
-    S = sim3_exp(xi)
-    tracker.keyframes.correct(tracker.keyframes.moved(S))
-    after = tracker.map.graph.reprojections([(0, 2), (3, 1)])
-    assert float((after - before).abs().max()) < 2e-3
-    for centre, state in zip(centres, tracker.keyframes, strict=True):
-        expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])
-        assert torch.allclose(torch.linalg.inv(state.T_cw)[:3, 3], expected[:3], atol=1e-9)
-    assert tracker.trajectory().tracked.all()
+    for scale in (0.5, 1.0, 3.0):
+        before = tracker.map.graph.reprojections([(0, 2), (3, 1)])
+        centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.keyframes]
+        xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
+        S = sim3_exp(xi)
+        tracker.keyframes.correct(tracker.keyframes.moved(S))
+        after = tracker.map.graph.reprojections([(0, 2), (3, 1)])
+        assert float((after - before).abs().max()) < 2e-3
+        for centre, state in zip(centres, tracker.keyframes, strict=True):
+            expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])
+            assert torch.allclose(torch.linalg.inv(state.T_cw)[:3, 3], expected[:3], atol=1e-9)
+        assert tracker.trajectory().tracked.all()
