@@ -24,7 +24,7 @@ CULL_DISTANCE = 0.009
 """A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
 makes one."""
 DEEPER = 3
-"""Keyframes before the window whose poses are adjusted whose inverse depth is adjusted, too."""
+"""Keyframes before the window of adjusted poses whose inverse depths are adjusted, too."""
 PROXIMITY_WINDOW = 25
 """Older keyframes among which further neighbours of a new one are looked for, as in DROID-SLAM."""
 PROXIMITY_DISTANCE = 0.2

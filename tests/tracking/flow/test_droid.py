@@ -23,7 +23,6 @@ from geogs.tracking.flow.droid_network import (
     LEVELS,
     RADIUS,
     DroidNetwork,
-    DroidSize,
     load_droid,
 )
 from geogs.tracking.flow.flow_operator import FlowOperator
@@ -39,7 +38,7 @@ POSES = [pose(0.0), pose(0.12, 0.02, 0.05, 0.03), pose(0.2, 0.0, 0.05, 0.05)]
 def narrow(seed: int = 0, delta: tuple[float, float] | None = None) -> DroidNetwork:
     """A small network with random weights; with ``delta`` all its updates are that many cells."""
     torch.manual_seed(seed)
-    network = DroidNetwork(DroidSize(8))
+    network = DroidNetwork(8)
     for head in (network.update.delta, network.update.weight):
         head[2].weight.data *= 5
     if delta is not None:

@@ -30,7 +30,7 @@ LONGEST_INTERVAL = 0.07
 """Seconds between two frames; over more, their poses say less of the rows than the video does."""
 TOGETHER = 64, 512
 """Edges, or frames, that are looked at together, on the CPU and on a GPU; bounds memory."""
-LARGEST = 0.01
+MAX_SHIFT = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
 
 T = TypeVar("T")
@@ -187,7 +187,7 @@ class RowErrors:
         shift, slope = (
             t - carried_over(camera, T_ji, p, h) for t, h in zip(there, here, strict=True)
         )
-        believed = p.valid & (shift.norm(dim=-1) < LARGEST * camera.long_edge)
+        believed = p.valid & (shift.norm(dim=-1) < MAX_SHIFT * camera.long_edge)
         return RowShifts(*(torch.where(believed[..., None], x, 0.0) for x in (shift, slope)))
 
     def of_pixels(

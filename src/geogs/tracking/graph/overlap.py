@@ -75,7 +75,7 @@ def may_overlap(
 def alike_in_size(
     store: KeyframeSet, first: Sequence[int], second: Sequence[int]
 ) -> Bool[np.ndarray, "n m"]:
-    """Whether two keyframes show what either looks at in sizes up to ``LARGEST_ZOOM`` times others.
+    """Whether two keyframes show what either looks at in sizes of a ratio up to ``LARGEST_ZOOM``.
 
     What a keyframe looks at is the point on its optical axis at the median depth.
     """

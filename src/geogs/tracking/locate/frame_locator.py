@@ -24,10 +24,10 @@ FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
 FIT_HUBER = 5.0
 """Standard deviations of the flow beyond which a match counts linearly in it."""
-SAME = 1.0
+MAX_DIFFERENCE = 1.0
 """Pixels by which matches of two ways to the same place differ in the median at most; those of two
 repetitions of a pattern differ by its period."""
-DOUBTFUL = 0.7
+DOUBTFUL_OVERLAP = 0.7
 """A frame near where it was expected is also looked for without a guess where less than this
 fraction of the keyframe's known depths agrees: a guess that is off by half a period of a pattern
 leads to the wrong one of its repetitions, which agree over a part of the image."""
@@ -68,7 +68,7 @@ class FrameMotion:
         """Whether matches of the same keyframe say the same as another's, in the median."""
         both = self.match.sure()[0] & other.match.sure()[0]
         off = (self.match.pixels - other.match.pixels)[0, both].norm(dim=-1)
-        return len(off) > 0 and float(off.median()) < SAME
+        return len(off) > 0 and float(off.median()) < MAX_DIFFERENCE
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class FrameLocator:
     ) -> FrameMotion | None:
         """The frame where most of the keyframe agrees: as expected, or where nothing but the
         images led, if that was doubtful; features are asked where flow led elsewhere."""
-        if expected is None or expected.overlap >= DOUBTFUL:
+        if expected is None or expected.overlap >= DOUBTFUL_OVERLAP:
             return expected
         cold = with_depth(self.relocate(keyframe, encoded))
         found = [expected] if cold is None else [expected, cold]

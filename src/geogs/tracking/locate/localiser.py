@@ -16,10 +16,10 @@ from geogs.world.keyframes import Keyframe
 
 MAX_RESIDUAL = 0.008
 """The camera is lost when the median reprojection error exceeds this, of the long edge."""
-RECOGNISED = 0.25
+MIN_RECOGNISED = 0.25
 """A keyframe that an image was recognised as counts if this fraction of it finds a match: twice
 what is asked where the camera was expected."""
-TRIED = 5
+MAX_TRIED = 5
 """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
 RELOCALISE_EVERY = 5
 """While a camera only rotates, its orientation says what it sees; only every so many frames it is
@@ -69,19 +69,19 @@ class SegmentLocaliser:
     def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
         """The frame at one of some keyframes that look like it.
 
-        One is believed where the dense flow agrees with it over ``RECOGNISED`` of the cells.
+        One is believed where the dense flow agrees with it over ``MIN_RECOGNISED`` of the cells.
         """
         for candidate in recognised:
             if candidate.keyframe not in self.map.keyframes:
                 continue
             keyframe = self.map.keyframes[candidate.keyframe]
             motion = with_depth(self.locator.locate_relative(keyframe, encoded, candidate.T_rel))
-            if motion is not None and motion.matched >= RECOGNISED:
+            if motion is not None and motion.matched >= MIN_RECOGNISED:
                 return motion
         return None
 
     def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
         """Where to search for a lost camera: recent keyframes, and older ones by turns."""
-        recent, older = keyframes[: -TRIED - 1 : -1], keyframes[:-TRIED]
-        first = (self.map.segment.status.misses * TRIED) % max(len(older), 1)
-        return recent + (older[first:] + older[:first])[:TRIED]
+        recent, older = keyframes[: -MAX_TRIED - 1 : -1], keyframes[:-MAX_TRIED]
+        first = (self.map.segment.status.misses * MAX_TRIED) % max(len(older), 1)
+        return recent + (older[first:] + older[:first])[:MAX_TRIED]
