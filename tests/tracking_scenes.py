@@ -1,5 +1,6 @@
 """A small textured room of planes, rendered exactly: images, depth and poses for tracker tests."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -68,6 +69,16 @@ def seen(centre: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.nda
         depth = np.where(near, z, depth)
     grey = np.clip(image, 0, 255).astype(np.uint8)
     return np.repeat(grey[..., None], 3, -1), depth
+
+
+@dataclass(frozen=True, eq=False)
+class ExactDepth:
+    """True depth as a sensor would bring it, by which a map is started at its first frame."""
+
+    depth: np.ndarray
+
+    def metres(self) -> np.ndarray:
+        return self.depth.astype(np.float32)
 
 
 def pose(x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:

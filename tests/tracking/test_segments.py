@@ -10,7 +10,6 @@ import torch
 from geogs.config import Config, LoopConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp
-from geogs.geometry.umeyama import umeyama
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.segment_trackers import Segments
@@ -21,6 +20,7 @@ from geogs.world.keyframes import KeyframeTable
 from geogs.world.segments import SegmentTable, TrackState
 from lit_rooms import lit_room
 from loop_scenes import at_angle
+from tracking_runs import error_cm
 
 pytestmark = pytest.mark.system
 
@@ -57,16 +57,12 @@ def run(frames: Sequence[Frame]) -> tuple[Segments, list]:
     return segments, results
 
 
-def error_cm(segments: Segments, angles: Sequence[float | None]) -> float:
+def error_of(segments: Segments, angles: Sequence[float | None]) -> float:
     """RMSE of the tracked camera centres after one similarity, centimetres."""
     trajectory = segments.trajectory()
     known = trajectory.tracked
-    truth = np.stack([
-        at_angle(lit_room(0).scene, np.radians(a or 0.0))[:3, 3] for a in angles
-    ])[known]  # fmt: skip
-    x, y = torch.from_numpy(trajectory.T_wc[known, :3, 3]), torch.from_numpy(truth)
-    scale, R, t = umeyama(x, y)
-    return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    truth = np.stack([at_angle(lit_room(0).scene, np.radians(a or 0.0))[:3, 3] for a in angles])
+    return error_cm(trajectory.T_wc[known, :3, 3], truth[known])
 
 
 def test_a_covered_lens_is_survived_where_the_place_was_seen_before():
@@ -77,7 +73,7 @@ def test_a_covered_lens_is_survived_where_the_place_was_seen_before():
     assert states[26:] == [TrackState.TRACKING] * 8
     assert [s.fate for s in segments.summary()] == ["world"]
     assert segments.trajectory().tracked.tolist() == [a is not None for a in angles]
-    assert error_cm(segments, angles) < 0.3
+    assert error_of(segments, angles) < 0.3
 
 
 @pytest.mark.long
@@ -93,7 +89,7 @@ def test_a_jump_cut_begins_a_segment_that_a_loop_joins():
     untracked = np.flatnonzero(~segments.trajectory().tracked)
     assert len(untracked) <= 6
     assert set(untracked) <= set(range(24, 30))
-    assert error_cm(segments, angles) < 1.0
+    assert error_of(segments, angles) < 1.0
     ids = segments.keyframe_ids
     assert ids == sorted(set(ids))
 

@@ -35,20 +35,20 @@ errors."""
 FIRST_TOLERANCE = 1.2
 """Pixels of an inlier between the two views that a clip begins with."""
 EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
-"""Pixels of error at which a measurement counts for a quarter: of each step of the fit of a clip
-alone, as if its shutter were global, and of the stages of the fit of all together with the readout,
-with the number of their steps."""
+"""Pixels of error at which a measurement counts for a quarter: in each step of fitting a clip
+alone, as if its shutter were global; and in the stages of fitting all clips with the readout, with
+the steps of each."""
 SHORTER, ASSUMED = 0.78, 0.2
-"""Another focal length from which the adjustment begins, times what it is taken to be, where that
-leaves open more than such a fraction; from a wrong one, rows and lens come to explain each other.
-"""
+"""Ratio of a second focal length from which the adjustment begins to the assumed one, where the
+relative deviation of that is larger than this; from a wrong one, rows and lens come to explain each
+other."""
 LARGEST_STEP = 0.015
 """Seconds."""
 CONVERGED = 5e-5
 """Seconds of a step at the last tolerance after which there are no more."""
 MISFIT, UNEXPLAINED = 3.0, 0.5
-"""A clip whose cost is so many times the median's is left out, and in the end one with a larger one
-than this: no readout explains it."""
+"""Multiple of the median cost beyond which a clip is left out, and cost beyond which it is in the
+end: no readout explains it."""
 COMMON = 0.03
 """Fraction of the error of the matches that they have in common, and that no number of them makes
 less."""

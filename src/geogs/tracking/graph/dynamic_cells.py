@@ -28,8 +28,8 @@ MAX_EDGE_RATIO = 3.0
 MAX_RATIO = 10.0
 """Multiples of the usual residual that a single match counts as at most."""
 MAX_STANDING_PARALLAX = 0.25
-"""Part of the scene's usual parallax below which a cell keeps its place in the image, as something
-infinitely far would: what moves with the camera does, too, and is not scene again by that."""
+"""Fraction of the scene's usual parallax below which a cell stands still in the image, as something
+infinitely far would: what moves with the camera does, too, and stays dynamic."""
 MIN_MATCHES = 0.7
 """Matches per cell, in the mean around one, from which it can be decided."""
 MAX_DYNAMIC = 0.8

@@ -54,9 +54,9 @@ def best_two_view(
     the pairs that have parallax over most good cells are compared: the depth that most cells
     agree with in the other views, where they are matched, is right.
 
-    What is followed longest, as the truck ahead, has no say in that, and most matches: a camera
-    that turns with it explains it, far away, and nearly all the rest. So pairs without it are
-    compared as well, and taken where the rest agrees with them clearly more.
+    What is followed longest, such as a truck ahead, has most matches, and a camera that turns with
+    it explains it, far away, and nearly all the rest. So pairs without it are compared as well, and
+    taken where the rest agrees with them clearly more.
 
     Args:
         camera: of all views.
