@@ -10,7 +10,7 @@ from geogs.tracking.frames.rotation_averaging import orientations
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, with_depth
-from geogs.tracking.locate.visible_keyframes import visible_keyframes
+from geogs.tracking.locate.localiser import visible_keyframes
 from geogs.world.keyframes import KeyframeSet
 
 

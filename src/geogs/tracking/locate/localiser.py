@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from geogs.bundle.device_choice import grid_fields
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, Recognition, with_depth
 from geogs.tracking.locate.orientation_follower import Followed
-from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.tracking.matching.flow_chain import MIN_MATCHED
 from geogs.tracking.matching.photometric_check import MIN_NCC
 from geogs.types import Frame
@@ -21,6 +23,11 @@ MIN_RECOGNISED = 0.25
 what is asked where the camera was expected."""
 MAX_TRIED = 5
 """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
+MAX_FACING, MAX_VISIBLE = 12, 2
+"""Keyframes that face most nearly the same way as a camera, and those of them that see most of the
+same, which are worth a measurement."""
+MIN_OVERLAP = 0.15
+"""Fraction of a keyframe's cells that must have known depth and fall into the image."""
 RELOCALISE_EVERY = 5
 """While a camera only rotates, its orientation says what it sees; only every so many frames it is
 searched for as if it could be anywhere."""
@@ -85,3 +92,17 @@ class SegmentLocaliser:
         recent, older = keyframes[: -MAX_TRIED - 1 : -1], keyframes[:-MAX_TRIED]
         first = (self.map.segment.status.misses * MAX_TRIED) % max(len(older), 1)
         return recent + (older[first:] + older[:first])[:MAX_TRIED]
+
+
+def visible_keyframes(keyframes: Sequence[Keyframe], T_cw: Float[Tensor, "4 4"]) -> list[Keyframe]:
+    """The keyframes most of whose known depth falls into the image of a camera, best first."""
+    if not keyframes:
+        return []
+    axis = T_cw[2, :3]
+    facing = sorted(keyframes, key=lambda k: -float(k.T_cw[2, :3] @ axis))[:MAX_FACING]
+    grid = facing[0].grid
+    there, _ = grid_fields(grid).reproject(facing, [T_cw] * len(facing))
+    known = torch.stack([k.has_known_depth for k in facing])
+    seen = (grid.inside(there) & known).float().mean(1).tolist()
+    ranked = sorted(zip(seen, facing, strict=True), key=lambda pair: -pair[0])
+    return [k for fraction, k in ranked[:MAX_VISIBLE] if fraction >= MIN_OVERLAP]
