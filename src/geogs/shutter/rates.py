@@ -27,7 +27,7 @@ AGREEING = 0.2
 
 @dataclass(frozen=True)
 class RayFlow:
-    """What the cells of one image see in it and in another, as rays of the two cameras."""
+    """Matches of the cells of one image with another, as rays of the two cameras."""
 
     first: Float[np.ndarray, "n 3"]
     """Unit vectors in the first camera."""

@@ -73,7 +73,7 @@ Report = Callable[[float], None]
 
 @dataclass(frozen=True)
 class FoundReadout:
-    """What a video says of its readout."""
+    """The readout of a video, as far as the video tells it."""
 
     readout: float = 0.0
     """Seconds; 0 where no other is believed."""
@@ -116,7 +116,7 @@ class _Adjusted:
 
 @dataclass(frozen=True)
 class _AdjustedClips:
-    """What is adjusted: several clips, and the readout and lens that they have in common."""
+    """State of the adjustment: several clips, and the readout and lens that they share."""
 
     clips: list[_Adjusted]
     shared: Float[np.ndarray, "s"]

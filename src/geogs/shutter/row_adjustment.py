@@ -31,7 +31,7 @@ DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class ReadoutEquation:
-    """What a clip says of the readout, whatever its poses and points.
+    """Normal equations of the readout by a clip, its poses and points eliminated.
 
     The unknowns are the readout in seconds and, where they are not known, the relative change of
     the focal length, k1 and k2.
@@ -53,7 +53,7 @@ class ReadoutEquation:
     def stepped(
         self, reconstruction: ClipReconstruction, shared: Float[np.ndarray, "s"]
     ) -> ClipReconstruction:
-        """Where poses and points go as the readout and the lens take their own step."""
+        """The reconstruction after the steps that follow one of the readout and the lens."""
         poses, points = self.still
         for step, (by_pose, by_point) in zip(shared, self.by_shared, strict=True):
             poses, points = poses + step * by_pose, points + step * by_point

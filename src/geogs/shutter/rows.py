@@ -85,7 +85,7 @@ class RowOffsets:
         return dense[CELL : CELL + height, CELL : CELL + width]
 
     def seen(self, nodes: Float[np.ndarray, "n 2"], shutter: Shutter) -> SeenRows:
-        """Where and when what a rectified image shows was seen, which was made with such offsets.
+        """Offsets and times at which a rectified image, made with such offsets, was seen.
 
         Args:
             nodes: offsets in pixels of the rolling image at the nodes.

@@ -61,7 +61,7 @@ _ROUGHNESS = 3.0
 
 @dataclass(frozen=True)
 class FlowEvidence:
-    """What the edges of a problem say of the inverse depth of its frames, linearised."""
+    """The matches' term in the inverse depths of a problem's frames, linearised."""
 
     curvature: Float[Tensor, "n p"]
     """C = sum w |dp/dd|^2."""

@@ -104,9 +104,9 @@ def misfit(residuals: Float[np.ndarray, "n"]) -> float:
 def said_of_lens(
     tracker: Tracker, ids: list[int], rows: RowErrors | None = None
 ) -> LensEvidence | None:
-    """What edges between some keyframes, earliest first, say of the lens beside what is known.
+    """Evidence on the lens by the edges between some keyframes, earliest first.
 
-    And of the readout by which ``rows`` err, where there are any.
+    And on the readout by which ``rows`` err, where there are any.
     """
     found = None
     for part in _parts(ids):
@@ -120,7 +120,7 @@ def said_of_lens(
 def said_of_frame_lenses(
     tracker: Tracker, ids: list[int]
 ) -> list[tuple[list[int], VaryingEvidence]]:
-    """What edges between some keyframes, earliest first, say of the lens of each of them.
+    """Evidence on the lens of each keyframe by the edges between some, earliest first.
 
     Of more than ``TOGETHER`` keyframes in parts, each with its own, which share the last of one
     and the first of the next.
@@ -165,13 +165,13 @@ class _Matches:
         return self.keyframes.grid
 
     def lens(self, rows: RowErrors | None, of_depths: bool = False) -> LensEvidence | None:
-        """What they say of the lens, and of the readout that ``rows`` are for; nothing where they
+        """Evidence on the lens, and on the readout that ``rows`` are for; nothing where they
         do not tell of all poses."""
         slope = None if rows is None else partial(self._slope, rows)
         return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope, of_depths)
 
     def frame_lenses(self) -> VaryingEvidence | None:
-        """What they say of the lens of each keyframe."""
+        """Evidence on the lens of each keyframe."""
         return varying_evidence(self.grid, self.problem, OPTIONS)
 
     def lens_change(self) -> float:

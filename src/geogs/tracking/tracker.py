@@ -36,7 +36,7 @@ from geogs.world.segments import LastFrame, TrackState, VideoSegment
 
 @dataclass(frozen=True)
 class TrackResult:
-    """What one frame changed."""
+    """Changes by one frame."""
 
     state: TrackState
     finalized: tuple[int, ...] = ()

@@ -1,4 +1,4 @@
-"""What one stretch of a video says of focal length and distortion, and how surely."""
+"""Focal length and distortion by one stretch of a video, with their deviations."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ FIELDS_OF_VIEW = 15.0, 150.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one stretch says."""
+    """The lens by one stretch."""
 
     lens: RadialLens
     covariance: Float64[Tensor, "3 3"]
@@ -46,7 +46,7 @@ class Estimate:
 
 
 def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
-    """What an adjusted stretch says, with k1 and k2 if ``radial``, or why it is not believed."""
+    """Estimate by an adjusted stretch, with k1 and k2 if ``radial``, or why it is not believed."""
     result = bundle.result
     assert result is not None
     lens = result.block.lens

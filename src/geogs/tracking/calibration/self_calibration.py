@@ -28,7 +28,7 @@ STRETCHES = 3
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """What the video says of its camera."""
+    """The camera of a video, as far as the video tells it."""
 
     camera: Camera
     """Camera of the working image; the guess where there is a ``failure``."""

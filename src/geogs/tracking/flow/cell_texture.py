@@ -28,7 +28,7 @@ class CellStructure:
     half: Float[np.ndarray, "p"]
     """Half of xx - yy."""
     radius: Float[np.ndarray, "p"]
-    """What the eigenvalues are above and below their mean."""
+    """Distance of the eigenvalues from their mean."""
 
     @property
     def smaller(self) -> Float[np.ndarray, "p"]:
@@ -42,7 +42,7 @@ class CellStructure:
 
     @property
     def certainty(self) -> Float[np.ndarray, "p 2"]:
-        """What a match of each cell says along x and along y, as a part of the full weight.
+        """Certainty of a match of each cell along x and along y, as a fraction of the full weight.
 
         A point on an edge is known across the edge, hardly along it. The information of a match is
         that of the structure tensor with each eigenvalue l replaced by min(1, l / SHARP +

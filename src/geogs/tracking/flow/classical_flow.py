@@ -95,7 +95,7 @@ class _DenseFlow:
         return _sample(cv2.blur(norm, (window, window)), self.level.from_image(points), None)
 
     def certainty(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2"]:
-        """What matches of image points say along x and y, by what both images show there."""
+        """Certainty of matches of image points along x and y, by what both images show there."""
         level = self.level
         found = _warped(self.target, level.u + self.rest[..., 0], level.v + self.rest[..., 1])
         tensor = common_tensor(self.source, found, 8 // level.step + 1)

@@ -68,11 +68,11 @@ class DroidImage:
     """An image as the operator keeps it, on the device; half precision on a GPU."""
 
     features: Float[Tensor, "c h w"]
-    """What it is matched by."""
+    """Matching features."""
     hidden: Float[Tensor, "c h w"]
-    """What an edge from this image starts with."""
+    """Hidden state that an edge from this image starts with."""
     static: Float[Tensor, "c h w"]
-    """What its updates see of the image."""
+    """Static context, which every update sees."""
     grey: UInt8[Tensor, "y x"]
     texture: float
     """Fraction of the cells with structure."""
@@ -80,11 +80,11 @@ class DroidImage:
 
 @dataclass(frozen=True)
 class DroidMemory:
-    """What is kept of a directed edge."""
+    """State of a directed edge."""
 
     hidden: Float[Tensor, "c h w"]
     target: Float[Tensor, "h w 2"]
-    """Where the network last thought its cells to be, in cells."""
+    """Last positions that the network found, in cells."""
 
 
 class DroidFlow:

@@ -156,7 +156,7 @@ class EdgeOutput:
 
     hidden: Float[Tensor, "e c h w"]
     delta: Float[Tensor, "e 2 h w"]
-    """What is to be added to the position that was looked up, in cells."""
+    """Correction of the position that was looked up, in cells."""
     weight: Float[Tensor, "e 2 h w"]
     """Confidence of x and y in (0, 1)."""
 
@@ -208,7 +208,7 @@ class DroidNetwork(nn.Module):
         self.update = UpdateOperator(features, 2 * base)
 
     def features(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
-        """What images are matched by; RGB in [0, 1], sides divisible by 8."""
+        """Matching features of images; RGB in [0, 1], sides divisible by 8."""
         return self.fnet(normalised(images))
 
     def context(

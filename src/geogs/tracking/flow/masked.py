@@ -23,7 +23,7 @@ def valid_pixels(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 
 @dataclass(frozen=True, eq=False)
 class ValidMask:
-    """What of an image may be matched; 1 and 0, on the device of the grid."""
+    """Valid mask of an image; 1 and 0, on the device of the grid."""
 
     pixels: Float[Tensor, "h w"]
     """Without what is nearer than a cell to pixels masked out: operators match patches."""

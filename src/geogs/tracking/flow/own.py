@@ -60,7 +60,7 @@ class OwnImage:
     features: FlowFeatures
     """Features of one image."""
     classical: Any
-    """What the classical operator keeps of it."""
+    """The classical operator's form of it."""
 
 
 class OwnFlow:
@@ -103,7 +103,7 @@ class OwnFlow:
         return OwnImage(features, self.classical.encode(image))
 
     def _features(self, pixels: UInt8[Tensor, "h w 3"]) -> Maps:
-        """What the network keeps of an image."""
+        """Features of an image."""
         with self._autocast():
             found = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
         self._levels = found.pyramid.levels
@@ -157,7 +157,7 @@ class OwnFlow:
         return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
 
     def _refinement(self, iterations: int, is_warm: bool, is_recorded: bool) -> Callable[..., Maps]:
-        """What takes some edges from their start to positions and weights.
+        """The function from some edges' starts to their positions and weights.
 
         Its arguments are the features of images but for the levels, the two images of each edge,
         and the start of each.

@@ -65,7 +65,7 @@ def solved_poses(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, Float[Te
 
 
 def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
-    """What rectified rows are off by at the present state; none where there are none."""
+    """Errors of rectified rows at the present state; none where no rows are rectified."""
     if not frames.rows:
         return None
     indices = sorted(record.index for record in frames.records)

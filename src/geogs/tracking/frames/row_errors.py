@@ -1,4 +1,4 @@
-"""What rectified rows are still off by, once the trajectory and the depths are known.
+"""Errors of rectified rows, once the trajectory and the depths are known.
 
 Rows are rectified before anything is matched, by the motion that the flow between neighbouring
 images tells. The trajectory of all frames tells it better: a point of a frame is seen at the time
@@ -136,7 +136,7 @@ class RowErrors:
     def seconds(
         self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e p"]:
-        """When pixels of frames were seen, from the middle row; zero of frames without rows."""
+        """Times of pixels of frames, from the middle row; zero for frames without rows."""
         found = torch.zeros_like(pixels[..., 0])
         known, own = self._known(frames)
         if known:
@@ -164,7 +164,7 @@ class RowErrors:
         inverse_depth: Float[Tensor, "e p"],
         pixels: Float[Tensor, "e p 2"],
     ) -> RowShifts:
-        """What is to be added to where cells were found, as if the rows of both frames were right.
+        """Shifts of matches to where they would be if the rows of both frames were right.
 
         What a cell of the source shows lies next to it, and what was found in the target, too; the
         former is propagated to the target at the cell's own depth. Zero where the sum cannot be

@@ -260,7 +260,7 @@ class FrameGraph:
 
 
 def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
-    """What depth sensors say of the cells of keyframes; none where there is nothing of any."""
+    """Depths of keyframes' cells by depth sensors; none where no keyframe has any."""
     if all(k.measured is None for k in keyframes):
         return None
     unknown = torch.zeros_like(keyframes[0].inverse_depth)
@@ -282,7 +282,7 @@ def _edge_of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> Me
 
 
 def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
-    """Where the cells fell when the flow of each edge was measured."""
+    """Reprojections of the cells when the flow of each edge was measured."""
     packed = [e for e in edges if isinstance(e, PackedEdge)]
     if packed and len(packed) == len(edges):
         return _packed_reprojections(grid, packed)

@@ -45,7 +45,7 @@ class OdometryAgreement:
 
 
 class Odometry:
-    """What another tracker says of the motion between the keyframes of a segment."""
+    """Motions between the keyframes of a segment by another tracker."""
 
     def __init__(
         self, keyframes: KeyframeSet, config: OdometryConfig, found: OdometryScale | None = None

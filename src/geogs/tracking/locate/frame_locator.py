@@ -62,7 +62,7 @@ class FrameMotion:
     residual: float
     """Median distance in pixels between matches and reprojection."""
     check: PhotometricCheck
-    """What the images say of it."""
+    """How well the images agree there."""
 
     def is_where(self, other: "FrameMotion") -> bool:
         """Whether matches of the same keyframe say the same as another's, in the median."""

@@ -35,7 +35,7 @@ class PoseDeviation:
 def pose_deviation(
     grid: SampleGrid, keyframe: Keyframe, T_rel: Float[Tensor, "4 4"], match: FlowMatch
 ) -> PoseDeviation:
-    """What one edge, from a keyframe to a frame at ``T_rel`` from it, leaves open of the pose.
+    """Deviations of the pose of a frame at ``T_rel`` from a keyframe, by the one edge between them.
 
     The inverse of sum J^T W J over the cells, J the derivative of a cell's position by a left
     perturbation of the pose, and 1 / W the variance of its match and of what its depth's does to

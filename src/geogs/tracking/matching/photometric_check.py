@@ -34,16 +34,16 @@ MIN_WINDOWS = 24
 
 @dataclass(frozen=True)
 class PhotometricCheck:
-    """What the images say of a location."""
+    """How well the images agree at a location."""
 
     correlation: float
     """Median normalised cross-correlation (NCC) of the windows, in [-1, 1]; 0 without any."""
     windows: int
-    """How many there are: with texture and known depth, in view of both images."""
+    """Number of windows with texture and known depth, in view of both images."""
 
     @staticmethod
     def of(numbers: Float[Tensor, "2"]) -> "PhotometricCheck":
-        """What :func:`correlation_at` returns as plain numbers; waits for a GPU."""
+        """The check of what :func:`correlation_at` returns; waits for a GPU."""
         correlation, windows = numbers.tolist()
         return PhotometricCheck(correlation, int(windows))
 

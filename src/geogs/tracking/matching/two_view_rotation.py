@@ -174,7 +174,7 @@ def _linearised(
     focal: Float64[np.ndarray, "2"],
     centre: Float64[np.ndarray, "2"],
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 3"]]:
-    """What is missing from projections to where points are seen, and how a rotation moves them."""
+    """Residuals of projections, and their derivatives by a rotation on the left."""
     z = np.maximum(points[:, 2], 1e-3)
     x, y = points[:, 0] / z, points[:, 1] / z
     J = np.stack([
