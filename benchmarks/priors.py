@@ -27,7 +27,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.monocular_prior import DepthKind, MonocularPrior
 from geogs.slam import Slam
-from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, structure_tensor
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, common_tensor
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE
@@ -133,7 +133,7 @@ def map_score(slam: Slam, walk: Walk) -> MapScore:
             cv2.resize(m, size, interpolation=nearest) for m in (view.depth, view.normal)
         )
         grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
-        xx, yy, xy = structure_tensor(grey)
+        xx, yy, xy = common_tensor(grey, grey)
         smaller = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
         plain = (smaller < MIN_STRUCTURE).astype(np.uint8)
         known = seen.depth.numpy() > 0

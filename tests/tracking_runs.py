@@ -13,6 +13,12 @@ CONFIG = TrackingConfig(init_keyframes=5)
 PATH = sideways(40)
 
 
+def metric_errors_cm(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Errors of all camera centres, metres taken for metres, the first poses on each other."""
+    there = truth[0] @ np.linalg.inv(estimate[0]) @ estimate
+    return 100 * np.linalg.norm((there - truth)[:, :3, 3], axis=1)
+
+
 def error_cm(estimate: np.ndarray, truth: np.ndarray) -> float:
     """RMSE of camera centres after a similarity, centimetres."""
     x, y = torch.from_numpy(estimate), torch.from_numpy(truth)

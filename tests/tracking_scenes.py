@@ -1,5 +1,8 @@
 """A small textured room of planes, rendered exactly: images, depth and poses for tracker tests."""
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import torch
@@ -35,8 +38,16 @@ TEXTURES = [_texture(k) for k in range(len(PLANES))]
 
 def render(T_wc: np.ndarray, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
     """Grey RGB image and z-depth from a camera at T_wc inside the box."""
-    rays = camera.rays(torch.float64).numpy()
-    return seen(T_wc[:3, 3], rays @ T_wc[:3, :3].T)
+    room = (*PLANES, *map(id, TEXTURES))
+    image, depth = _rendered(T_wc.astype(np.float64).tobytes(), camera, room)
+    return image.copy(), depth.copy()
+
+
+@lru_cache(maxsize=256)
+def _rendered(T_wc: bytes, camera: Camera, room: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """The same, kept as many tests look from the same poses; ``room`` tells it from another."""
+    T, rays = np.frombuffer(T_wc).reshape(4, 4), camera.rays(torch.float64).numpy()
+    return seen(T[:3, 3], rays @ T[:3, :3].T)
 
 
 def seen(centre: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,6 +69,16 @@ def seen(centre: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.nda
         depth = np.where(near, z, depth)
     grey = np.clip(image, 0, 255).astype(np.uint8)
     return np.repeat(grey[..., None], 3, -1), depth
+
+
+@dataclass(frozen=True, eq=False)
+class ExactDepth:
+    """True depth as a sensor would bring it, by which a map is started at its first frame."""
+
+    depth: np.ndarray
+
+    def metres(self) -> np.ndarray:
+        return self.depth.astype(np.float32)
 
 
 def pose(x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:

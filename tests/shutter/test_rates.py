@@ -73,7 +73,6 @@ def test_what_is_no_rotation_has_no_rate():
     scattered /= np.linalg.norm(scattered, axis=1, keepdims=True)
     assert angular_velocity(replace(flow, second=scattered), 1 / RATE, 0.0) is None
     assert angular_velocity(replace(flow, inside=np.zeros(400, bool)), 1 / RATE, 0.0) is None
-    assert angular_velocity(flow, 0.0, 0.0) is None
 
 
 def test_parallax_is_what_cells_move_beside_the_rotation():

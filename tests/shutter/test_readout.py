@@ -22,7 +22,7 @@ from geogs.shutter.readout import (
 )
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.types import Frame
-from rolling_scenes import RATE, hand_held, rolling_image
+from rolling_scenes import RATE, hand_held, rolling_frames, rolling_image
 from row_by_row import FOCAL, clip_of, scattered, shaken, steady
 from tracking_scenes import CAMERA
 
@@ -175,24 +175,15 @@ def test_images_that_are_alike_to_the_bit_tell_nothing():
     assert find_readout(still, RollingCamera(CAMERA)) == FoundReadout()
 
 
-def clips(readout: float) -> list[list]:
-    return [
-        [
-            Frame(k, k / RATE, rolling_image(hand_held, k / RATE, readout))
-            for k in range(start, start + CLIP)
-        ]
-        for start in range(0, 3 * CLIP // 2, CLIP // 2)
-    ]
-
-
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("readout", "least", "most"),
     [pytest.param(0.0, 0.0, 0.0, marks=pytest.mark.long), (0.03, 0.024, 0.034)],
 )
 def test_a_rendered_video_tells_its_readout(readout, least, most):
-    done = []
-    followed = FollowedClips(lambda first: (clip for clip in clips(readout)[first:]))
+    done, video = [], rolling_frames(hand_held, 2 * CLIP, readout)
+    clips = [video[start : start + CLIP] for start in (0, CLIP // 2, CLIP)]
+    followed = FollowedClips(lambda first: (clip for clip in clips[first:]))
     found = find_readout(followed, RollingCamera(CAMERA), done.append)
     assert find_readout(followed, RollingCamera(CAMERA)) == found
     assert least <= found.readout <= most

@@ -71,7 +71,7 @@ def test_step_equals_the_dense_normal_equations(rows: int, columns: int, step: f
     g = torch.Generator().manual_seed(5)
     scale = 2 + 0.2 * torch.rand(3, rows * columns, generator=g)
     alpha = torch.where(prior > 0, 1 / (0.05 * prior) ** 2, 0.0)
-    stiffness = None if step is None else node_differences(rows, columns).double() / step**2
+    stiffness = node_differences(rows, columns).double() / (step or torch.inf) ** 2
     moved = depth_scale_step(
         flow_evidence(grid, p, HUBER), p.inverse_depth, ScaledPrior(prior, scale, alpha),
         node_weights(grid, rows, columns), stiffness,
@@ -110,12 +110,12 @@ def test_repeated_steps_end_where_the_cost_is_least():
         p, source=p.source[:2], target=p.target[:2], pixels=p.pixels[:2], weight=p.weight[:2],
     )  # fmt: skip
     scale = torch.ones(1, 4)
-    basis, huge = node_weights(grid, 2, 2), 1e6
+    basis, none, huge = node_weights(grid, 2, 2), torch.zeros(4, 4, dtype=torch.float64), 1e6
     for _ in range(6):
         flow = flow_evidence(grid, problem, huge)
         flow = FlowEvidence(flow.curvature[:1], flow.gradient[:1])
         d = problem.inverse_depth[:1]
-        step = depth_scale_step(flow, d, ScaledPrior(prior[None], scale, alpha[None]), basis)
+        step = depth_scale_step(flow, d, ScaledPrior(prior[None], scale, alpha[None]), basis, none)
         scale = scale + step.scale
         moved = problem.inverse_depth.clone()
         moved[0] += step.depth[0]

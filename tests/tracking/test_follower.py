@@ -1,6 +1,6 @@
 """Frames that come while a keyframe is being completed: found at once, and kept like others."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,20 +11,10 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.segments import TrackState
-from tracking_runs import CONFIG
-from tracking_scenes import CAMERA, render, sideways
+from tracking_runs import CONFIG, metric_errors_cm
+from tracking_scenes import CAMERA, ExactDepth, render, sideways
 
 LENGTH = 11
-
-
-@dataclass(frozen=True, eq=False)
-class Exact:
-    """True depth, by which a map is started at its first frame."""
-
-    depth: np.ndarray
-
-    def metres(self) -> np.ndarray:
-        return self.depth.astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +22,7 @@ def stream() -> list[Frame]:
     frames = []
     for k, T in enumerate(sideways(LENGTH)):
         image, depth = render(T)
-        frames.append(Frame(k, k / 30, image, depth=None if k else Exact(depth)))
+        frames.append(Frame(k, k / 30, image, depth=None if k else ExactDepth(depth)))
     return frames
 
 
@@ -51,11 +41,10 @@ def centre(T_cw: torch.Tensor) -> np.ndarray:
 
 
 def errors_cm(tracker: Tracker) -> np.ndarray:
-    """Of every frame's place, the first frame taken for right, in centimetres."""
-    truth, found = np.stack(sideways(LENGTH)), tracker.trajectory()
+    """Errors of all frames, which have to be tracked, in centimetres."""
+    found = tracker.trajectory()
     assert found.tracked.all()
-    there = truth[0] @ np.linalg.inv(found.T_wc[0]) @ found.T_wc
-    return 100 * np.linalg.norm((there - truth)[:, :3, 3], axis=1)
+    return metric_errors_cm(found.T_wc, np.stack(sideways(LENGTH)))
 
 
 def run(stream: list[Frame], beside: int) -> tuple[Tracker, list[np.ndarray]]:

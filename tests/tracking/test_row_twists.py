@@ -61,11 +61,11 @@ def test_the_twist_is_the_most_likely_one_and_leaves_open_what_the_pose_follows_
 
 
 def test_an_even_motion_leaves_no_doubt_and_a_knock_as_much_as_it_is_missed_by():
-    assert float(errors(0 * KNOCK).twist_doubts([FRAME]).max()) < 1e-4
+    assert float(errors(0 * KNOCK).twist_deviations([FRAME]).max()) < 1e-4
     knocked = errors(KNOCK)
     # A quartic through the poses takes the rate for this much higher where it begins to change.
     missed = KNOCK / RATE / 6
-    told, none = knocked.twist_doubts([FRAME, COUNT])
+    told, none = knocked.twist_deviations([FRAME, COUNT])
     for part in (slice(0, 3), slice(3, 6)):
         assert 0.3 < float(told[part][0] / missed[part].norm()) < 1.0
     assert not none.any()

@@ -10,7 +10,6 @@ import torch
 from geogs.config import Config, LoopConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp
-from geogs.geometry.umeyama import umeyama
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.segment_trackers import Segments
@@ -21,6 +20,7 @@ from geogs.world.keyframes import KeyframeTable
 from geogs.world.segments import SegmentTable, TrackState
 from lit_rooms import lit_room
 from loop_scenes import at_angle
+from tracking_runs import error_cm
 
 pytestmark = pytest.mark.system
 
@@ -57,27 +57,23 @@ def run(frames: Sequence[Frame]) -> tuple[Segments, list]:
     return segments, results
 
 
-def error_cm(segments: Segments, angles: Sequence[float | None]) -> float:
+def error_of(segments: Segments, angles: Sequence[float | None]) -> float:
     """RMSE of the tracked camera centres after one similarity, centimetres."""
     trajectory = segments.trajectory()
     known = trajectory.tracked
-    truth = np.stack([
-        at_angle(lit_room(0).scene, np.radians(a or 0.0))[:3, 3] for a in angles
-    ])[known]  # fmt: skip
-    x, y = torch.from_numpy(trajectory.T_wc[known, :3, 3]), torch.from_numpy(truth)
-    scale, R, t = umeyama(x, y)
-    return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    truth = np.stack([at_angle(lit_room(0).scene, np.radians(a or 0.0))[:3, 3] for a in angles])
+    return error_cm(trajectory.T_wc[known, :3, 3], truth[known])
 
 
 def test_a_covered_lens_is_survived_where_the_place_was_seen_before():
-    angles = [*np.arange(0, 48, 2.0), *[None] * 8, *np.arange(10, 30, 2.0)]
+    angles = [*np.arange(0, 36, 2.0), *[None] * 8, *np.arange(10, 26, 2.0)]
     segments, results = run(stream(angles))
     states = [r.state for r in results[: len(angles)]]
-    assert states[24:32] == [TrackState.LOST] * 8
-    assert states[32:] == [TrackState.TRACKING] * 10
+    assert states[18:26] == [TrackState.LOST] * 8
+    assert states[26:] == [TrackState.TRACKING] * 8
     assert [s.fate for s in segments.summary()] == ["world"]
     assert segments.trajectory().tracked.tolist() == [a is not None for a in angles]
-    assert error_cm(segments, angles) < 0.3
+    assert error_of(segments, angles) < 0.3
 
 
 @pytest.mark.long
@@ -93,7 +89,7 @@ def test_a_jump_cut_begins_a_segment_that_a_loop_joins():
     untracked = np.flatnonzero(~segments.trajectory().tracked)
     assert len(untracked) <= 6
     assert set(untracked) <= set(range(24, 30))
-    assert error_cm(segments, angles) < 1.0
+    assert error_of(segments, angles) < 1.0
     ids = segments.keyframe_ids
     assert ids == sorted(set(ids))
 
@@ -114,28 +110,28 @@ def test_a_segment_that_meets_nothing_stays_apart():
 
 
 def test_the_largest_segment_becomes_the_world():
-    angles = [*np.arange(0, 16, 2.0), *np.arange(120, 180, 2.0)]
+    angles = [*np.arange(0, 16, 2.0), *np.arange(120, 152, 2.0)]
     segments, results = run(stream(angles, cuts=[8]))
     assert results[-1].is_new_main
     assert results[-1].finalized == tuple(segments.keyframe_ids)
     assert [s.fate for s in segments.summary()] == ["apart", "world"]
-    assert segments.trajectory().tracked.tolist() == [False] * 8 + [True] * 30
+    assert segments.trajectory().tracked.tolist() == [False] * 8 + [True] * 16
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
-def test_moving_keyframes_keeps_what_they_see(scale):
+def test_moving_keyframes_keeps_what_they_see():
     tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     for frame in stream(np.arange(0, 16, 2.0)):
         tracker.track(frame)
     tracker.finish()
-    before = tracker.map.graph.reprojections([(0, 2), (3, 1)])
-    centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.keyframes]
-    xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
-    S = sim3_exp(xi)
-    tracker.keyframes.correct(tracker.keyframes.moved(S))
-    after = tracker.map.graph.reprojections([(0, 2), (3, 1)])
-    assert float((after - before).abs().max()) < 2e-3
-    for centre, state in zip(centres, tracker.keyframes, strict=True):
-        expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])
-        assert torch.allclose(torch.linalg.inv(state.T_cw)[:3, 3], expected[:3], atol=1e-9)
-    assert tracker.trajectory().tracked.all()
+    for scale in (0.5, 1.0, 3.0):
+        before = tracker.map.graph.reprojections([(0, 2), (3, 1)])
+        centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.keyframes]
+        xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
+        S = sim3_exp(xi)
+        tracker.keyframes.correct(tracker.keyframes.moved(S))
+        after = tracker.map.graph.reprojections([(0, 2), (3, 1)])
+        assert float((after - before).abs().max()) < 2e-3
+        for centre, state in zip(centres, tracker.keyframes, strict=True):
+            expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])
+            assert torch.allclose(torch.linalg.inv(state.T_cw)[:3, 3], expected[:3], atol=1e-9)
+        assert tracker.trajectory().tracked.all()

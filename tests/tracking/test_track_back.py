@@ -1,6 +1,6 @@
 """Frames from before a start: tracked backwards, with keyframes of their own."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,21 +13,11 @@ from geogs.world.frames import RelativeRotation
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import check_keyframes
 from records import copied
-from tracking_runs import CONFIG
-from tracking_scenes import CAMERA, pose, render
+from tracking_runs import CONFIG, metric_errors_cm
+from tracking_scenes import CAMERA, ExactDepth, pose, render
 
 BEFORE = 10
 """Frames without depth, and so without a map."""
-
-
-@dataclass(frozen=True, eq=False)
-class Exact:
-    """Depth without error."""
-
-    depth: np.ndarray
-
-    def metres(self) -> np.ndarray:
-        return self.depth.astype(np.float32)
 
 
 PATH = [pose(0.03 * k, yaw=0.04 * k) for k in range(BEFORE + 2)]
@@ -45,16 +35,15 @@ def started_late(links_err_by: float | None = None) -> Tracker:
                 turn = pose(0, yaw=links_err_by) @ np.linalg.inv(PATH[n]) @ PATH[n + 1]
                 R = torch.from_numpy(turn[:3, :3])
                 record.rotations = [RelativeRotation(n + 1, R, 1e-3)]
-        tracker.track(Frame(k, k / 30, image, depth=Exact(depth) if k >= BEFORE else None))
+        tracker.track(Frame(k, k / 30, image, depth=ExactDepth(depth) if k >= BEFORE else None))
     return tracker
 
 
 def largest_error_cm(tracker: Tracker) -> float:
-    """Of the places of all frames, which have to be known."""
-    found, truth = tracker.trajectory(), np.stack(PATH)
+    """The largest error of all frames, which have to be tracked, where the last one is right."""
+    found = tracker.trajectory()
     assert found.states == ["tracked"] * len(PATH)
-    there = truth[-1] @ np.linalg.inv(found.T_wc[-1]) @ found.T_wc
-    return 100 * np.linalg.norm((there - truth)[:, :3, 3], axis=1).max()
+    return metric_errors_cm(found.T_wc[::-1], np.stack(PATH)[::-1]).max()
 
 
 def test_errors_of_rotations_before_a_start_do_not_add_up():

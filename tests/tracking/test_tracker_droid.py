@@ -12,7 +12,6 @@ from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.droid_network import (
     DroidNetwork,
-    DroidSize,
     EdgeOutput,
     cell_positions,
     on_cells,
@@ -77,7 +76,7 @@ class KnowingNetwork:
 @pytest.fixture(scope="module")
 def tracked() -> SimpleNamespace:
     path = sideways(30, step=0.04)
-    operator = DroidFlow(GRID, DroidNetwork(DroidSize(2)))
+    operator = DroidFlow(GRID, DroidNetwork(2))
     operator.network = KnowingNetwork(path)
     tracker = lone_tracker(CAMERA, Config(tracking=CONFIG), operator=operator)
     for frame in frames(path):

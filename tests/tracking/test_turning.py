@@ -59,7 +59,7 @@ def turned(path: Sequence[np.ndarray], trajectory: Trajectory) -> np.ndarray:
 
 
 def test_a_camera_that_only_turns_has_orientations():
-    path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(32)]
+    path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(24)]
     segments, results = run(frames(path))
     assert segments.table.why_not.startswith("The images show no parallax")
     assert results[-1].state is TrackState.INITIALIZING
@@ -183,7 +183,7 @@ def test_no_keyframe_is_made_where_no_depth_is_known(turning_away):
 
 def test_frames_before_a_start_are_located_by_its_keyframes():
     looking = [pose(-0.5, yaw=0.55 * (1 - np.cos(0.18 * k))) for k in range(36)]
-    path = [*looking, *sideways(30)[1:]]
+    path = [*looking, *sideways(20)[1:]]
     segments, _ = run(frames(path))
     trajectory = segments.trajectory()
     assert "lost" not in trajectory.states

@@ -19,7 +19,7 @@ class AngularMotion:
     acceleration: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Radians per second squared."""
     parallax: Float[np.ndarray, "gh gw 2"] | None = None
-    """What things move beside that, each at its own depth: x/z and y/z per second at the cells of
+    """Parallax, which each thing has by its own depth: x/z and y/z per second at the cells of
     a grid that covers the image; none where nothing is known."""
 
     def angles(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
@@ -46,14 +46,14 @@ def rotated(
 
 @dataclass(frozen=True)
 class AngularStep:
-    """What the camera did between two images of a video."""
+    """Motion of the camera between two images of a video."""
 
     rate: Float[np.ndarray, "3"]
-    """Its mean angular velocity, radians per second."""
+    """Mean angular velocity, radians per second."""
     interval: float
     """Seconds between the two."""
     parallax: tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]] | None = None
-    """What things move beside that, x/z and y/z per second, in the first image and the second."""
+    """Parallax, x/z and y/z per second, in the first image and the second."""
 
 
 def angular_motion_between(before: AngularStep | None, after: AngularStep | None) -> AngularMotion:
@@ -80,7 +80,7 @@ def angular_motion_between(before: AngularStep | None, after: AngularStep | None
 def _agreed(
     before: Float[np.ndarray, "gh gw 2"], after: Float[np.ndarray, "gh gw 2"], fraction: float
 ) -> Float[np.ndarray, "gh gw 2"]:
-    """Between the two, and the less of it the more they differ: flow that fails differs."""
+    """Mean of the two, shrunk the more they differ: flow that fails differs."""
     mean, change = before + fraction * (after - before), after - before
     square, error = (mean**2).sum(2, keepdims=True), (change**2).sum(2, keepdims=True)
     weight: Float[np.ndarray, "gh gw 1"] = square / np.maximum(square + error, 1e-12)

@@ -39,41 +39,29 @@ class ClipReconstruction:
     def derivatives(
         self,
     ) -> tuple[Float[np.ndarray, "k n 2 6"], Float[np.ndarray, "k n 2 3"]]:
-        """Those of :meth:`projected` by the steps of an image's own pose and of a point."""
-        by_pose, by_place = self._by_pose_and_place()
-        # Of rays (x, y, 1) and the inverse depth.
-        by = np.concatenate([self.R[..., :2], self.t[..., None]], axis=-1)
-        lines = by_place.reshape(len(by), -1, 3) @ by
-        return by_pose, lines.reshape(by_place.shape)
-
-    def derivatives_by_pose(self) -> Float[np.ndarray, "k n 2 6"]:
-        """The first of :meth:`derivatives` alone."""
-        return self._by_pose_and_place()[0]
-
-    def _by_pose_and_place(
-        self,
-    ) -> tuple[Float[np.ndarray, "k n 2 6"], Float[np.ndarray, "k n 2 3"]]:
-        """Derivatives of :meth:`projected` by the steps of a pose, and by :meth:`in_cameras`."""
+        """Derivatives of :meth:`projected` by the steps of an image's own pose and of a point."""
         turned, inverse = self._turned(), self.points[:, 2]
         at = turned + inverse[:, None] * self.t[:, None]
         depth = _depth(at)[..., 0]
         once, across, down = 1 / depth, -at[..., 0] / depth**2, -at[..., 1] / depth**2
-        by_place = np.zeros((*depth.shape, 2, 3))
-        by_place[..., 0, 0] = by_place[..., 1, 1] = once
-        by_place[..., 0, 2], by_place[..., 1, 2] = across, down
+        by_camera = np.zeros((*depth.shape, 2, 3))  # by points in axes of the camera
+        by_camera[..., 0, 0] = by_camera[..., 1, 1] = once
+        by_camera[..., 0, 2], by_camera[..., 1, 2] = across, down
         by_pose = np.empty((*depth.shape, 2, 6))
         # Of row g of the above, g . (phi x turned) = phi . (turned x g).
         x, y, z = turned[..., 0], turned[..., 1], turned[..., 2]
         by_pose[..., 0, 0], by_pose[..., 1, 0] = y * across, y * down - z * once
         by_pose[..., 0, 1], by_pose[..., 1, 1] = z * once - x * across, -x * down
         by_pose[..., 0, 2], by_pose[..., 1, 2] = -y * once, x * once
-        np.multiply(by_place, inverse[:, None, None], out=by_pose[..., 3:])
-        return by_pose, by_place
+        np.multiply(by_camera, inverse[:, None, None], out=by_pose[..., 3:])
+        by_point = np.concatenate([self.R[..., :2], self.t[..., None]], axis=-1)
+        lines = by_camera.reshape(len(by_point), -1, 3) @ by_point
+        return by_pose, lines.reshape(by_camera.shape)
 
     def stepped(
         self, poses: Float[np.ndarray, "k 6"], points: Float[np.ndarray, "n 3"]
     ) -> "ClipReconstruction":
-        """After rotations on the left and moves of the poses, and moves of the points.
+        """The reconstruction after rotations on the left and moves of poses, and of points.
 
         The median inverse depth is one again afterwards.
         """

@@ -16,12 +16,12 @@ from geogs.threads import thread_map
 MOST_POINTS = 160
 LEAST_POINTS = 30
 LEAST_IMAGES = 8
-"""That a point is followed through."""
+"""Images that a point is followed through."""
 LEAST_SEEN = 24
 """Points of an image that counts."""
 LONGEST_INTERVAL = 0.26
 """Seconds between two images; over more, nothing says how points move from one to the next."""
-POINTS, QUALITY, APART = 250, 0.005, 8
+POINTS, QUALITY, SPACING = 250, 0.005, 8
 """Corners, at most; the least strength of one against the strongest; pixels between two."""
 WINDOW, LEVELS = 15, 3
 """Pixels that are compared around a point; halvings at which it is looked for first."""
@@ -73,9 +73,9 @@ class FollowedClip:
 
 
 def followed_clip(clip: Sequence[Image]) -> FollowedClip | None:
-    """Corners of the middle image, those that are seen longest; none where they are too few.
+    """Corners of the middle image, those that are seen longest.
 
-    Nor is there any where images are too few, too far apart, or could not all be read.
+    None where they are too few, or the images are too few, too far apart, or could not all be read.
     """
     intervals = np.diff([image.timestamp for image in clip])
     if len(clip) < LEAST_IMAGES or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
@@ -138,7 +138,7 @@ def followed_points(images: _Images) -> Float[np.ndarray, "k n 2"]:
     over a floor, by a tenth of a pixel and more.
     """
     middle, evened = len(images) // 2, [even(image) for image in images]
-    corners = cv2.goodFeaturesToTrack(evened[middle], POINTS, QUALITY, APART)
+    corners = cv2.goodFeaturesToTrack(evened[middle], POINTS, QUALITY, SPACING)
     if corners is None:
         return np.zeros((len(images), 0, 2))
     corners = corners[_inside(corners[:, 0], images[middle])]
@@ -209,7 +209,7 @@ def _inside(
 def _amid_gradients(
     image: UInt8[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """From the middle of each window to the mean of its pixels, weighted by squared gradient."""
+    """Vectors from windows' middles to the means of their pixels, weighted by squared gradient."""
     across, down = (cv2.Sobel(image, cv2.CV_32F, *by) for by in ((1, 0), (0, 1)))
     weight = across**2 + down**2
     v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float32)

@@ -1,7 +1,5 @@
 """Where the adjustment of a clip begins: two views, then one image after the other."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,17 +16,7 @@ LEAST_FRACTION = 0.5
 _FEWEST = 8
 """Points that tell a pose; an image with fewer has that of the image before."""
 _PROBABILITY, _TRIES = 0.9999, 1000
-"""How sure the motion between two views is to be found, and by how many tries at most."""
-
-
-@dataclass(frozen=True)
-class RelativePose:
-    """A motion of one view against another, up to the length of its translation."""
-
-    R: Float[np.ndarray, "3 3"]
-    """A point at X in the first view is at ``R X + t`` in the second."""
-    t: Float[np.ndarray, "3"]
-    """Its length is one."""
+"""Confidence with which the motion between two views is found, and tries at most."""
 
 
 def first_reconstruction(tracks: ClipTracks, tolerance: float) -> ClipReconstruction | None:
@@ -50,7 +38,7 @@ def first_reconstruction(tracks: ClipTracks, tolerance: float) -> ClipReconstruc
         pose = relative_pose(tracks.plane[middle, both], tracks.plane[far, both], tolerance)
         if pose is None:
             continue
-        inverse = inverse_depths(pose, tracks.plane[middle], tracks.plane[far])
+        inverse = inverse_depths(*pose, tracks.plane[middle], tracks.plane[far])
         parallax = float(np.median(np.abs(inverse[both])))
         if parallax > best:
             inverse = np.where(both, inverse, np.median(inverse[both])) / parallax
@@ -70,8 +58,10 @@ def first_reconstruction(tracks: ClipTracks, tolerance: float) -> ClipReconstruc
 
 def relative_pose(
     first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], tolerance: float
-) -> RelativePose | None:
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
     """The motion that most matches agree on (MAGSAC, the same for the same matches).
+
+    A point at X in the first view is at ``R X + t`` in the second; t has the length one.
 
     Args:
         first: x/z and y/z of the matches in the first view.
@@ -85,19 +75,22 @@ def relative_pose(
     if E is None or E.shape != (3, 3):
         return None
     _, R, t, _ = cv2.recoverPose(E, first, second, np.eye(3), mask=inliers.copy())
-    return RelativePose(R, t[:, 0] / np.linalg.norm(t))
+    return R, t[:, 0] / np.linalg.norm(t)
 
 
 def inverse_depths(
-    pose: RelativePose, first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]
+    R: Float[np.ndarray, "3 3"],
+    t: Float[np.ndarray, "3"],
+    first: Float[np.ndarray, "n 2"],
+    second: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "n"]:
-    """In the first view, in units of the inverse length of the translation (least squares).
+    """Inverse depths in the first view for a translation of the length one (least squares).
 
     A point at inverse depth d is seen in the second view where ``R (x, y, 1) + d t`` projects.
     """
-    turned = np.column_stack([first, np.ones(len(first))]) @ pose.R.T
+    turned = np.column_stack([first, np.ones(len(first))]) @ R.T
     still = turned[:, :2] - second * turned[:, 2:]
-    moved = pose.t[:2] - second * pose.t[2]
+    moved = t[:2] - second * t[2]
     inverse: Float[np.ndarray, "n"] = -(still * moved).sum(1) / ((moved**2).sum(1) + 1e-12)
     return inverse
 
@@ -114,7 +107,7 @@ def _located(
 
     def linearised(at: ClipReconstruction) -> tuple[np.ndarray, np.ndarray]:
         error = plane - at.projected()[0]
-        by_pose = at.derivatives_by_pose()[0].reshape(-1, 6)
+        by_pose = at.derivatives()[0][0].reshape(-1, 6)
         weight = seen * geman_mcclure_weight((error**2).sum(1) / tolerance**2)
         weighted = np.repeat(weight, 2)[:, None] * by_pose
         return weighted.T @ by_pose, weighted.T @ error.ravel()

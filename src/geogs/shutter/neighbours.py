@@ -38,7 +38,7 @@ def with_angular_motion(
     wanted: Callable[[int], bool],
     each: Each = map,
 ) -> Iterator[tuple[Picture, AngularMotion]]:
-    """Those images whose position is wanted, each with how the camera turned then.
+    """Images whose position is wanted, each with how the camera turned then.
 
     What is given depends on an image and its two neighbours alone, so it is the same wherever
     reading begins.

@@ -27,16 +27,16 @@ AGREEING = 0.2
 
 @dataclass(frozen=True)
 class RayFlow:
-    """What the cells of one image see in it and in another, as rays of the two cameras."""
+    """Matches of the cells of one image with another, as rays of the two cameras."""
 
     first: Float[np.ndarray, "n 3"]
     """Unit vectors in the first camera."""
     second: Float[np.ndarray, "n 3"]
-    """In the second."""
+    """The same in the second."""
     first_time: Float[np.ndarray, "n"]
     """Readouts from the middle row of the first image to the row of the cell."""
     second_time: Float[np.ndarray, "n"]
-    """Likewise in the second image."""
+    """The same in the second image."""
     inside: Bool[np.ndarray, "n"]
     """Whether the flow ends within the second image."""
     ends: Float[np.ndarray, "n 2"]
@@ -51,17 +51,14 @@ class FlowMeter:
     def __init__(self, camera: RollingCamera) -> None:
         """``camera`` of the images that :meth:`small` is given."""
         full = camera.camera
-        small = (
-            full if max(full.width, full.height) <= LONG_EDGE else full.with_long_edge(LONG_EDGE)
-        )
+        small = full if full.long_edge <= LONG_EDGE else full.with_long_edge(LONG_EDGE)
         self._size = (small.width, small.height)
         self._camera = replace(camera, camera=small)
         v, u = np.mgrid[STEP // 2 : small.height : STEP, STEP // 2 : small.width : STEP]
         self._cells = v, u
-        pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
-        self._pixels = pixels
-        self._rays = self._camera.rays(pixels)
-        self._times = self._camera.line_times(pixels)
+        self._pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+        self._rays = self._camera.rays(self._pixels)
+        self._times = self._camera.line_times(self._pixels)
         self._of_thread = threading.local()
 
     def small(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
@@ -79,9 +76,8 @@ class FlowMeter:
         dense = self._of_thread.dis.calc(first, second, None)
         ends = self._pixels + dense[self._cells].reshape(-1, 2)
         width, height = self._size
-        inside = (ends >= BORDER).all(1) & (ends <= (width - 1 - BORDER, height - 1 - BORDER)).all(
-            1
-        )
+        last = width - 1 - BORDER, height - 1 - BORDER
+        inside = ((ends >= BORDER) & (ends <= last)).all(1)
         ends = np.where(inside[:, None], ends, self._pixels)
         rays, times = self._camera.rays(ends), self._camera.line_times(ends)
         return RayFlow(self._rays, rays, self._times, times, inside, ends, self._cells[0].shape)
@@ -106,8 +102,6 @@ def angular_velocity(
     Returns:
         the velocity; none where too few cells agree with any.
     """
-    if interval <= 0:
-        return None
     from geogs.shutter.turning_kernels import turning_between
 
     first_time, second_time = readout * flow.first_time, readout * flow.second_time
@@ -122,7 +116,7 @@ def angular_velocity(
 def parallax(
     flow: RayFlow, rate: Float[np.ndarray, "3"], interval: float, readout: float
 ) -> tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]]:
-    """What cells move beside a rotation, in the first image and propagated to the second.
+    """Motion of the cells beside a rotation, in the first image and propagated to the second.
 
     The translation of the camera, each cell at its own depth, and what moves by itself. It is
     smoothed over the cells around, by their median and a mean, and where nothing is known it comes

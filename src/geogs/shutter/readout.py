@@ -26,28 +26,29 @@ CLIP, SPAN = 30, 3.0
 """Neighbouring images that points are followed through, and seconds that these last, at most: where
 images are far apart, the first and the last of so many would show other places."""
 CLIPS = 12
-"""That are worth giving, from all over the video."""
+"""Clips that are worth giving, from all over the video."""
 ENOUGH_CLIPS, ENOUGH = (5, 7, 9), 0.002
 """No more clips are looked at where so many leave a standard error of so many seconds."""
 CONFIDENT, SMALL = 3.0, 0.01
-"""Nor where the readout is less than so many seconds by so many standard errors."""
+"""No more are looked at, either, where the readout is less than so many seconds by so many standard
+errors."""
 FIRST_TOLERANCE = 1.2
 """Pixels of an inlier between the two views that a clip begins with."""
 EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
-"""Pixels of error at which a measurement counts for a quarter: of each step of the fit of a clip
-alone, as if its shutter were global, and of the stages of the fit of all together with the readout,
-with the number of their steps."""
+"""Pixels of error at which a measurement counts for a quarter: in each step of fitting a clip
+alone, as if its shutter were global; and in the stages of fitting all clips with the readout, with
+the steps of each."""
 SHORTER, ASSUMED = 0.78, 0.2
-"""Another focal length from which the adjustment begins, times what it is taken to be, where that
-leaves open more than such a fraction; from a wrong one, rows and lens come to explain each other.
-"""
+"""Ratio of a second focal length from which the adjustment begins to the assumed one, where the
+relative deviation of that is larger than this; from a wrong one, rows and lens come to explain each
+other."""
 LARGEST_STEP = 0.015
 """Seconds."""
 CONVERGED = 5e-5
 """Seconds of a step at the last tolerance after which there are no more."""
 MISFIT, UNEXPLAINED = 3.0, 0.5
-"""A clip whose cost is so many times the median's is left out, and in the end one with a larger one
-than this: no readout explains it."""
+"""Multiple of the median cost beyond which a clip is left out, and cost beyond which it is in the
+end: no readout explains it."""
 COMMON = 0.03
 """Fraction of the error of the matches that they have in common, and that no number of them makes
 less."""
@@ -72,12 +73,12 @@ Report = Callable[[float], None]
 
 @dataclass(frozen=True)
 class FoundReadout:
-    """What a video says of its readout."""
+    """The readout of a video, as far as the video tells it."""
 
     readout: float = 0.0
     """Seconds; 0 where no other is believed."""
     best: float = 0.0
-    """At which the clips fit best, believed or not."""
+    """Readout at which the clips fit best, believed or not."""
     error: float = float("inf")
     """Standard error of the best, seconds."""
     clips: int = 0
@@ -115,7 +116,7 @@ class _Adjusted:
 
 @dataclass(frozen=True)
 class _AdjustedClips:
-    """What is adjusted: several clips, and the readout and lens that they have in common."""
+    """State of the adjustment: several clips, and the readout and lens that they share."""
 
     clips: list[_Adjusted]
     shared: Float[np.ndarray, "s"]
@@ -127,7 +128,7 @@ class _AdjustedClips:
 
     @property
     def fitting(self) -> list[ReadoutEquation]:
-        """Of those clips that a rigid scene explains about as well as it explains most."""
+        """Equations of the clips that a rigid scene explains about as well as most."""
         if not self.equations:
             return []
         most = MISFIT * np.median([part.cost for part in self.equations])
@@ -151,13 +152,13 @@ class _CommonReadout:
     def linearise(self, state: _AdjustedClips) -> _AdjustedClips:
         """The clips that have not diverged, with their equations."""
         clips = [c for c in state.clips if c.reconstruction.is_finite]
-        equations = thread_map(functools.partial(self._equation, state.shared), clips)
-        return replace(state, clips=clips, equations=equations)
 
-    def _equation(self, shared: Float[np.ndarray, "s"], clip: _Adjusted) -> ReadoutEquation:
-        return readout_equation(
-            clip.tracks, clip.reconstruction, shared, self.tolerance, self.around
-        )
+        def equation(clip: _Adjusted) -> ReadoutEquation:
+            return readout_equation(
+                clip.tracks, clip.reconstruction, state.shared, self.tolerance, self.around
+            )
+
+        return replace(state, clips=clips, equations=thread_map(equation, clips))
 
     def step(
         self, state: _AdjustedClips, linear: _AdjustedClips, damping: float
@@ -260,7 +261,7 @@ def _verdict(state: _AdjustedClips, focal: float) -> FoundReadout:
     if len(parts) < LEAST_CLIPS or by_fewer is None:
         return FoundReadout(clips=len(parts))
     error = float(np.hypot(_standard_error(parts, lens), TREMOR * readout))
-    if error == 0:  # Images that are alike to the bit: nothing moves, so nothing is told.
+    if error == 0:  # Images that are alike to the bit: nothing moves.
         return FoundReadout()
     error = float(np.hypot(error, BETWEEN * by_fewer.size**2 / max(abs(readout), error)))
     confident = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
@@ -269,13 +270,13 @@ def _verdict(state: _AdjustedClips, focal: float) -> FoundReadout:
 
 
 def _curvature(parts: Sequence[ReadoutEquation]) -> Float[np.ndarray, "s s"]:
-    """Of several clips together."""
+    """Curvature of several clips together."""
     total: Float[np.ndarray, "s s"] = np.sum([part.curvature for part in parts], 0)
     return total + 1e-12 * np.eye(len(total))
 
 
 def _known_of_lens(lens: tuple[float, ...]) -> Float[np.ndarray, "s s"]:
-    """Information on it before any clip is asked."""
+    """Information on the lens before any clip is asked."""
     return np.diag([0.0, *(1 / np.square(lens))])
 
 

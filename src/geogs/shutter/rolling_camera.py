@@ -22,7 +22,7 @@ class RollingCamera:
     quarter_turns: int = 0
     """Clockwise, from the images as the sensor read them to the upright ones."""
     lines: int | None = None
-    """That the sensor reads an image in; those of ``camera`` if none."""
+    """Lines that the sensor reads an image in; those of ``camera`` if none."""
 
     def line_times(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
         """When pixels are seen, in readouts from the middle of the image.

@@ -16,8 +16,8 @@ from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import ClipTracks
 
 POWERS = 0, 2, 4
-"""Of the distance from the axis, times which a point seems off it by a longer focal length, and by
-OpenCV's k1 and k2."""
+"""Powers of the distance from the axis that scale the shift of a point by a longer focal length,
+and by OpenCV's k1 and k2."""
 NODES = 5
 """Images whose poses say where a point is between them. Fewer make little of quick tremor and the
 readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
@@ -31,16 +31,16 @@ DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class ReadoutEquation:
-    """What a clip says of the readout, whatever its poses and points.
+    """Normal equations of the readout by a clip, its poses and points eliminated.
 
-    Of the readout in seconds and, where they are not known, the relative change of the focal
-    length, k1 and k2.
+    The unknowns are the readout in seconds and, where they are not known, the relative change of
+    the focal length, k1 and k2.
     """
 
     curvature: Float[np.ndarray, "s s"]
-    """Curvature of the cost in these, poses and points being what is then best."""
+    """Curvature of the cost in the unknowns, poses and points being what is then best."""
     gradient: Float[np.ndarray, "s"]
-    """By how much the cost falls at first."""
+    """Slope by which the cost falls."""
     square: float
     """Weighted sum of squared errors of all that was measured."""
     cost: float
@@ -48,12 +48,12 @@ class ReadoutEquation:
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
     """Steps of poses and points, the readout and the lens being fixed."""
     by_shared: list[tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]]
-    """By how much more they step for each second that the readout grows, and each size."""
+    """Derivatives of these steps by each of the unknowns."""
 
     def stepped(
         self, reconstruction: ClipReconstruction, shared: Float[np.ndarray, "s"]
     ) -> ClipReconstruction:
-        """Where poses and points go as the readout and the lens take their own step."""
+        """The reconstruction after the steps that follow one of the readout and the lens."""
         poses, points = self.still
         for step, (by_pose, by_point) in zip(shared, self.by_shared, strict=True):
             poses, points = poses + step * by_pose, points + step * by_point

@@ -23,7 +23,7 @@ def node_count(pixels: int) -> int:
 
 
 class RowOffsets:
-    """By how much each pixel of a rectified image is seen elsewhere because the camera turns.
+    """Offsets of the pixels of a rectified image in the rolling one, since the camera moves.
 
     The rectified image is what a pinhole with a global shutter would see at the time of the middle
     row. A distant point at ray r is seen by the rolling camera where ``Exp(angles(t)) r`` projects
@@ -43,9 +43,13 @@ class RowOffsets:
         self._still = rolling.pixels(self._rays)
 
     def nodes(self, motion: AngularMotion, readout: float) -> Float[np.ndarray, "n 2"]:
-        """Offsets in pixels of the rolling image at the nodes, row by row."""
-        pixels = self._still
-        velocity = None
+        """Offsets in pixels of the rolling image at the nodes, row by row.
+
+        Args:
+            motion: of the camera, at this image.
+            readout: seconds from the first to the last row.
+        """
+        pixels, velocity = self._still, None
         if motion.parallax is not None:
             velocity = self._sampled(motion.parallax)
             # What the rate's change within a readout leaves of the rotation is not parallax.
@@ -72,15 +76,6 @@ class RowOffsets:
         )  # fmt: skip
         return values[:, 0].astype(np.float64)
 
-    def __call__(self, motion: AngularMotion, readout: float) -> Float[np.ndarray, "h w 2"]:
-        """Offsets in pixels of the rolling image at every pixel of the rectified one.
-
-        Args:
-            motion: of the camera, at this image.
-            readout: seconds from the first to the last row.
-        """
-        return self.dense(self.nodes(motion, readout))
-
     def dense(self, nodes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "h w 2"]:
         """Offsets at every pixel of the rectified image from those at the nodes."""
         width, height = self._rectified.width, self._rectified.height
@@ -90,11 +85,11 @@ class RowOffsets:
         return dense[CELL : CELL + height, CELL : CELL + width]
 
     def seen(self, nodes: Float[np.ndarray, "n 2"], shutter: Shutter) -> SeenRows:
-        """Where and when what a rectified image shows was seen, which was made with such offsets.
+        """Offsets and times at which a rectified image, made with such offsets, was seen.
 
         Args:
             nodes: offsets in pixels of the rolling image at the nodes.
-            shutter: that they are for.
+            shutter: the one that they are for.
         """
         pixels, target = self._still + nodes, self._rectified
         rays = self._rolling.rays(pixels)

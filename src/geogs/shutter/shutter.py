@@ -1,4 +1,4 @@
-"""What is known of a video's shutter."""
+"""The shutter of a video."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ LONGEST = 0.1
 
 @dataclass(frozen=True)
 class Shutter:
-    """How long the sensor takes from its first line to its last."""
+    """Time that the sensor takes from its first line to its last."""
 
     readout: float = 0.0
     """Seconds; 0 is a global shutter, negative where the last line is read first."""

@@ -43,6 +43,10 @@ DEPTH_DAMPING = 1e-3
 """Damping of inverse depth without a prior, relative to the mean curvature of its frame."""
 REWEIGHTINGS = 3
 """Times that the prior is judged and fitted anew in one adjustment."""
+EDGES_TOGETHER = 24
+"""Edges that are linearised at a time; bounds memory."""
+LIMITS = 1e-3, 1e2
+"""Inverse depths that a step ends at."""
 _CAUCHY = 2.0
 """Deviations at which a cell of the prior counts half in the fit of the scales."""
 _EVIDENCE = ((1.0, 8.0), (3.0, 2.0), (9.0, 0.5))
@@ -57,7 +61,7 @@ _ROUGHNESS = 3.0
 
 @dataclass(frozen=True)
 class FlowEvidence:
-    """What the edges of a problem say of the inverse depth of its frames, linearised."""
+    """The matches' term in the inverse depths of a problem's frames, linearised."""
 
     curvature: Float[Tensor, "n p"]
     """C = sum w |dp/dd|^2."""
@@ -108,15 +112,13 @@ def node_differences(rows: int, columns: int) -> Float[Tensor, "k k"]:
     return D.mT @ D
 
 
-def flow_evidence(
-    grid: SampleGrid, problem: BundleProblem, huber: float, chunk: int = 24
-) -> FlowEvidence:
+def flow_evidence(grid: SampleGrid, problem: BundleProblem, huber: float) -> FlowEvidence:
     """Curvature and gradient of the matches' term in the inverse depth of every frame."""
     d = problem.inverse_depth
     curvature, gradient = torch.zeros_like(d), torch.zeros_like(d)
     motion = relative_motion(problem.T_cw, problem.source, problem.target)
-    for first in range(0, len(problem.source), chunk):
-        part = slice(first, first + chunk)
+    for first in range(0, len(problem.source), EDGES_TOGETHER):
+        part = slice(first, first + EDGES_TOGETHER)
         source = problem.source[part].to(d.device)
         p = linearise(grid.camera, grid.rays, motion[part], d[source])
         r, w = weighed_residuals(p, problem.pixels[part], problem.weight[part], huber)
@@ -130,7 +132,7 @@ def depth_scale_step(
     inverse_depth: Float[Tensor, "n p"],
     prior: ScaledPrior,
     basis: Float[Tensor, "p k"],
-    stiffness: Float[Tensor, "k k"] | None = None,
+    stiffness: Float[Tensor, "k k"],
 ) -> DepthScaleStep:
     """The Gauss-Newton step of inverse depths and scales; frames are independent.
 
@@ -148,11 +150,10 @@ def depth_scale_step(
     S, g = S.double(), g.double()
     curvature = (alpha * prior.inverse_depth.square()) @ basis.square()
     S = S + torch.diag_embed(SCALE_DAMPING * curvature.double() + 1e-12)
-    if stiffness is not None:
-        # Scales differ by parts of their mean, so that the unit of depth does not matter.
-        relative = stiffness / prior.scale.double().mean(1).square()[:, None, None]
-        S = S + relative
-        g = g - (relative @ prior.scale.double()[..., None])[..., 0]
+    # Scales differ by parts of their mean, so that the unit of depth does not matter.
+    relative = stiffness / prior.scale.double().mean(1).square()[:, None, None]
+    S = S + relative
+    g = g - (relative @ prior.scale.double()[..., None])[..., 0]
     scale = torch.linalg.solve(S, g).to(inverse_depth)
     damping = DEPTH_DAMPING * C.mean(1, keepdim=True) + 1e-8
     curved = C + torch.where(known, alpha, damping)
@@ -184,7 +185,6 @@ def adjust_depth(
     prior: Float[Tensor, "n p"],
     scale: Float[Tensor, "n k"],
     config: PriorConfig,
-    limits: tuple[float, float] = (1e-3, 1e2),
 ) -> AdjustedDepth:
     """One JDSA step with weights that follow how well each prior agrees with the matches.
 
@@ -225,7 +225,7 @@ def adjust_depth(
     good &= (start + step.scale > 0).all(1, keepdim=True)
     taken = good & (alpha > 0)  # what goes without the prior has just been adjusted to the matches
     return AdjustedDepth(
-        torch.where(taken, (inverse_depth + step.depth).clamp(*limits), inverse_depth),
+        torch.where(taken, (inverse_depth + step.depth).clamp(*LIMITS), inverse_depth),
         torch.where(good, start + step.scale, start),
         torch.where(good, alpha, 0.0),
         overall,

@@ -16,11 +16,11 @@ from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
 from geogs.world.segments import LastFrame
 
-FARTHER = 1.0
-"""Part of the motion that calls for a keyframe by which a frame may be farther than that from the
-one that is not finished."""
-MOST_FRAMES = 60
-"""Whose images wait with a follower."""
+PATIENCE = 1.0
+"""How much farther than what calls for a keyframe a frame may be from the unfinished one, as a
+fraction of that."""
+MAX_FRAMES = 60
+"""Most frames whose images wait with a follower."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Follower:
         camera = keyframe.grid.camera
         is_sensed = frame.depth is not None and keyframe.measured is None
         has_size = frame.image.shape[:2] == (camera.height, camera.width)
-        if frame.follows_cut or is_sensed or not has_size or len(self.frames) >= MOST_FRAMES:
+        if frame.follows_cut or is_sensed or not has_size or len(self.frames) >= MAX_FRAMES:
             return None
         encoded = self._locator.operator.encode(frame.image)
         if self._locator.operator.texture(encoded) < MIN_TEXTURE:
@@ -85,7 +85,7 @@ class Follower:
         if motion is None:
             return None
         seen = motion.flow, motion.overlap, motion.parallax
-        if calls_for_keyframe(config, camera.long_edge, *seen, patience=FARTHER):
+        if calls_for_keyframe(config, camera.long_edge, *seen, patience=PATIENCE):
             return None
         velocity = motion.T_cw @ se3_inverse(self.T_cw)
         T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)

@@ -23,8 +23,8 @@ from geogs.world.keyframes import KeyframeSet
 EXPECTED_RESIDUAL = math.sqrt(2 * math.log(2))
 """Median length of an error in two dimensions, in its deviations."""
 CAUTION = 4 / 3
-"""Times as large as foretold are errors of frames between keyframes: matches of a frame have some
-in common. Read off rendered videos (docs/uncertainty.md has the table)."""
+"""Ratio of the errors of frames between keyframes to those foretold: the matches of a frame err
+alike. Read off rendered videos (docs/uncertainty.md has the table)."""
 
 
 def frame_uncertainty(tracker: Tracker) -> Uncertainty:

@@ -1,7 +1,7 @@
 """How well a tracker knows its keyframes, by what all its matches leave open."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -65,8 +65,7 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     rows = rows_in_doubt(tracker.map.recorder.log, tracker.keyframes, errors)
     propagated, focal, change, lenses = np.zeros(2), 0.0, 0.0, 0.0
     lens = tracker.keyframes.table.lens
-    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        part = slice(first, first + TOGETHER + 1)
+    for part in _parts(ids):
         found = _marginals(tracker, ids[part], rows)
         if found is None:
             continue
@@ -105,34 +104,40 @@ def misfit(residuals: Float[np.ndarray, "n"]) -> float:
 def said_of_lens(
     tracker: Tracker, ids: list[int], rows: RowErrors | None = None
 ) -> LensEvidence | None:
-    """What edges between some keyframes, earliest first, say of the lens beside what is known.
+    """Evidence on the lens by the edges between some keyframes, earliest first.
 
-    And of the readout by which ``rows`` err, where there are any.
+    And on the readout by which ``rows`` err, where there are any.
     """
     found = None
-    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
-        part = None if matches is None else matches.lens(rows)
-        if part is not None:
-            found = part if found is None else found.joined(part)
+    for part in _parts(ids):
+        matches = _Matches.among(tracker, ids[part])
+        said = None if matches is None else matches.lens(rows)
+        if said is not None:
+            found = said if found is None else found.joined(said)
     return found
 
 
 def said_of_frame_lenses(
     tracker: Tracker, ids: list[int]
 ) -> list[tuple[list[int], VaryingEvidence]]:
-    """What edges between some keyframes, earliest first, say of the lens of each of them.
+    """Evidence on the lens of each keyframe by the edges between some, earliest first.
 
     Of more than ``TOGETHER`` keyframes in parts, each with its own, which share the last of one
     and the first of the next.
     """
     found = []
-    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
-        matches = _Matches.among(tracker, ids[first : first + TOGETHER + 1])
+    for part in _parts(ids):
+        matches = _Matches.among(tracker, ids[part])
         said = None if matches is None else matches.frame_lenses()
         if matches is not None and said is not None:
             found.append((matches.frames, said))
     return found
+
+
+def _parts(ids: list[int]) -> Iterator[slice]:
+    """Spans of ids that are solved jointly; the last of one is the first of the next."""
+    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
+        yield slice(first, first + TOGETHER + 1)
 
 
 @dataclass(frozen=True)
@@ -145,7 +150,7 @@ class _Matches:
 
     @staticmethod
     def among(tracker: Tracker, ids: list[int]) -> "_Matches | None":
-        """Those of some keyframes; none where no edge joins them."""
+        """The matches of some keyframes; none where no edge joins them."""
         free = ids if tracker.segment.fixed else ids[1:]
         among = {*ids, *tracker.segment.fixed}
         edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
@@ -156,17 +161,17 @@ class _Matches:
 
     @property
     def grid(self) -> SampleGrid:
-        """Of their cells."""
+        """The grid of their cells."""
         return self.keyframes.grid
 
-    def lens(self, rows: RowErrors | None = None, of_depths: bool = False) -> LensEvidence | None:
-        """What they say of the lens, and of the readout that ``rows`` are for; nothing where they
+    def lens(self, rows: RowErrors | None, of_depths: bool = False) -> LensEvidence | None:
+        """Evidence on the lens, and on the readout that ``rows`` are for; nothing where they
         do not tell of all poses."""
         slope = None if rows is None else partial(self._slope, rows)
         return lens_evidence(self.grid, self.problem, OPTIONS, CELLS, slope, of_depths)
 
     def frame_lenses(self) -> VaryingEvidence | None:
-        """What they say of the lens of each keyframe."""
+        """Evidence on the lens of each keyframe."""
         return varying_evidence(self.grid, self.problem, OPTIONS)
 
     def lens_change(self) -> float:
@@ -201,7 +206,7 @@ class _Matches:
     def _slope(
         self, rows: RowErrors, part: BundleProblem, rays: Tensor, at: CellProjection
     ) -> Float[Tensor, "e p 2"]:
-        """By how much matches, where cells fall, change with a readout longer by a part of it."""
+        """Derivatives of matches, where cells fall, by the factor on the readout."""
         i, j = ([self.keyframes[self.frames[n]].frame_index for n in x] for x in (
             part.source.tolist(), part.target.tolist()
         ))  # fmt: skip

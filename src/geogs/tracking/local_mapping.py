@@ -12,7 +12,6 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import propagated
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, frame_distances, proximity_pairs
-from geogs.tracking.keyframes.keyframe_depth_sensor import stands_alone
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import FrameMotion
 from geogs.tracking.start.start_up import MIN_KEYFRAMES
@@ -25,7 +24,7 @@ CULL_DISTANCE = 0.009
 """A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
 makes one."""
 DEEPER = 3
-"""Keyframes before the window whose poses are adjusted whose inverse depth is adjusted, too."""
+"""Keyframes before the window of adjusted poses whose inverse depths are adjusted, too."""
 PROXIMITY_WINDOW = 25
 """Older keyframes among which further neighbours of a new one are looked for, as in DROID-SLAM."""
 PROXIMITY_DISTANCE = 0.2
@@ -66,7 +65,7 @@ class LocalMapping:
         """Make a located frame a keyframe, with the depths that its anchor gives it."""
         anchor = self.keyframes[motion.keyframe]
         keyframe = self.map.add(frame, encoded, motion.T_cw)
-        self._carry_depths(anchor, keyframe)
+        self._propagate_depths(anchor, keyframe)
         if self.segment.is_metric:
             self.map.sensor.join(keyframe, frame.depth)
         return keyframe
@@ -75,10 +74,10 @@ class LocalMapping:
         """Make a located frame, which was the keyframe ``id`` before the map was started, the
         earliest keyframe, linked to those after it and adjusted with them."""
         keyframe = self.map.restore(record, id, motion.T_cw)
-        self._carry_depths(self.keyframes[motion.keyframe], keyframe)
+        self._propagate_depths(self.keyframes[motion.keyframe], keyframe)
         ids, fixed = self.keyframes.ids, {*self.segment.fixed}
         self._connect(ids[1:PROXIMITY_WINDOW], ids[:1], (keyframe.id, motion.keyframe))
-        self._carry_moving(motion.keyframe, keyframe)
+        self._propagate_dynamic(motion.keyframe, keyframe)
         self._adjust(
             [k for k in ids[: self.config.window] if k not in fixed and k != ids[-1]],
             [k for k in ids[: self.config.window + DEEPER] if k not in fixed],
@@ -98,19 +97,19 @@ class LocalMapping:
         self.map.complete(keyframe, rotations)
         ids = self.keyframes.ids
         self._connect(ids[-1:], ids[-PROXIMITY_WINDOW:-1], (anchor, keyframe.id))
-        self._carry_moving(anchor, keyframe)
+        self._propagate_dynamic(anchor, keyframe)
         self._adjust(self.active, self.deep)
         self.map.odometry.update_scale()
         return self._cull() if culls else ()
 
-    def _carry_depths(self, anchor: Keyframe, keyframe: Keyframe) -> None:
+    def _propagate_depths(self, anchor: Keyframe, keyframe: Keyframe) -> None:
         T = keyframe.T_cw @ se3_inverse(anchor.T_cw)
         keyframe.inverse_depth, keyframe.information = grid_fields(self.keyframes.grid).transfer(
             T, anchor.inverse_depth, anchor.information
         )
 
-    def _carry_moving(self, anchor: int, keyframe: Keyframe) -> None:
-        """What moves in the anchor moves in a keyframe that has been measured against it."""
+    def _propagate_dynamic(self, anchor: int, keyframe: Keyframe) -> None:
+        """Mark as dynamic in a new keyframe what is so in the anchor it was measured against."""
         (pixels,), (weight,) = edge_matches(
             self.keyframes.grid, [self.graph.edges[keyframe.id, anchor]]
         )
@@ -140,7 +139,7 @@ class LocalMapping:
 
     def _adjust(self, poses: Sequence[int], depths: Sequence[int]) -> None:
         """Rounds of bundle adjustment, with flow measured anew where poses have moved."""
-        moving, deep, priors = set(poses), set(depths), self.map.priors
+        moving, deep = set(poses), set(depths)
         for n in range(ROUNDS):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]
             if n:
@@ -151,8 +150,7 @@ class LocalMapping:
             )
             if n == 0:
                 self.graph.update_dynamic(deep, self.config.moving)
-            if n == ROUNDS - 1:
-                priors.adjust(depths)
+        self.map.priors.adjust(depths)
         self.graph.release(moving)
 
     def _cull(self) -> tuple[int, ...]:
@@ -161,8 +159,8 @@ class LocalMapping:
         if len(ids) <= MIN_KEYFRAMES or ids[-2] in self.segment.final:
             return ()
         before, id = ids[-3], ids[-2]
-        if stands_alone([self.keyframes[k] for k in ids[-3:]]):
-            return ()
+        if [self.keyframes[k].measured is not None for k in ids[-3:]] == [False, True, False]:
+            return ()  # the only one around whose depth was measured
         distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
         if float(distance) >= CULL_DISTANCE * self._long_edge:
             return ()

@@ -51,7 +51,7 @@ class RowTwists(NamedTuple):
     twist: Float64[Tensor, "n 6"]
     """Per second, beside that of the trajectory; a left perturbation of the frame's pose."""
     leaves_open: list[PoseDeviation]
-    """Of the frame's pose, which follows what is not known of the twist."""
+    """Deviations of the frames' poses, which follow what is not known of the twists."""
 
 
 def row_twists(
@@ -64,8 +64,8 @@ def row_twists(
     """Twists of frames while they were read, by the matches that end in them.
 
     Each is estimated together with a step of the frame's pose, and is known before to be as small
-    as two polynomials through the poses around differ (:meth:`RowErrors.twist_doubts`). Depths, and
-    the poses of the frames that matches begin in, are taken for right.
+    as two polynomials through the poses around differ (:meth:`RowErrors.twist_deviations`). Depths,
+    and the poses of the frames that matches begin in, are taken for right.
     Source: pose and velocity from one image of a rolling shutter (Ait-Aider et al. 2006), with what
     is known of the velocity before by Bayes' rule.
 
@@ -89,11 +89,11 @@ def row_twists(
             sums[frame] = sums.get(frame, 0) + equations
     frames = [*sums]
     A = torch.stack([*sums.values()]) if sums else torch.zeros(0, 12, 13, dtype=torch.float64)
-    return RowTwists(frames, *solved_twists(A, errors.twist_doubts(frames)))
+    return RowTwists(frames, *solved_twists(A, errors.twist_deviations(frames)))
 
 
 def solved_twists(
-    A: Float64[Tensor, "n 12 13"], doubt: Float64[Tensor, "n 6"]
+    A: Float64[Tensor, "n 12 13"], deviation: Float64[Tensor, "n 6"]
 ) -> tuple[Float64[Tensor, "n 6"], list[PoseDeviation]]:
     """Most likely twists, and what they leave open of the poses, by the normal equations of steps
     of the poses and twists, with their right sides, ``EVIDENCE`` of which counts, and the twists'
@@ -105,7 +105,7 @@ def solved_twists(
     damped = of_pose + 1e-9 * largest[:, None, None] * eye
     follow, step = torch.linalg.solve(damped, torch.cat([both.mT, v[:, :6]], 2)).split([6, 1], 2)
     S, g = of_twist - both @ follow, v[:, 6:] - both @ step
-    rows, columns = doubt[..., None], doubt[:, None]
+    rows, columns = deviation[..., None], deviation[:, None]
     open_ = rows * torch.linalg.inv(rows * S * columns + eye) * columns
     squares = (follow @ open_ @ follow.mT).diagonal(dim1=1, dim2=2).reshape(-1, 2, 3).sum(2)
     left = [PoseDeviation(*two) for two in squares.clamp(min=0).sqrt().tolist()]

@@ -28,7 +28,6 @@ from geogs.world.segments import (
 Recall = Callable[[UInt8[np.ndarray, "h w 3"]], Sequence[Recognition]]
 """Recognises keyframes of any segment in an image; most alike first."""
 
-
 MIN_ORIENTED = 0.5
 """Fraction of the frames whose orientation has to be known where nothing else is: fewer are
 pictures of different things rather than a camera that only rotates."""
@@ -68,17 +67,17 @@ class Segments:
 
     @property
     def main(self) -> Tracker:
-        """That of the main map."""
+        """The tracker of the main map."""
         return self._trackers[self.table.main]
 
     @property
     def current(self) -> Tracker:
-        """That of the segment in which the camera is."""
+        """The tracker of the segment in which the camera is."""
         return self._trackers[self.table.current]
 
     @property
     def trackers(self) -> list[Tracker]:
-        """All, earliest first."""
+        """All trackers, earliest first."""
         return list(self._trackers.values())
 
     @property
@@ -241,7 +240,7 @@ class Segments:
         del self._trackers[tracker.segment.number]
 
     def _reported(self, result: TrackResult) -> TrackResult:
-        """What is told of a segment that is not the main map: only what is final."""
+        """What is reported of a segment that is not the main map: only what is final."""
         if self.current is self.main:
             return result
         return TrackResult(result.state, finalized_elsewhere=result.finalized)

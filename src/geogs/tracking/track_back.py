@@ -9,8 +9,8 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.rotation_averaging import orientations
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.local_mapping import LocalMapping
-from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion
-from geogs.tracking.locate.visible_keyframes import visible_keyframes
+from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, with_depth
+from geogs.tracking.locate.localiser import visible_keyframes
 from geogs.world.keyframes import KeyframeSet
 
 
@@ -65,8 +65,8 @@ def _located(
     candidates = list(keyframes)
     nearest = min(candidates, key=lambda k: abs(k.frame_index - index))
     for keyframe in dict.fromkeys((nearest, *visible_keyframes(candidates, guess))):
-        motion = locator.locate(keyframe, encoded, guess, is_expected=False)
-        if motion is not None and motion.known >= MIN_KNOWN:
+        motion = with_depth(locator.locate(keyframe, encoded, guess, is_expected=False))
+        if motion is not None:
             return motion
     return None
 

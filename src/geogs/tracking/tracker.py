@@ -36,7 +36,7 @@ from geogs.world.segments import LastFrame, TrackState, VideoSegment
 
 @dataclass(frozen=True)
 class TrackResult:
-    """What one frame changed."""
+    """Changes by one frame."""
 
     state: TrackState
     finalized: tuple[int, ...] = ()
@@ -84,7 +84,7 @@ class Tracker:
         self._orientation = OrientationFollower(grid, operator, self.config)
         self.local = LocalMapping(self.map, self.config)
         self._motion: FrameMotion | None = None
-        """By which the last frame was located; none where it was not."""
+        """The motion by which the last frame was located; none where it was not."""
         self._defers = defers
         self._unfinished: _Unfinished | None = None
 

@@ -18,7 +18,7 @@ def test_what_is_known_of_lenses_tells_what_a_narrow_view_does_not():
     found = with_prior(Estimate(lens, root @ root.mT, 12))
     assert abs(found.lens.k1) < 0.3
     assert abs(found.lens.k2) < 0.6
-    assert found.camera.fx == pytest.approx(CAMERA.fx * math.exp(-0.05), rel=0.01)
+    assert found.lens.camera.fx == pytest.approx(CAMERA.fx * math.exp(-0.05), rel=0.01)
     assert found.deviation < 0.01
 
 

@@ -9,7 +9,6 @@ from geogs.tracking.flow.cell_texture import (
     cell_structure,
     common_tensor,
     structure_of,
-    structure_tensor,
 )
 from geogs.world.grid import OFFSET, STRIDE
 
@@ -54,7 +53,7 @@ def test_it_is_what_one_coordinate_is_known_to_while_the_other_is_open() -> None
     rng = np.random.default_rng(1)
     coarse = rng.normal(0, 1, (64, 64)).cumsum(0)[:, ::-1].cumsum(1) / 12
     image = np.clip(100 + coarse + 6 * np.sin(np.arange(64) / 3), 0, 255).astype(np.uint8)
-    parts = [p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(image)]
+    parts = [p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in common_tensor(image, image)]
     expected = []
     for xx, yy, xy in zip(*parts, strict=True):
         values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]], np.float64))

@@ -16,8 +16,15 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.networks.tensor_files import read_tensors
+from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
-from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize, load_droid
+from geogs.tracking.flow.droid_network import (
+    CORRELATION_SCALE,
+    LEVELS,
+    RADIUS,
+    DroidNetwork,
+    load_droid,
+)
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
@@ -31,7 +38,7 @@ POSES = [pose(0.0), pose(0.12, 0.02, 0.05, 0.03), pose(0.2, 0.0, 0.05, 0.05)]
 def narrow(seed: int = 0, delta: tuple[float, float] | None = None) -> DroidNetwork:
     """A small network with random weights; with ``delta`` all its updates are that many cells."""
     torch.manual_seed(seed)
-    network = DroidNetwork(DroidSize(8))
+    network = DroidNetwork(8)
     for head in (network.update.delta, network.update.weight):
         head[2].weight.data *= 5
     if delta is not None:
@@ -177,7 +184,8 @@ def test_the_start_of_an_edge_is_the_context_of_its_source(operator, views, star
         position = ((start[0] - 4) / 8).reshape(1, GRID.height, GRID.width, 2)
         flow = position - ((GRID.pixels - 4) / 8).reshape(1, GRID.height, GRID.width, 2)
         motion = torch.cat([flow, 0 * flow], -1).permute(0, 3, 1, 2)
-        correlation = once._lookup([views[0]], [views[1]])(position)
+        features = [view.features[None] for view in views[:2]]
+        correlation = CorrelationVolume(*features, LEVELS, RADIUS, CORRELATION_SCALE)(position)
         out = once.network.update(hidden, static, correlation, motion)
     expected = position + out.delta.permute(0, 2, 3, 1)
     torch.testing.assert_close(there.pixels, (4 + 8 * expected).flatten(1, 2), rtol=1e-4, atol=1e-3)

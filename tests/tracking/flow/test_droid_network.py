@@ -13,7 +13,6 @@ from geogs.tracking.flow.droid_network import (
     LOOKUP,
     RADIUS,
     DroidNetwork,
-    DroidSize,
     cell_positions,
     load_droid,
     motion_features,
@@ -68,7 +67,7 @@ def test_encoders_have_an_eighth_of_the_resolution(network):
 def test_a_cell_is_centred_on_its_first_pixel():
     """The receptive field of cell (r, c) is symmetric about pixel (8 r, 8 c)."""
     torch.manual_seed(0)
-    network = DroidNetwork(DroidSize(4))
+    network = DroidNetwork(4)
     image = torch.rand(1, 3, 160, 160, requires_grad=True)
     network.cnet(image)[0, :, 10, 11].square().sum().backward()
     rows, columns = (torch.nonzero(image.grad.abs().sum((0, 1, k)))[:, 0] for k in (3, 2))

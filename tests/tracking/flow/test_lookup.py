@@ -13,6 +13,7 @@ from geogs.tracking.flow.lookup import (
     PyramidLevel,
     correlation_windows,
     correlation_windows_reference,
+    level_tables,
 )
 
 LEVELS = (PyramidLevel(17, 12, 0.25, 0.0), PyramidLevel(9, 6, 0.125, -0.25))
@@ -35,7 +36,7 @@ def problem():
 def reference(source, pyramid, edges, centres):
     """The windows by loops over everything, float64."""
     out = torch.zeros(*centres.shape[:2], len(LEVELS), 7, 7, dtype=torch.float64)
-    table = pyramid.table
+    table, _ = level_tables(pyramid.levels)
     for e, (i, j) in enumerate(zip(edges.first.tolist(), edges.second.tolist(), strict=True)):
         for p, (x, y) in enumerate(centres[e].double().tolist()):
             for n, (level, (offset, w, h)) in enumerate(zip(LEVELS, table, strict=True)):

@@ -8,7 +8,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.classical_flow_cuda import CudaClassicalFlow
-from geogs.tracking.flow.lookup import Edges
+from geogs.tracking.flow.lookup import Edges, level_tables
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
@@ -90,7 +90,8 @@ def test_descriptors_of_the_pyramid_are_where_their_levels_say(network):
     with torch.no_grad():
         pyramids = [network.encode(i).pyramid for i in (quiet, spot)]
     change = (pyramids[1].descriptors - pyramids[0].descriptors).abs().sum(-1)[0]
-    for (offset, w, h), level in zip(pyramids[0].table, pyramids[0].levels, strict=True):
+    levels = pyramids[0].levels
+    for (offset, w, h), level in zip(level_tables(levels)[0], levels, strict=True):
         field = change[offset : offset + w * h].reshape(h, w)
         v, u = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
         at = [float((field * c).sum() / field.sum()) for c in (u, v)]

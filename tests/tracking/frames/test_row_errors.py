@@ -59,7 +59,7 @@ def read_at(rolling: RollingCamera, point: np.ndarray) -> np.ndarray:
 
 def shown_at(rolling: RollingCamera, offsets: RowOffsets, pixel: np.ndarray) -> np.ndarray:
     """The pixel of the rectified image that was taken from one of the sensor's."""
-    dense, at = offsets(ASSUMED, READOUT).astype(np.float64), np.round(pixel).astype(int)
+    dense = offsets.dense(offsets.nodes(ASSUMED, READOUT)).astype(np.float64)
     here = pixel.copy()
     for _ in range(20):
         u, v = np.clip(here, 0, [CAMERA.width - 1.001, CAMERA.height - 1.001])

@@ -30,7 +30,7 @@ def scattered(count: int, seed: int = 0) -> KeyframeSet:
 def test_no_pair_within_reach_is_left_out():
     for store in (scattered(60), planted_tracker(80)[0].keyframes):
         ids = store.ids
-        may = may_overlap(store, ids, ids, 0.2, 2)
+        may = may_overlap(store, ids, ids, 0.2)
         may &= may.T
         directed = [(i, j) for i in ids for j in ids]
         distance = frame_distances(store, directed).reshape(len(ids), len(ids)).numpy()
@@ -39,18 +39,18 @@ def test_no_pair_within_reach_is_left_out():
         # It is a help, too: most of what it lets through can be seen.
         assert finite.sum() > 0.4 * may.sum()
     short = scattered(60)
-    assert may_overlap(short, short.ids, short.ids, 0.2, 2).mean() < 0.5
+    assert may_overlap(short, short.ids, short.ids, 0.2).mean() < 0.5
 
 
 def test_keyframes_that_are_skipped_as_a_whole_have_no_tile_in_view():
     for store in (scattered(60), planted_tracker(200)[0].keyframes):
         ids = store.ids
-        spheres = overlap._spheres(store, ids, 2)
+        spheres = overlap._spheres(store, ids)
         planes = overlap._view_planes(store.grid.camera, store.poses(ids))
         seen = spheres.reach(*planes).float() @ spheres.fraction
         expected = (seen > 0.2 - 1e-6).numpy()
-        assert np.array_equal(may_overlap(store, ids, ids, 0.2, 2), expected)
-        assert may_overlap(store, ids, ids, 0.0, 2).all()
+        assert np.array_equal(may_overlap(store, ids, ids, 0.2), expected)
+        assert may_overlap(store, ids, ids, 0.0).all()
         skipped = ~spheres.around().reach(*planes)[..., 0]
         assert float(skipped.float().mean()) > 0.05
         assert not (skipped & (seen > 0)).any()

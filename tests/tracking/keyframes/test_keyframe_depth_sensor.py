@@ -14,7 +14,7 @@ from geogs.world.cell_depths import MeasuredCells
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
 from records import copied
-from tracking_runs import CONFIG
+from tracking_runs import CONFIG, metric_errors_cm
 from tracking_scenes import CAMERA, pose, render, sideways
 
 
@@ -48,13 +48,6 @@ def tracked(frames: list[Frame]) -> Tracker:
         tracker.track(frame)
     tracker.finish()
     return tracker
-
-
-def errors_cm(tracker: Tracker, path: list[np.ndarray]) -> np.ndarray:
-    """Of every frame's place, metres taken for metres, the first frames on each other."""
-    found, truth = tracker.trajectory().T_wc, np.stack(path)
-    there = truth[0] @ np.linalg.inv(found[0]) @ found
-    return 100 * np.linalg.norm((there - truth)[:, :3, 3], axis=1)
 
 
 def test_the_first_frame_starts_a_map_in_metres():
@@ -102,7 +95,8 @@ def test_too_little_depth_starts_nothing():
 def test_places_are_in_metres_with_few_depths():
     path = sideways(24)
     tracker = tracked(sensed(path, every=6))
-    assert errors_cm(tracker, path).max() < 0.5  # of a path of 58 cm
+    errors = metric_errors_cm(tracker.trajectory().T_wc, np.stack(path))
+    assert errors.max() < 0.5  # of a path of 58 cm
     assert sum(k.measured is not None for k in tracker.keyframes) >= 3
 
 
@@ -111,7 +105,7 @@ def test_a_camera_that_only_turns_has_a_place():
     path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(24)]
     tracker = tracked(sensed(path))
     assert tracker.trajectory().tracked.all()
-    assert errors_cm(tracker, path).max() < 0.5
+    assert metric_errors_cm(tracker.trajectory().T_wc, np.stack(path)).max() < 0.5
 
 
 def test_measurements_follow_the_scale_of_their_keyframe():

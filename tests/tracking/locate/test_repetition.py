@@ -9,7 +9,12 @@ import torch
 import tracking_scenes
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.follower import Follower
-from geogs.tracking.locate.frame_locator import BORNE_OUT, DOUBTFUL, SAME, FrameMotion
+from geogs.tracking.locate.frame_locator import (
+    CONFIRMED_NCC,
+    DOUBTFUL_OVERLAP,
+    MAX_DIFFERENCE,
+    FrameMotion,
+)
 from geogs.tracking.locate.localiser import SegmentLocaliser
 from geogs.tracking.matching.photometric_check import PhotometricCheck
 from geogs.tracking.tracker import Tracker, lone_tracker
@@ -47,7 +52,7 @@ def searched(
 
 
 def test_what_most_of_the_keyframe_agrees_with_is_believed():
-    sure, doubtful = motion(DOUBTFUL, 0.3), motion(DOUBTFUL - 0.01, 0.3)
+    sure, doubtful = motion(DOUBTFUL_OVERLAP, 0.3), motion(DOUBTFUL_OVERLAP - 0.01, 0.3)
     better, worse = motion(0.9, 0.31), motion(0.9, 0.29)
     assert searched(sure, better, better) == (sure, 0)
     assert searched(doubtful, better, motion(0.9, 0.305)) == (better, 2)
@@ -59,9 +64,13 @@ def test_what_most_of_the_keyframe_agrees_with_is_believed():
 
 
 def test_features_are_not_asked_where_flow_leads_there_again_and_images_bear_it_out():
-    doubtful, features = motion(DOUBTFUL - 0.01, 0.3), motion(0.9, 0.5)
-    near, far = SAME / 2, 2 * SAME
-    for at, correlation, asked in ((near, BORNE_OUT, 1), (near, 0.9, 2), (far, BORNE_OUT, 2)):
+    doubtful, features = motion(DOUBTFUL_OVERLAP - 0.01, 0.3), motion(0.9, 0.5)
+    near, far = MAX_DIFFERENCE / 2, 2 * MAX_DIFFERENCE
+    for at, correlation, asked in (
+        (near, CONFIRMED_NCC, 1),
+        (near, 0.9, 2),
+        (far, CONFIRMED_NCC, 2),
+    ):
         cold = motion(0.8, 0.4, at=at, correlation=correlation)
         assert searched(doubtful, cold, features) == (cold if asked == 1 else features, asked)
     blank = replace(doubtful.match, weight=torch.zeros(1, 8, 2))

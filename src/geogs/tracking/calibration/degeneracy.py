@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from geogs.geometry.camera import Camera
+from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -28,7 +29,7 @@ PLANAR_FRACTION = 0.9
 _TOLERANCE = 1 / 1000
 """Deviation, of the long edge, from a homography that is still explained by it."""
 _FIELDS_OF_VIEW = 25.0, 130.0
-"""Degrees along the longer side, between which a turn is looked for."""
+"""Degrees along the longer side, between which a rotation is looked for."""
 
 
 class Degeneracy(Enum):
@@ -56,7 +57,7 @@ class _HomographyFit:
 def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Degeneracy | None:
     """What is wrong with the flow from one view to others; None if nothing is.
 
-    A turn that only one focal length explains tells it, however little else there is.
+    A rotation that only one focal length explains tells it, however little else there is.
     ``min_parallax`` is in pixels; of the camera only size, aspect and principal point count.
     """
     fits = [fit for fit in (_homography(camera, match) for match in flows) if fit is not None]
@@ -93,8 +94,7 @@ def _homography(camera: Camera, match: FlowMatch) -> _HomographyFit | None:
 
 def _unexplained(K: Float[np.ndarray, "3 3"], fit: _HomographyFit) -> float:
     """Median distance of matches from where the rotation nearest to a homography moves them."""
-    U, _, Vt = np.linalg.svd(np.linalg.inv(K) @ fit.H @ K)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(np.linalg.inv(K) @ fit.H @ K)
     moved = _moved(K @ R @ np.linalg.inv(K), fit.first)
     return float(np.median(np.linalg.norm(moved - fit.second, axis=1)))
 

@@ -71,12 +71,10 @@ def try_candidate(
         )  # fmt: skip
         poses.append(poses[-1] if T is None else T)
     n = len(flows) + 1
-    free = torch.ones(n, dtype=torch.bool)
-    free[0] = False
     rows = torch.cat([depth[None], torch.ones(n - 1, grid.size)])
     problem = BundleProblem(
         torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
-        free, torch.ones(n, dtype=torch.bool),
+        torch.arange(n) > 0, torch.ones(n, dtype=torch.bool),
         pixels=torch.cat([f.pixels for f in flows]), weight=torch.cat([f.weight for f in flows]),
     )  # fmt: skip
     result = _adjusted(problem, LensBlock(lens, grid.pixels), radial)
@@ -88,7 +86,7 @@ def try_candidate(
 
 
 def _adjusted(problem: BundleProblem, block: LensBlock, radial: bool) -> SharedResult | None:
-    """From forgiving to strict, always with the focal length."""
+    """The problem adjusted from forgiving to strict, always with the focal length."""
     result = None
     for huber, steps in _STAGES:
         block = replace(block, radial=radial and huber == _STAGES[-1][0])

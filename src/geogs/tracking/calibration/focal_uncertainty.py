@@ -1,4 +1,4 @@
-"""What one stretch of a video says of focal length and distortion, and how surely."""
+"""Focal length and distortion by one stretch of a video, with their deviations."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,6 @@ from torch import Tensor
 
 from geogs.bundle.lens import RadialLens
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
-from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import USUAL_BEND
 from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
@@ -27,21 +26,16 @@ FIELDS_OF_VIEW = 15.0, 150.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one stretch says."""
+    """The lens by one stretch."""
 
     lens: RadialLens
     covariance: Float64[Tensor, "3 3"]
-    """Of the logarithm of the focal length, k1 and k2; zero for those that are known."""
+    """Covariance of log focal length, k1 and k2; zero for those that are known."""
     keyframes: int
 
     @property
-    def camera(self) -> Camera:
-        """The lens' pinhole."""
-        return self.lens.camera
-
-    @property
     def deviations(self) -> tuple[float, float, float]:
-        """Of each of the sizes."""
+        """Standard deviation of each of these."""
         focal, k1, k2 = self.covariance.diagonal().sqrt().tolist()
         return focal, k1, k2
 
@@ -52,16 +46,15 @@ class Estimate:
 
 
 def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
-    """What an adjusted stretch says, with k1 and k2 if ``radial``, or why it is not believed."""
+    """Estimate by an adjusted stretch, with k1 and k2 if ``radial``, or why it is not believed."""
     result = bundle.result
     assert result is not None
     lens = result.block.lens
     angle = 2 * math.degrees(math.atan(lens.camera.long_edge / 2 / lens.camera.fx))
     if not FIELDS_OF_VIEW[0] < angle < FIELDS_OF_VIEW[1]:
         return f"it seems to have a field of view of {angle:.0f} degrees"
-    if any(
-        abs(k) > MOST_BEND * usual for k, usual in zip((lens.k1, lens.k2), USUAL_BEND, strict=True)
-    ):
+    bends = zip((lens.k1, lens.k2), USUAL_BEND, strict=True)
+    if any(abs(k) > MOST_BEND * usual for k, usual in bends):
         return "its lens seems to bend as none does"
     if bundle.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
@@ -74,8 +67,8 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
 
 
 def with_prior(said: Estimate) -> Estimate:
-    """With what is known of lenses before any match is asked: k1 and k2 are about none. A narrow
-    field of view does not tell them."""
+    """The estimate joined with what is known of any lens: k1 and k2 are about zero, which a narrow
+    field of view does not tell."""
     lens = said.lens
     size = torch.tensor([0.0, lens.k1, lens.k2], dtype=torch.float64)
     told = LensEstimate(size, said.covariance)

@@ -122,8 +122,7 @@ class GrowingBundle:
         """All edges, on the CPU; every pose but the first is free."""
         directed = sorted(self._edges)
         edges = [self._edges[e] for e in directed]
-        free = torch.ones(len(self), dtype=torch.bool)
-        free[0] = False
+        free = torch.arange(len(self)) > 0
         return BundleProblem(
             torch.stack(self._T),
             torch.stack(self._depth).cpu(),

@@ -13,7 +13,6 @@ from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
-from geogs.tracking.calibration.focal_uncertainty import Estimate
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer
 from geogs.tracking.flow.operator_choice import build_operator
@@ -29,7 +28,7 @@ STRETCHES = 3
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """What the video says of its camera."""
+    """The camera of a video, as far as the video tells it."""
 
     camera: Camera
     """Camera of the working image; the guess where there is a ``failure``."""
@@ -42,7 +41,7 @@ class SelfCalibration:
     """Standard deviations of k1 and k2."""
     keyframes: int = 0
     frames: int = 0
-    """That were used."""
+    """Frames that were used."""
     failure: str | None = None
     """Why the video does not tell; "the camera only turns", for the middle of a sentence."""
 
@@ -74,24 +73,22 @@ def self_calibrate(
     images = (cv2.resize(f.image, size, interpolation=cv2.INTER_AREA) for f in frames)
     gatherer = ViewGatherer(images, grid, operator)
     failures: list[str] = []
-    found: Estimate | None = None
-    while found is None and len(failures) < STRETCHES and not (failures and gatherer.is_over):
-        said = Stretch(grid, operator, gatherer, radial, _part_of(report, len(failures))).ask()
-        if isinstance(said, str):
-            failures.append(said)
-        else:
-            found = said
-    if found is None:
-        # That nothing explains a stretch weighs more than what the others lack.
-        failure = min(failures, key=lambda said: said != Degeneracy.UNEXPLAINED.value)
-        return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
-    report(1.0)
-    k1, k2 = found.lens.k1, found.lens.k2
-    bends = k1 != 0 or k2 != 0
-    return SelfCalibration(
-        camera.with_focal(camera.fx * found.camera.fx / small.fx), (k1, k2) if bends else None,
-        found.deviation, found.deviations[1:] if bends else None, found.keyframes, gatherer.frames,
-    )  # fmt: skip
+    while len(failures) < STRETCHES and not (failures and gatherer.is_over):
+        found = Stretch(grid, operator, gatherer, radial, _part_of(report, len(failures))).ask()
+        if isinstance(found, str):
+            failures.append(found)
+            continue
+        report(1.0)
+        lens = found.lens
+        bends = lens.k1 != 0 or lens.k2 != 0
+        return SelfCalibration(
+            camera.with_focal(camera.fx * lens.camera.fx / small.fx),
+            (lens.k1, lens.k2) if bends else None, found.deviation,
+            found.deviations[1:] if bends else None, found.keyframes, gatherer.frames,
+        )  # fmt: skip
+    # That nothing explains a stretch weighs more than what the others lack.
+    failure = min(failures, key=lambda said: said != Degeneracy.UNEXPLAINED.value)
+    return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
 
 
 def _part_of(report: Report, n: int) -> Report:

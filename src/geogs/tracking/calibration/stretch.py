@@ -15,17 +15,17 @@ START_KEYFRAMES = 12
 """Keyframes of a stretch that are solved first, and by which it then grows."""
 KEYFRAMES = 24
 """Most keyframes of a stretch; they are added until the focal length is known well enough."""
-ENOUGH = 0.01
+ENOUGH_DEVIATION = 0.01
 """Relative deviation of the focal length from which no more keyframes of a stretch are used: all
 matches of the run are asked again at its end (docs/lens.md)."""
-SMALL = 400
+SMALL_IMAGE = 400
 """Pixels of the long edge of images that are matched at full resolution from the start, larger ones
 at half of it first."""
 MIN_PARALLAX = 0.003
 """Motion that rotation does not explain, needed between two keyframes, of the long edge: some
 deviations of a match, from which on views can be placed. Whether they tell the focal length their
 adjustment says (docs/calibration.md)."""
-LEAST_VIEWS = 4
+MIN_VIEWS = 4
 
 Report = Callable[[float], None]
 
@@ -72,23 +72,22 @@ class Stretch:
                 if not bundle.place(view):
                     return said
             # Matches are searched again from where the first adjustment has them.
-            for fine in (self.grid.camera.long_edge <= SMALL, True):
+            for fine in (self.grid.camera.long_edge <= SMALL_IMAGE, True):
                 bundle.measure(fine, self._tick)
                 if not bundle.adjust(self.radial):
                     return said
             said = estimate(bundle, self.radial)
             self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
-            if isinstance(said, Estimate) and said.deviation < ENOUGH:
+            if isinstance(said, Estimate) and said.deviation < ENOUGH_DEVIATION:
                 return said
             if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
                 return said
 
     def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
-        count = max(START_KEYFRAMES, 2 * LEAST_VIEWS)
         failure = Degeneracy.BLANK
-        while failure is not Degeneracy.UNEXPLAINED and self._gather(count):
-            if len(self._views) < LEAST_VIEWS:
+        while failure is not Degeneracy.UNEXPLAINED and self._gather(START_KEYFRAMES):
+            if len(self._views) < MIN_VIEWS:
                 return Degeneracy.STILL
             flows = flows_from_first(self.grid, self.operator, self._views)
             found = self._solve_start(flows)

@@ -51,7 +51,7 @@ def median_correlation(
 def matched_motion(
     grid: SampleGrid, pixels: Float[Tensor, "p 2"], weight: Float[Tensor, "p 2"]
 ) -> Float[Tensor, "2"]:
-    """As :func:`~geogs.tracking.matching.photometric_check.matched_motion`, float64, on the GPU."""
+    """:func:`~geogs.tracking.matching.photometric_check.matched_motion`, float64, on the GPU."""
     keys = torch.empty(grid.size, dtype=torch.int32, device=pixels.device)
     found = torch.empty(2, dtype=torch.float64, device=pixels.device)
     kernels_for(SOURCE, pixels.device)["matched_motion"](

@@ -28,7 +28,7 @@ class CellStructure:
     half: Float[np.ndarray, "p"]
     """Half of xx - yy."""
     radius: Float[np.ndarray, "p"]
-    """What the eigenvalues are above and below their mean."""
+    """Distance of the eigenvalues from their mean."""
 
     @property
     def smaller(self) -> Float[np.ndarray, "p"]:
@@ -42,7 +42,7 @@ class CellStructure:
 
     @property
     def certainty(self) -> Float[np.ndarray, "p 2"]:
-        """What a match of each cell says along x and along y, as a part of the full weight.
+        """Certainty of a match of each cell along x and along y, as a fraction of the full weight.
 
         A point on an edge is known across the edge, hardly along it. The information of a match is
         that of the structure tensor with each eigenvalue l replaced by min(1, l / SHARP +
@@ -62,39 +62,26 @@ class CellStructure:
 
 def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> CellStructure:
     """Structure of an image at the cells of the sample grid."""
-    return structure_of(
-        *(p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in structure_tensor(grey))
-    )
+    parts = common_tensor(grey, grey)
+    return structure_of(*(p[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1) for p in parts))
 
 
 def structure_of(
     xx: Float[np.ndarray, "p"], yy: Float[np.ndarray, "p"], xy: Float[np.ndarray, "p"]
 ) -> CellStructure:
-    """That of tensors at the cells."""
+    """Structure of the cells with these tensors."""
     half = (xx - yy) / 2
     return CellStructure((xx + yy) / 2, half, np.sqrt(half * half + xy * xy))
-
-
-def grey_levels(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
-    """An RGB image in grey."""
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def structure_tensor(
-    grey: UInt8[np.ndarray, "h w"],
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Squares and product of the gradient's parts, xx, yy and xy, averaged over 9 x 9 pixels."""
-    return common_tensor(grey, grey)
 
 
 def common_tensor(
     first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], window: int = 9
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Structure tensor of what two images have in common that show the same at each pixel: products
-    of the gradients of the one and of the other, averaged over a window of so many pixels a side.
+    """Structure tensor (xx, yy, xy) of what two images have in common that show the same at each
+    pixel: products of their gradients, averaged over a window of so many pixels a side.
 
-    Noise adds its own gradients' squares to the structure of an image, but nothing to this in the
-    mean, as that of two images is independent.
+    That of an image with itself is the image's own. Noise adds its own gradients' squares to it,
+    but nothing in the mean to that of two images, whose noise is independent.
     """
     ax, ay = _gradients(first)
     bx, by = (ax, ay) if second is first else _gradients(second)
@@ -104,5 +91,5 @@ def common_tensor(
 
 
 def _gradients(grey: UInt8[np.ndarray, "h w"]) -> list[Float32[np.ndarray, "h w"]]:
-    """Along x and y, grey levels / pixel."""
+    """Gradients along x and y, grey levels / pixel."""
     return [cv2.Sobel(grey, cv2.CV_32F, *by, scale=1 / 8) for by in ((1, 0), (0, 1))]

@@ -95,10 +95,9 @@ class _DenseFlow:
         return _sample(cv2.blur(norm, (window, window)), self.level.from_image(points), None)
 
     def certainty(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2"]:
-        """What matches of image points say along x and y, by what both images show there."""
+        """Certainty of matches of image points along x and y, by what both images show there."""
         level = self.level
-        x, y = level.u + self.rest[..., 0], level.v + self.rest[..., 1]
-        found = _warped(self.target, x, y)
+        found = _warped(self.target, level.u + self.rest[..., 0], level.v + self.rest[..., 1])
         tensor = common_tensor(self.source, found, 8 // level.step + 1)
         # Gradients of the level are by its own pixels.
         at = level.from_image(points)
@@ -137,7 +136,7 @@ class ClassicalFlow:
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
         # Half of a small image is too little to match.
-        fine = fine or max(self.grid.camera.width, self.grid.camera.height) <= SMALL_IMAGE
+        fine = fine or self.grid.camera.long_edge <= SMALL_IMAGE
         a, b = [*first, *second], [*second, *first]
         n = len(first)
         start = [None] * (2 * n)
@@ -147,8 +146,10 @@ class ClassicalFlow:
         flows = list(pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
         matches = list(pool.map(self._match, flows, reverse))
-        pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
-        weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
+        pixels, weight = (
+            torch.from_numpy(np.stack(part)).to(self.grid.device)
+            for part in zip(*matches, strict=True)
+        )
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
 
     def _workers(self) -> ThreadPoolExecutor:
@@ -257,7 +258,7 @@ def _match_brightness(
 
 
 def _local_mean(image: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "r c"]:
-    """Over about an eighth of the long edge, at an eighth of the resolution."""
+    """Mean over about an eighth of the long edge, at an eighth of the resolution."""
     size = (max(image.shape[1] // 8, 1), max(image.shape[0] // 8, 1))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return cv2.GaussianBlur(small, (0, 0), max(size) / 16)

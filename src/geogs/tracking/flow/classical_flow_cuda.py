@@ -151,7 +151,7 @@ class CudaClassicalFlow:
             start = None
         else:
             start = (forward.float().contiguous(), backward.float().contiguous())
-        fine = fine or max(self._layout.width, self._layout.height) <= SMALL_IMAGE
+        fine = fine or self.grid.camera.long_edge <= SMALL_IMAGE
         parts = []
         for at in range(0, len(first), PAIRS_AT_ONCE):
             part = slice(at, at + PAIRS_AT_ONCE)

@@ -16,13 +16,14 @@ What the network speaks is translated here.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.gpu.transfer import to_device, upload
-from geogs.tracking.flow.cell_texture import cell_structure, grey_levels
+from geogs.tracking.flow.cell_texture import cell_structure
 from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
     CORRELATION_SCALE,
@@ -67,11 +68,11 @@ class DroidImage:
     """An image as the operator keeps it, on the device; half precision on a GPU."""
 
     features: Float[Tensor, "c h w"]
-    """What it is matched by."""
+    """Matching features."""
     hidden: Float[Tensor, "c h w"]
-    """What an edge from this image starts with."""
+    """Hidden state that an edge from this image starts with."""
     static: Float[Tensor, "c h w"]
-    """What its updates see of the image."""
+    """Static context, which every update sees."""
     grey: UInt8[Tensor, "y x"]
     texture: float
     """Fraction of the cells with structure."""
@@ -79,20 +80,11 @@ class DroidImage:
 
 @dataclass(frozen=True)
 class DroidMemory:
-    """What is kept of a directed edge."""
+    """State of a directed edge."""
 
     hidden: Float[Tensor, "c h w"]
     target: Float[Tensor, "h w 2"]
-    """Where the network last thought its cells to be, in cells."""
-
-
-@dataclass(frozen=True)
-class _Revised:
-    """Directed edges after their updates."""
-
-    hidden: Float[Tensor, "d c h w"]
-    target: Float[Tensor, "d h w 2"]
-    weight: Float[Tensor, "d h w 2"]
+    """Last positions that the network found, in cells."""
 
 
 class DroidFlow:
@@ -112,7 +104,7 @@ class DroidFlow:
             shown = self._shown(image)
             features = self.network.features(shown)
             hidden, static = self.network.context(shown)
-        grey = grey_levels(image)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         kept = upload(grey, self.device)
         return DroidImage(
             features[0], hidden[0], static[0], kept, cell_structure(grey).textured_fraction
@@ -148,13 +140,18 @@ class DroidFlow:
         for begin in range(0, len(source), self.options.edges_at_once):
             c = slice(begin, begin + self.options.edges_at_once)
             parts.append(self._revise(source[c], target[c], start[c], before[c], updates))
-        edges = _Revised(
-            torch.cat([p.hidden for p in parts]),
-            torch.cat([p.target for p in parts]),
-            torch.cat([p.weight for p in parts]),
+        hidden, position, confidence = (torch.cat(p) for p in zip(*parts, strict=True))
+        pixels, weight = self._weighed(position, confidence)
+        damping = self._damping(source, hidden)
+        # Copies, so that one edge that is kept does not keep all.
+        kept = tuple(
+            DroidMemory(h.clone(), p.clone()) for h, p in zip(hidden, position, strict=True)
         )
-        match = self._match(edges, self._damping(source, edges.hidden))
-        return _some(match, slice(None, len(first))), _some(match, slice(len(first), None))
+        there, back = (
+            FlowMatch(pixels[way], weight[way], damping[way], kept[way])
+            for way in (slice(None, len(first)), slice(len(first), None))
+        )
+        return there, back
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.float16, enabled=self.grid.on_gpu)
@@ -171,8 +168,11 @@ class DroidFlow:
         start: Float[Tensor, "d p 2"],
         before: Sequence[DroidMemory | None],
         updates: int,
-    ) -> _Revised:
-        """Run the updates of some directed edges from the positions ``start``, in pixels."""
+    ) -> tuple[Float[Tensor, "d c h w"], Float[Tensor, "d h w 2"], Float[Tensor, "d h w 2"]]:
+        """Run the updates of some directed edges from the positions ``start``, in pixels.
+
+        Returns their hidden states, positions in cells and confidence of these.
+        """
         shape = (len(source), self.grid.height, self.grid.width, 2)
         position = (start.reshape(shape) - OFFSET) / STRIDE
         # Points close to or behind the second camera can be anywhere.
@@ -186,7 +186,8 @@ class DroidFlow:
         static = torch.stack([s.static for s in source])
         weight = torch.zeros_like(position)
         with self._precision():
-            lookup = self._lookup(source, target)
+            a, b = (torch.stack([image.features for image in x]) for x in (source, target))
+            lookup = CorrelationVolume(a, b, LEVELS, RADIUS, CORRELATION_SCALE)
             for _ in range(updates):
                 out = self.network.update(
                     hidden, static, lookup(position), motion_features(position, last)
@@ -194,13 +195,7 @@ class DroidFlow:
                 hidden, weight = out.hidden, out.weight.permute(0, 2, 3, 1).float()
                 # The best guess of where the adjustment would move the reprojection to.
                 position = last = position + out.delta.permute(0, 2, 3, 1).float()
-        return _Revised(hidden, position, weight)
-
-    def _lookup(
-        self, source: Sequence[DroidImage], target: Sequence[DroidImage]
-    ) -> CorrelationVolume:
-        first, second = (torch.stack([image.features for image in x]) for x in (source, target))
-        return CorrelationVolume(first, second, LEVELS, RADIUS, CORRELATION_SCALE)
+        return hidden, position, weight
 
     def _damping(
         self, source: Sequence[DroidImage], hidden: Float[Tensor, "d c h w"]
@@ -214,22 +209,11 @@ class DroidFlow:
         factor = STRIDE**2 / (WEIGHT_SCALE * self.options.deviation**2)
         return factor * (DAMPING_FACTOR * eta.flatten(1) + DAMPING_FLOOR)[index]
 
-    def _match(self, edges: _Revised, damping: Float[Tensor, "d p"]) -> FlowMatch:
-        pixels = (OFFSET + STRIDE * edges.target).flatten(1, 2)
-        confidence = edges.weight.flatten(1, 2)
+    def _weighed(
+        self, position: Float[Tensor, "d h w 2"], confidence: Float[Tensor, "d h w 2"]
+    ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
+        """Pixels of positions in cells, and their inverse variances; zero where none is found."""
+        pixels = (OFFSET + STRIDE * position).flatten(1, 2)
+        confidence = confidence.flatten(1, 2)
         found = (confidence.mean(-1) > self.options.min_confidence) & self.grid.inside(pixels, 0.0)
-        weight = confidence * found[..., None] / self.options.deviation**2
-        # Copies, so that one edge that is kept does not keep all.
-        memory = tuple(
-            DroidMemory(h.clone(), t.clone())
-            for h, t in zip(edges.hidden, edges.target, strict=True)
-        )
-        return FlowMatch(pixels, weight, damping, memory)
-
-
-def _some(match: FlowMatch, edges: slice) -> FlowMatch:
-    assert match.damping is not None
-    assert match.memory is not None
-    return FlowMatch(
-        match.pixels[edges], match.weight[edges], match.damping[edges], match.memory[edges]
-    )
+        return pixels, confidence * found[..., None] / self.options.deviation**2

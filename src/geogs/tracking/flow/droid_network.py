@@ -29,32 +29,12 @@ MOTION_LIMIT = 64.0
 """Cells at which the motion that is shown to the network is cut off."""
 DAMPING_SCALE = 0.01
 """Factor on the softplus that gives the damping."""
-UPSAMPLING = 8
-"""Edge of a cell in pixels."""
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Red, green and blue of the images that the public encoders were trained on, in [0, 1]."""
 TRIMMED = tuple(
     f"update.{head}.2.{kind}" for head in ("weight", "delta") for kind in ("weight", "bias")
 )
 """Parameters of which the public weights hold more outputs than the first two that are used."""
-
-
-@dataclass(frozen=True)
-class DroidSize:
-    """Width of the network; the default is that of the public weights."""
-
-    base: int = 32
-    """Channels of the encoders at half resolution."""
-
-    @property
-    def features(self) -> int:
-        """Channels of matching features, of the hidden state and of the static context."""
-        return 4 * self.base
-
-    @property
-    def motion(self) -> int:
-        """Channels of the encoded motion."""
-        return 2 * self.base
 
 
 def on_cells(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h8 w8"]:
@@ -155,7 +135,7 @@ class GraphAggregation(nn.Module):
         self.conv1 = nn.Conv2d(hidden, hidden, 3, 1, 1)
         self.conv2 = nn.Conv2d(hidden, hidden, 3, 1, 1)
         self.eta = nn.Sequential(nn.Conv2d(hidden, 1, 3, 1, 1), nn.Softplus())
-        self.upmask = nn.Sequential(nn.Conv2d(hidden, 9 * UPSAMPLING**2, 1))
+        self.upmask = nn.Sequential(nn.Conv2d(hidden, 9 * STRIDE**2, 1))
 
     def forward(
         self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]
@@ -176,7 +156,7 @@ class EdgeOutput:
 
     hidden: Float[Tensor, "e c h w"]
     delta: Float[Tensor, "e 2 h w"]
-    """What is to be added to the position that was looked up, in cells."""
+    """Correction of the position that was looked up, in cells."""
     weight: Float[Tensor, "e 2 h w"]
     """Confidence of x and y in (0, 1)."""
 
@@ -184,9 +164,9 @@ class EdgeOutput:
 class UpdateOperator(nn.Module):
     """The recurrent part: revises the flow of an edge from what lies around its present target."""
 
-    def __init__(self, size: DroidSize) -> None:
+    def __init__(self, hidden: int, motion: int) -> None:
+        """Channels of the hidden state, and of the encoded motion."""
         super().__init__()
-        hidden, motion = size.features, size.motion
         self.corr_encoder = nn.Sequential(
             nn.Conv2d(LOOKUP, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 3, 1, 1), nn.ReLU()
         )
@@ -219,16 +199,16 @@ class UpdateOperator(nn.Module):
 class DroidNetwork(nn.Module):
     """All parts, with the parameters of the public weights."""
 
-    def __init__(self, size: DroidSize | None = None) -> None:
+    def __init__(self, base: int = 32) -> None:
+        """``base`` channels of the encoders at half resolution: 32 in the public weights."""
         super().__init__()
-        self.size = size or DroidSize()
-        features = self.size.features
-        self.fnet = DroidEncoder(self.size.base, features, norm=True)
-        self.cnet = DroidEncoder(self.size.base, 2 * features, norm=False)
-        self.update = UpdateOperator(self.size)
+        features = 4 * base  # of matching, of the hidden state and of the static context
+        self.fnet = DroidEncoder(base, features, norm=True)
+        self.cnet = DroidEncoder(base, 2 * features, norm=False)
+        self.update = UpdateOperator(features, 2 * base)
 
     def features(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
-        """What images are matched by; RGB in [0, 1], sides divisible by 8."""
+        """Matching features of images; RGB in [0, 1], sides divisible by 8."""
         return self.fnet(normalised(images))
 
     def context(

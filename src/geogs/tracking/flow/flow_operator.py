@@ -1,4 +1,4 @@
-"""What the tracker asks of a flow operator."""
+"""The interface of flow operators."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable

@@ -45,16 +45,6 @@ class DescriptorPyramid:
     descriptors: Float[Tensor, "n q c"]
     levels: tuple[PyramidLevel, ...]
 
-    @property
-    def table(self) -> Int[np.ndarray, "l 3"]:
-        """Offset, width and height of each level, int32."""
-        return _table(self.levels)
-
-    @property
-    def scales(self) -> Float[np.ndarray, "l 2"]:
-        """Factor and shift of each level, float32."""
-        return _scales(self.levels)
-
 
 @dataclass(frozen=True)
 class Edges:
@@ -96,7 +86,8 @@ def correlation_windows_reference(
     offsets = torch.stack([du, dv], -1).reshape(-1, 2)
     mine = source[edges.first.long()]
     out = []
-    for (offset, width, height), level in zip(pyramid.table.tolist(), pyramid.levels, strict=True):
+    table, _ = level_tables(pyramid.levels)
+    for (offset, width, height), level in zip(table.tolist(), pyramid.levels, strict=True):
         field = pyramid.descriptors[edges.second.long(), offset : offset + width * height]
         image = field.mT.reshape(len(field), -1, height, width)
         points = (centres * level.scale + level.shift)[:, :, None] + offsets
@@ -113,7 +104,8 @@ def _compiled_windows(
     from geogs.tracking.flow.lookup_kernels import lookup_windows
 
     mine, theirs = (x.float().numpy() for x in (source, pyramid.descriptors))
-    points, table, scales = centres.float().contiguous().numpy(), pyramid.table, pyramid.scales
+    points = centres.float().contiguous().numpy()
+    table, scales = level_tables(pyramid.levels)
     out = np.empty((*points.shape[:2], len(table), WINDOW), np.float32)
     norm = np.float32(source.shape[-1] ** -0.5)
 
@@ -121,7 +113,7 @@ def _compiled_windows(
         i, j = int(edges.first[e]), int(edges.second[e])
         lookup_windows(mine[i], theirs[j], points[e], table, scales, norm, out[e])
 
-    list(thread_map(work, range(len(points))))
+    thread_map(work, range(len(points)))
     return torch.from_numpy(out).flatten(2)
 
 
@@ -139,7 +131,7 @@ class _CudaWindows(torch.autograd.Function):
     ) -> Tensor:
         mine, theirs = (_pairs(x) for x in (source, descriptors))
         device = centres.device
-        table, scales = _tables(pyramid.levels, device)
+        table, scales = _tables_on(device, pyramid.levels)
         points = centres.float().contiguous()
         count, cells = points.shape[:2]
         levels = len(pyramid.levels)
@@ -165,22 +157,21 @@ class _CudaWindows(torch.autograd.Function):
         return own, other, None, None, None
 
 
-def _table(levels: tuple[PyramidLevel, ...]) -> Int[np.ndarray, "l 3"]:
+def level_tables(
+    levels: tuple[PyramidLevel, ...],
+) -> tuple[Int[np.ndarray, "l 3"], Float[np.ndarray, "l 2"]]:
+    """Offset, width and height of each level, int32; its factor and shift, float32."""
     sizes = [level.width * level.height for level in levels]
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     rows = [(o, v.width, v.height) for o, v in zip(offsets, levels, strict=True)]
-    return np.array(rows, np.int32)
-
-
-def _scales(levels: tuple[PyramidLevel, ...]) -> Float[np.ndarray, "l 2"]:
-    return np.array([(level.scale, level.shift) for level in levels], np.float32)
+    scales = [(level.scale, level.shift) for level in levels]
+    return np.array(rows, np.int32), np.array(scales, np.float32)
 
 
 @lru_cache(maxsize=8)
-def _tables(levels: tuple[PyramidLevel, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Table and scales of a pyramid on a device, copied there once."""
-    parts = (torch.from_numpy(part).to(device) for part in (_table(levels), _scales(levels)))
-    table, scales = parts
+def _tables_on(device: torch.device, levels: tuple[PyramidLevel, ...]) -> tuple[Tensor, Tensor]:
+    """The same on a device, copied there once."""
+    table, scales = (torch.from_numpy(part).to(device) for part in level_tables(levels))
     return table, scales
 
 

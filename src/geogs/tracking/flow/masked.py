@@ -23,7 +23,7 @@ def valid_pixels(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 
 @dataclass(frozen=True, eq=False)
 class ValidMask:
-    """What of an image may be matched; 1 and 0, on the device of the grid."""
+    """Valid mask of an image; 1 and 0, on the device of the grid."""
 
     pixels: Float[Tensor, "h w"]
     """Without what is nearer than a cell to pixels masked out: operators match patches."""
@@ -74,16 +74,16 @@ class MaskedFlow:
             raise InputError("The mask hides the whole image; it is bright where the scene is.")
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> MaskedImage:
-        """As the operator's, with what is valid."""
+        """The operator's form of an image, with what is valid."""
         valid = self.fixed or self._valid(valid_pixels(image))
         return MaskedImage(self._operator.encode(image), valid)
 
     def texture(self, encoded: MaskedImage) -> float:
-        """As the operator's, at most the fraction of cells that are valid."""
+        """The operator's, at most the fraction of cells that are valid."""
         return min(self._operator.texture(encoded.encoded), encoded.valid.fraction)
 
     def grey(self, encoded: MaskedImage) -> Float[Tensor, "h w"]:
-        """As the operator's."""
+        """The operator's."""
         return self._operator.grey(encoded.encoded)
 
     def measure(
@@ -95,7 +95,7 @@ class MaskedFlow:
         fine: bool = True,
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
-        """As the operator's, without what is masked out."""
+        """The operator's matches, without what is masked out."""
         a, b = ([image.encoded for image in side] for side in (first, second))
         there, back = self._operator.measure(a, b, forward, backward, fine, memory)
         return self._masked(there, first, second), self._masked(back, second, first)

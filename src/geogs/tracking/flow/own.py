@@ -27,15 +27,15 @@ class OwnFlowOptions:
     """How the network is run."""
 
     warm_iterations: int = 4
-    """From a start that is right to a few pixels."""
+    """Iterations from a start that is right to a few pixels."""
     coarse_iterations: int = 3
     """The same where a cheaper measurement will do."""
     cold_iterations: int = 8
-    """From what the classical operator finds where nothing is known."""
+    """Iterations from what the classical operator finds where nothing is known."""
     min_probability: float = 0.5
     """A cell that is matched with less probability has no weight."""
     max_deviation: float = 2.0
-    """Nor has one whose flow may be off by more pixels."""
+    """A cell whose flow may be off by more pixels has none, either."""
     max_correction: float = 6.0
     """Pixels by which a cell may move away from a warm start more than the median cell does; a
     jump of one period of a pattern that repeats is larger."""
@@ -60,7 +60,7 @@ class OwnImage:
     features: FlowFeatures
     """Features of one image."""
     classical: Any
-    """What the classical operator keeps of it."""
+    """The classical operator's form of it."""
 
 
 class OwnFlow:
@@ -103,7 +103,7 @@ class OwnFlow:
         return OwnImage(features, self.classical.encode(image))
 
     def _features(self, pixels: UInt8[Tensor, "h w 3"]) -> Maps:
-        """What the network keeps of an image."""
+        """Features of an image."""
         with self._autocast():
             found = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
         self._levels = found.pyramid.levels
@@ -157,7 +157,7 @@ class OwnFlow:
         return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
 
     def _refinement(self, iterations: int, is_warm: bool, is_recorded: bool) -> Callable[..., Maps]:
-        """What takes some edges from their start to positions and weights.
+        """The function from some edges' starts to their positions and weights.
 
         Its arguments are the features of images but for the levels, the two images of each edge,
         and the start of each.
@@ -179,8 +179,8 @@ class OwnFlow:
         self, first: Sequence[OwnImage], second: Sequence[OwnImage]
     ) -> Float[Tensor, "d p 2"]:
         """The classical flow of both directions, its gaps filled; no motion where it has none."""
-        sides = [[i.classical for i in side] for side in (first, second)]
-        matches = self.classical.measure(sides[0], sides[1], fine=False)
+        a, b = ([i.classical for i in side] for side in (first, second))
+        matches = self.classical.measure(a, b, fine=False)
         starts = []
         for match in matches:
             for pixels, weight in zip(match.pixels, match.weight, strict=True):
@@ -200,12 +200,11 @@ class OwnFlow:
     ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
         """The network's flow joined with the classical flow that begins there.
 
-        From a cold start what the classical flow does not bear out has no weight: where neither
-        knows the motion, as in front of a car, the network is as sure of what is merely alike.
+        From a cold start what the classical flow does not confirm has no weight: where neither
+        knows the motion, as in front of a car, the network is confident of what is merely alike.
         """
-        sides = [[i.classical for i in side] for side in (first, second)]
-        n = len(first)
-        matches = self.classical.measure(sides[0], sides[1], pixels[:n], pixels[n:], fine)
+        a, b = ([i.classical for i in side] for side in (first, second))
+        matches = self.classical.measure(a, b, pixels[: len(a)], pixels[len(a) :], fine)
         theirs = torch.cat([m.pixels for m in matches])
         certain = torch.cat([m.weight for m in matches])
         both = ((weight > 0) & (certain > 0)).all(-1, keepdim=True)

@@ -35,7 +35,7 @@ MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
 
 @dataclass(frozen=True)
 class FlowFeatures:
-    """What the network keeps of images; cells are those of the sample grid."""
+    """Features of images; cells are those of the sample grid."""
 
     source: Float[Tensor, "n p c"]
     """Descriptors of the cells."""
@@ -62,7 +62,7 @@ class LaplaceMixture:
         return 2 * (p * (2 * self.log_scale).exp() + (1 - p) * (2 * self.log_outlier).exp())
 
     def weight(self, floor: float) -> Float[Tensor, "e p 2"]:
-        """What a flow counts in an adjustment, 1 / pixel^2: the probability that the cell is
+        """Weight of a flow in an adjustment, 1 / pixel^2: the probability that the cell is
         matched, over the variance that it then has; ``floor`` is a deviation in pixels."""
         return self.logit.sigmoid() / (2 * (2 * self.log_scale).exp() + floor**2)
 
@@ -77,7 +77,7 @@ class LaplaceMixture:
 
 @dataclass(frozen=True)
 class FlowEstimate:
-    """What an iteration says."""
+    """Flow after one iteration."""
 
     pixels: Float[Tensor, "e p 2"]
     """Positions of the cells in the second image."""

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32
 class StartFlow:
     """An interpolant of flow on a grid of at least two by two cells.
 
-    ``f(u, v) = linear - a (1 - a) / 2 X - b (1 - b) / 2 Y``, a and b being the shares of the way
+    ``f(u, v) = linear - a (1 - a) / 2 X - b (1 - b) / 2 Y``, a and b being the fractions of the way
     from one cell to the next along u and v. X and Y are second differences along the two, each the
     smaller one of the cells at both ends, none if their signs differ (minmod): what is quadratic
     along either axis is exact, and a step never overshoots. Source: the limited reconstructions of
@@ -28,7 +28,7 @@ class StartFlow:
         self._bend_u, self._bend_v = _limited_bend(self._flow, 1), _limited_bend(self._flow, 0)
 
     def on(self, lattice: "Lattice") -> Float32[np.ndarray, "h w 2"]:
-        """At all places of a lattice that is made for such a grid."""
+        """Flow at all points of a lattice that is made for such a grid."""
         x, height = lattice, len(lattice.u)
         found = bilinear(self._flow, x.u, x.v)
         # Both numbers of a row behind each other: NumPy is slow on axes of two.
@@ -38,7 +38,7 @@ class StartFlow:
         return found
 
     def at(self, points: Float[np.ndarray, "p 2"]) -> Float32[np.ndarray, "p 2"]:
-        """At some points, in cells. The border is repeated."""
+        """Flow at some points, in cells. The border is repeated."""
         rows, columns = self._flow.shape[:2]
         i, a = _cells(points[:, 0].astype(np.float32), columns)
         j, b = _cells(points[:, 1].astype(np.float32), rows)
@@ -66,16 +66,16 @@ class Lattice:
     ) -> None:
         """Places are multiples of 1/32, to which OpenCV rounds; the grid has so many cells."""
         self.u, self.v = np.meshgrid(u, v)
-        cell, share = _cells(u, columns)
+        cell, fraction = _cells(u, columns)
         self.cell_u = np.meshgrid(cell, v)[0]
-        self.factor_u = (0.5 * share * (1 - share)).repeat(2)
-        cell, share = _cells(v, rows)
+        self.factor_u = (0.5 * fraction * (1 - fraction)).repeat(2)
+        cell, fraction = _cells(v, rows)
         self.cell_v = np.meshgrid(u, cell)[1]
-        self.factor_v = (0.5 * share * (1 - share))[:, None]
+        self.factor_v = (0.5 * fraction * (1 - fraction))[:, None]
 
 
 def _cells(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The cell before each place, and the share of the way to the next."""
+    """The cell before each point, and the fraction of the way to the next."""
     x = np.clip(x, 0, count - 1)
     cell = np.minimum(np.floor(x), count - 2)
     return cell, x - cell

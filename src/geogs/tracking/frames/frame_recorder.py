@@ -151,10 +151,10 @@ class FrameRecorder:
         self._observe([(record, anchor)], match)
 
     def place_found(self, found: FoundFrames, others: Sequence["FrameRecorder"]) -> None:
-        """Say where frames are that were found beside those that had a place.
+        """Place frames that were found after the stream, beside those that tracking placed.
 
-        Each hangs on the keyframe nearest in time, with nothing to be solved by; frames in the logs
-        of ``others`` are taken over.
+        Each is relative to the keyframe nearest in time, with nothing to be solved by; frames in
+        the logs of ``others`` are taken over.
         """
         poses = dict(zip(found.numbers, torch.from_numpy(found.T_cw), strict=True))
         for other in others:

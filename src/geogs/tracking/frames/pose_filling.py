@@ -65,7 +65,7 @@ def solved_poses(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, Float[Te
 
 
 def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
-    """What rectified rows are off by at the present state; none where there are none."""
+    """Errors of rectified rows at the present state; none where no rows are rectified."""
     if not frames.rows:
         return None
     indices = sorted(record.index for record in frames.records)
@@ -75,8 +75,8 @@ def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
 def rows_in_doubt(
     frames: FrameLog, keyframes: KeyframeSet, known: RowErrors | None = None
 ) -> RowErrors | None:
-    """The same (``known`` where they were solved already) where their readout is not known for
-    sure, and where they were not rectified as it is not known at all; none where it was told."""
+    """The same (``known`` where they were solved already) where the readout has an error, or is not
+    known at all, so that rows were not rectified; none where it was given."""
     if frames.open_rows is None:
         errors = known or row_errors(frames, keyframes)
     else:
@@ -150,7 +150,7 @@ def observed(
 
 
 def _problem(records: Sequence[FrameRecord], keyframes: KeyframeSet) -> MotionProblem:
-    """Frames and all their observations; a match is as sure as the depth of its cell, too."""
+    """Frames and all their observations, weighted by the depths of their cells, too."""
     grid = keyframes.grid
     cells = sparse_cells(grid)
     pairs = [

@@ -2,7 +2,6 @@
 
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -47,7 +46,8 @@ def orientations(
     moved = set(free)
     used = [link for link in links if link[0] in found and not moved.isdisjoint(link[:2])]
     if free:
-        found = minimise(found, partial(_linearised, free, used), _stepped, Policy(ROUNDS)).state
+        problem = partial(_linearised, free, used), partial(_stepped, free)
+        found = minimise(found, *problem, Policy(ROUNDS)).state
     return {n: R for n, R in found.items() if n not in known}
 
 
@@ -76,20 +76,10 @@ def _followed(
     return found
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """Links at some rotations."""
-
-    free: list[int]
-    jacobian: "csc_matrix"
-    """Three rows for each link by the steps of the free rotations, each moved from the left."""
-    error: Float64[np.ndarray, "n"]
-
-
 def _linearised(
     free: list[int], links: list[tuple[int, int, Tensor, float]], found: dict[int, Tensor]
-) -> _Linear:
-    """What links say of the free rotations.
+) -> tuple["csc_matrix", Float64[np.ndarray, "n"]]:
+    """Jacobian of the links by the steps of the free rotations, moved from the left, and errors.
 
     With ``R_b R_a^T`` for the rotation R of b relative to a, the error is
     ``log(R (R_b R_a^T)^T)``; to first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
@@ -103,27 +93,28 @@ def _linearised(
     precision = 1 / torch.tensor([link[3] for link in links], dtype=torch.float64)
     relative = second @ first.mT
     error = precision[:, None] * so3_log(measured @ relative.mT)
-    rows: list[np.ndarray] = []
-    columns: list[np.ndarray] = []
-    values: list[np.ndarray] = []
-    at = np.arange(3)
-    for k, (a, b, _, _) in enumerate(links):
-        for n, block in ((b, torch.eye(3, dtype=torch.float64)), (a, -relative[k])):
-            if n in column:
-                rows.append(np.repeat(3 * k + at, 3))
-                columns.append(np.tile(column[n] + at, 3))
-                values.append((precision[k] * block).numpy().ravel())
+    blocks = torch.stack([torch.eye(3).to(relative).expand_as(relative), -relative], 1)
+    values = (precision[:, None, None, None] * blocks).numpy()
+    ends = np.array([[column.get(b, -1), column.get(a, -1)] for a, b, _, _ in links])
+    link, end = np.nonzero(ends >= 0)
+    rows, columns = np.broadcast_arrays(
+        3 * link[:, None, None] + np.arange(3)[:, None], ends[link, end, None, None] + np.arange(3)
+    )
+    at = rows.ravel(), columns.ravel()
     shape = (3 * len(links), 3 * len(free))
-    J = coo_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
-    ).tocsc()
-    return _Linear(free, J, error.numpy().ravel())
+    J = coo_matrix((values[link, end].ravel(), at), shape).tocsc()
+    return J, error.numpy().ravel()
 
 
-def _stepped(found: dict[int, Tensor], linear: _Linear, damping: float) -> Step[dict[int, Tensor]]:
+def _stepped(
+    free: list[int],
+    found: dict[int, Tensor],
+    linear: tuple["csc_matrix", Float64[np.ndarray, "n"]],
+    damping: float,
+) -> Step[dict[int, Tensor]]:
     from scipy.sparse.linalg import spsolve
 
-    J = linear.jacobian
-    step = spsolve((J.T @ J).tocsc(), J.T @ linear.error)
+    J, error = linear
+    step = spsolve((J.T @ J).tocsc(), J.T @ error)
     moves = so3_exp(torch.from_numpy(step).reshape(-1, 3))
-    return Step(found | {n: move @ found[n] for n, move in zip(linear.free, moves, strict=True)})
+    return Step(found | {n: move @ found[n] for n, move in zip(free, moves, strict=True)})

@@ -1,4 +1,4 @@
-"""What rectified rows are still off by, once the trajectory and the depths are known.
+"""Errors of rectified rows, once the trajectory and the depths are known.
 
 Rows are rectified before anything is matched, by the motion that the flow between neighbouring
 images tells. The trajectory of all frames tells it better: a point of a frame is seen at the time
@@ -30,7 +30,7 @@ LONGEST_INTERVAL = 0.07
 """Seconds between two frames; over more, their poses say less of the rows than the video does."""
 TOGETHER = 64, 512
 """Edges, or frames, that are looked at together, on the CPU and on a GPU; bounds memory."""
-LARGEST = 0.01
+MAX_SHIFT = 0.01
 """Fraction of the long edge; an error that seems larger is none of the rows."""
 
 T = TypeVar("T")
@@ -52,7 +52,7 @@ class _RectifiedFrame:
     times: Float[Tensor, "5"]
     """Seconds of the nodes, from the frame."""
     motions: Float[Tensor, "5 4 4"]
-    """From the camera at the frame to the camera at its nodes."""
+    """Motions from the camera at the frame to the camera at its nodes."""
 
 
 class RowErrors:
@@ -84,7 +84,7 @@ class RowErrors:
                 )
 
     def merged(self, other: "RowErrors") -> "RowErrors":
-        """Those of the frames of both, of one camera and one unit; their numbers differ."""
+        """Errors of the frames of both, of one camera and one unit; their numbers differ."""
         both = copy.copy(self)
         both._T_cw = self._T_cw | other._T_cw
         both._rectified = self._rectified | other._rectified
@@ -103,10 +103,9 @@ class RowErrors:
 
     def with_twists(self, frames: Sequence[int], twists: Float64[Tensor, "n 6"]) -> "RowErrors":
         """The same, the camera moving by so much more per second while it reads these frames."""
-        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        known, own = self._known(frames)
         other = copy.copy(self)
         if known:
-            own = [self._rectified[frames[n]] for n in known]
             times = torch.stack([f.times for f in own]).double()
             more = se3_exp(times[..., None] * twists[known][:, None]).float()
             moved = more @ torch.stack([f.motions for f in own])
@@ -115,38 +114,42 @@ class RowErrors:
             }
         return other
 
-    def twist_doubts(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
+    def twist_deviations(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
         """Deviations of the twists of frames, as the poses around tell them: how far the slope of
         the polynomial through all of them is from that through the nearest three, in either half.
 
         Zero for frames without rows. Source: embedded formulas of numerical differentiation.
         """
-        doubts = torch.zeros(len(frames), 6, dtype=torch.float64)
-        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        deviations = torch.zeros(len(frames), 6, dtype=torch.float64)
+        known, own = self._known(frames)
         if known:
-            own = [self._rectified[frames[n]] for n in known]
             times = torch.stack([f.times for f in own]).double()
             moved = se3_log(torch.stack([f.motions for f in own]).double())
             nearest = times.abs().argsort(1)[:, :3]
             by_three = slope_at_zero(
                 times.gather(1, nearest), moved.gather(1, nearest[..., None].expand(-1, -1, 6))
             )
-            apart = (slope_at_zero(times, moved) - by_three).reshape(-1, 2, 3).norm(dim=2)
-            doubts[known] = apart.repeat_interleave(3, 1)
-        return doubts
+            off = (slope_at_zero(times, moved) - by_three).reshape(-1, 2, 3).norm(dim=2)
+            deviations[known] = off.repeat_interleave(3, 1)
+        return deviations
 
     def seconds(
         self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e p"]:
-        """When pixels of frames were seen, from the middle row; zero of frames without rows."""
+        """Times of pixels of frames, from the middle row; zero for frames without rows."""
         found = torch.zeros_like(pixels[..., 0])
-        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        known, own = self._known(frames)
         if known:
-            rows = [self._rectified[frames[n]].rows for n in known]
             at = torch.tensor(known, device=pixels.device)
-            _, when = seen_rows(rows, torch.arange(len(known), device=pixels.device), pixels[at])
+            which = torch.arange(len(known), device=pixels.device)
+            _, when = seen_rows([f.rows for f in own], which, pixels[at])
             found[at] = self._factor * when
         return found
+
+    def _known(self, frames: Sequence[int]) -> tuple[list[int], list[_RectifiedFrame]]:
+        """Positions of the frames with rows among some, and what is known of each."""
+        known = [n for n, frame in enumerate(frames) if frame in self._rectified]
+        return known, [self._rectified[frames[n]] for n in known]
 
     def poses(self, frames: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera of frames in the trajectory, float64."""
@@ -161,7 +164,7 @@ class RowErrors:
         inverse_depth: Float[Tensor, "e p"],
         pixels: Float[Tensor, "e p 2"],
     ) -> RowShifts:
-        """What is to be added to where cells were found, as if the rows of both frames were right.
+        """Shifts of matches to where they would be if the rows of both frames were right.
 
         What a cell of the source shows lies next to it, and what was found in the target, too; the
         former is propagated to the target at the cell's own depth. Zero where the sum cannot be
@@ -184,7 +187,7 @@ class RowErrors:
         shift, slope = (
             t - carried_over(camera, T_ji, p, h) for t, h in zip(there, here, strict=True)
         )
-        believed = p.valid & (shift.norm(dim=-1) < LARGEST * camera.long_edge)
+        believed = p.valid & (shift.norm(dim=-1) < MAX_SHIFT * camera.long_edge)
         return RowShifts(*(torch.where(believed[..., None], x, 0.0) for x in (shift, slope)))
 
     def of_pixels(
@@ -193,7 +196,7 @@ class RowErrors:
         pixels: Float[Tensor, "e p 2"],
         inverse_depth: Float[Tensor, "e p"],
     ) -> RowShifts:
-        """By how much what pixels of frames show lies next to them at the middle row's time.
+        """Shifts from pixels of frames to where what they show lies at the middle row's time.
 
         The camera saw it in another position and at another time; by the poses around, the pixel's
         own point was elsewhere then. The difference is what the pixel shows instead, to first
@@ -288,7 +291,7 @@ def edge_shifts(
 
 
 def in_parts(items: list[T], on_gpu: bool) -> Iterator[list[T]]:
-    """As many of them in turn as are looked at together."""
+    """Parts of as many items as are looked at together."""
     size = TOGETHER[on_gpu]
     for start in range(0, len(items), size):
         yield items[start : start + size]
@@ -300,8 +303,8 @@ def lagrange(
     """Weights of the values at ``times`` in that of the polynomial through them, one after the
     other, and how each changes with ``at``."""
     off = [at - time[:, None] for time in times.unbind(1)]
-    apart = times[:, :, None] - times[:, None]
-    scale = (1 / (apart + torch.eye(NODES).to(apart)).prod(-1)).unbind(1)
+    spans = times[:, :, None] - times[:, None]
+    scale = (1 / (spans + torch.eye(NODES).to(spans)).prod(-1)).unbind(1)
     weights, changes = [], []
     for j in range(NODES):
         a, b, c, d = (off[other] for other in range(NODES) if other != j)
@@ -321,12 +324,10 @@ def slope_at_zero(
 
 def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
     """The frames around each whose poses are used; none where too few are known in a row."""
-    n = len(trajectory.timestamps)
-    linked = (np.diff(trajectory.timestamps) <= LONGEST_INTERVAL) & (
-        np.diff(trajectory.timestamps) > 0
-    )
+    intervals = np.diff(trajectory.timestamps)
+    linked = (intervals <= LONGEST_INTERVAL) & (intervals > 0)
     linked &= trajectory.tracked[1:] & trajectory.tracked[:-1]
-    nodes: list[np.ndarray | None] = [None] * n
+    nodes: list[np.ndarray | None] = [None] * len(trajectory.timestamps)
     ends = np.flatnonzero(np.diff(np.concatenate([[False], linked, [False]]).astype(int)))
     for first, last in ends.reshape(-1, 2):
         if last - first + 1 < NODES:

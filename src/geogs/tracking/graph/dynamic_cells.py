@@ -21,20 +21,20 @@ from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
-LEAST_SCALE = 0.2
-"""Deviations of a match below which the usual residual of an edge is not taken to lie."""
-WORSE = 3.0
-"""Times the usual residual of all edges that of one of them is at most taken to be."""
-MOST = 10.0
-"""Times the usual residual that a single match can speak for motion."""
-STANDING = 0.25
-"""Part of the scene's usual parallax below which a cell keeps its place in the image, as something
-infinitely far would: what moves with the camera does, too, and is not scene again by that."""
-ENOUGH = 0.7
-"""Matches per cell of a surrounding from which it can be decided."""
-FILLED = 0.8
+MIN_RESIDUAL = 0.2
+"""Least usual residual of an edge, in deviations of a match."""
+MAX_EDGE_RATIO = 3.0
+"""Largest usual residual of one edge, in multiples of that of all."""
+MAX_RATIO = 10.0
+"""Multiples of the usual residual that a single match counts as at most."""
+MAX_STANDING_PARALLAX = 0.25
+"""Fraction of the scene's usual parallax below which a cell stands still in the image, as something
+infinitely far would: what moves with the camera does, too, and stays dynamic."""
+MIN_MATCHES = 0.7
+"""Matches per cell, in the mean around one, from which it can be decided."""
+MAX_DYNAMIC = 0.8
 """Fraction of a keyframe's cells beyond which it is the keyframe that does not suit the others."""
-REGION = 0.4
+MIN_DYNAMIC_AROUND = 0.4
 """Fraction of the cells around one that are dynamic, from which it is dynamic itself."""
 EDGES_TOGETHER = 128
 """Directed edges, of some ten keyframes, decided in one go; bounds memory."""
@@ -81,8 +81,8 @@ def update_dynamic(
 
     ``decided`` are all edges of these sources that have a say; where they say too little of a cell,
     it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
-    residual around a cell must be. One that was held for moving and keeps its place in the image
-    (``STANDING``) is held on.
+    residual around a cell must be. One that was dynamic and keeps its place in the image
+    (``MAX_STANDING_PARALLAX``) stays dynamic.
     """
     directed = sorted(decided)
     if not directed:
@@ -90,21 +90,21 @@ def update_dynamic(
     source = torch.tensor([i for i, _ in directed])
     for chunk in source_chunks(source, EDGES_TOGETHER):
         residual, parallax, static = _residuals(keyframes, edges, directed[chunk])
-        ratio = (residual / _usual(residual, static)[:, None]).clamp(max=MOST)
+        ratio = (residual / _usual(residual, static)[:, None]).clamp(max=MAX_RATIO)
         ids, row = source[chunk].unique(return_inverse=True)
         row = row.to(ratio.device)
         total = ratio.new_zeros(len(ids), ratio.shape[1])
         count = total.index_add(0, row, (~ratio.isnan()).to(ratio))
         total = total.index_add(0, row, ratio.nan_to_num(0.0))
-        before = [keyframes[k].moving for k in ids.tolist()]
         none = torch.zeros_like(static[0])
-        held = torch.stack([none if b is None else b for b in before])
+        moving = [keyframes[k].moving for k in ids.tolist()]
+        before = torch.stack([none if cells is None else cells for cells in moving])
         # The median over the static cells of an edge is its usual parallax.
         usual = torch.where(static, parallax, torch.nan).nanmedian(1).values[:, None]
         moved = torch.zeros_like(total).index_add(0, row, (parallax / usual).nan_to_num(0.0))
-        stands = held & (moved < STANDING * count)
-        dynamic = dynamic_cells(keyframes.grid, total, count, held, threshold)
-        border = _mean(keyframes.grid, stands.to(total), 5) >= REGION
+        stands = before & (moved < MAX_STANDING_PARALLAX * count)
+        dynamic = dynamic_cells(keyframes.grid, total, count, before, threshold)
+        border = _mean(keyframes.grid, stands.to(total), 5) >= MIN_DYNAMIC_AROUND
         dynamic |= stands | border
         for n, k in enumerate(ids.tolist()):
             keyframes[k].moving = dynamic[n].clone()
@@ -124,11 +124,11 @@ def dynamic_cells(
     can be decided or nearly all contradict: then the pose is wrong, or the image is.
     """
     near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
-    known = seen >= ENOUGH
+    known = seen >= MIN_MATCHES
     core = (near > threshold * seen) & known
-    is_known = known.any(1, keepdim=True) & (core.sum(1) <= FILLED * known.sum(1))[:, None]
+    is_known = known.any(1, keepdim=True) & (core.sum(1) <= MAX_DYNAMIC * known.sum(1))[:, None]
     filled = grid_fields(grid).fill(core.to(total), known.to(total))
-    return torch.where(is_known, _mean(grid, filled, 5) >= REGION, before)
+    return torch.where(is_known, _mean(grid, filled, 5) >= MIN_DYNAMIC_AROUND, before)
 
 
 def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Tensor, "n p"]:
@@ -183,6 +183,6 @@ def _usual(residual: Float[Tensor, "e p"], static: Bool[Tensor, "e p"]) -> Float
     What moves may fill a keyframe, but not most of those that are decided together.
     """
     usual = torch.where(static, residual, torch.nan).nanmedian(1).values
-    common = usual.nanmedian().nan_to_num(LEAST_SCALE).clamp(min=LEAST_SCALE)
+    common = usual.nanmedian().nan_to_num(MIN_RESIDUAL).clamp(min=MIN_RESIDUAL)
     usual = torch.where(usual.isnan(), common, usual)
-    return torch.minimum(torch.maximum(usual, common), WORSE * common)
+    return torch.minimum(torch.maximum(usual, common), MAX_EDGE_RATIO * common)

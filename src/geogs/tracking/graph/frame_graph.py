@@ -1,6 +1,6 @@
 """The frame graph: which keyframes see each other, and the flow measured between them."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -94,8 +94,6 @@ class FrameGraph:
 
     def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
         """Present positions of the cells of i in j for each directed edge (i, j)."""
-        if not directed:
-            return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
         return keyframe_pairs(self.keyframes, directed).project()
 
     def measure(self, pairs: Iterable[Pair], fine: bool = True, packed: bool = False) -> None:
@@ -156,13 +154,18 @@ class FrameGraph:
         return new + [p for p, m in zip(known, worst.tolist(), strict=True) if m > tolerance]
 
     def _moved(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
-        """Median motion in pixels of the matched cells since they were measured."""
-        return _in_parts(self._moved_together, directed, self.keyframes.grid.on_gpu)
+        """Median motion in pixels of the matched cells since they were measured; some edges at a
+        time, concurrently on the CPU."""
+        grid = self.keyframes.grid
 
-    def _moved_together(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
-        grid, edges = self.keyframes.grid, [self.edges[e] for e in directed]
-        _, weight = edge_matches(grid, edges)
-        return keyframe_pairs(self.keyframes, directed).moved(_reprojections(grid, edges), weight)
+        def moved(part: Sequence[Pair]) -> Float[Tensor, "k"]:
+            edges = [self.edges[e] for e in part]
+            _, weight = edge_matches(grid, edges)
+            return keyframe_pairs(self.keyframes, part).moved(_reprojections(grid, edges), weight)
+
+        size = PAIRS_TOGETHER[grid.on_gpu]
+        parts = [directed[k : k + size] for k in range(0, len(directed), size)]
+        return torch.cat([moved(p) for p in parts] if grid.on_gpu else thread_map(moved, parts))
 
     def problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
@@ -174,7 +177,7 @@ class FrameGraph:
     def streamed_problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
     ) -> tuple[StreamedProblem, list[int]]:
-        """As :meth:`problem`, with the matches left where they are."""
+        """The same as :meth:`problem`, with the matches left where they are."""
         directed = sorted(directed)
         poses, depths = set(free_pose), set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
@@ -257,7 +260,7 @@ class FrameGraph:
 
 
 def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
-    """What depth sensors say of the cells of keyframes; none where there is nothing of any."""
+    """Depths of keyframes' cells by depth sensors; none where no keyframe has any."""
     if all(k.measured is None for k in keyframes):
         return None
     unknown = torch.zeros_like(keyframes[0].inverse_depth)
@@ -279,7 +282,7 @@ def _edge_of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> Me
 
 
 def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
-    """Where the cells fell when the flow of each edge was measured."""
+    """Reprojections of the cells when the flow of each edge was measured."""
     packed = [e for e in edges if isinstance(e, PackedEdge)]
     if packed and len(packed) == len(edges):
         return _packed_reprojections(grid, packed)
@@ -294,17 +297,6 @@ def _packed_reprojections(grid: SampleGrid, edges: Sequence[PackedEdge]) -> Floa
     source, target = (torch.stack([getattr(e, k) for e in edges]) for k in ("T_source", "T_target"))
     depth = torch.stack([e.inverse_depth for e in edges])
     return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
-
-
-def _in_parts(
-    work: Callable[[Sequence[Pair]], Float[Tensor, "k"]], directed: Sequence[Pair], on_gpu: bool
-) -> Float[Tensor, "e"]:
-    """A number for each directed pair; some at a time, side by side on the CPU."""
-    size = PAIRS_TOGETHER[on_gpu]
-    if len(directed) <= size:
-        return work(directed)
-    parts = [directed[k : k + size] for k in range(0, len(directed), size)]
-    return torch.cat([work(p) for p in parts] if on_gpu else thread_map(work, parts))
 
 
 def _frame_damping(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
+from jaxtyping import Float
 
 from geogs.bundle.motion_term import MeasuredMotions
 from geogs.config import OdometryConfig
@@ -36,7 +37,7 @@ class OdometryAgreement:
     """How far measured motions fit those of the images."""
 
     motions: int
-    """That were measured between neighbouring keyframes."""
+    """Number of motions that were measured between neighbouring keyframes."""
     fitting: float
     """Fraction of these that fit within their deviations."""
     used: bool
@@ -44,7 +45,7 @@ class OdometryAgreement:
 
 
 class Odometry:
-    """What another tracker says of the motion between the keyframes of a segment."""
+    """Motions between the keyframes of a segment by another tracker."""
 
     def __init__(
         self, keyframes: KeyframeSet, config: OdometryConfig, found: OdometryScale | None = None
@@ -79,15 +80,13 @@ class Odometry:
         scale = self.found.scale
         if scale is None:
             return None
-        known = [(n, self.keyframes[id]) for n, id in enumerate(ids)]
-        steps = _steps([(n, k) for n, k in known if k.pose is not None])
+        steps, motion = self._measured(ids)
         if not steps:
             return None
-        motion = torch.stack([_measured(a, b) for (_, a), (_, b) in steps])
         information = information_of(motion, self.config)
         information[:, :3] *= scale**2
         motion[:, :3, 3] /= scale
-        source, target = (torch.tensor([pair[k][0] for pair in steps]) for k in (0, 1))
+        source, target = (torch.tensor([pair[k] for pair in steps]) for k in (0, 1))
         return MeasuredMotions(source, target, motion, information)
 
     def since(self, keyframe: Keyframe, pose: MeasuredPose | None) -> torch.Tensor | None:
@@ -99,15 +98,22 @@ class Odometry:
         motion[:3, 3] /= scale
         return motion
 
+    def _measured(
+        self, ids: Sequence[int]
+    ) -> tuple[list[tuple[int, int]], Float[torch.Tensor, "m 4 4"]]:
+        """Neighbours whose poses are of one world, by their places among some keyframes, and the
+        motions from each to the next, metres."""
+        known = [(n, self.keyframes[k].pose) for n, k in enumerate(ids)]
+        poses = [(n, pose) for n, pose in known if pose is not None]
+        steps = [(a, b) for a, b in pairwise(poses) if a[1].world == b[1].world]
+        motions = _stacked([b.T_cw @ se3_inverse(a.T_cw) for (_, a), (_, b) in steps])
+        return [(m, n) for (m, _), (n, _) in steps], motions
+
     def _vote(self, ids: Sequence[int]) -> ScaleVote:
-        known = [(n, self.keyframes[id]) for n, id in enumerate(ids)]
-        steps = _steps([(n, k) for n, k in known if k.pose is not None])
-        empty = torch.zeros(0, 4, 4, dtype=torch.float64)
-        seen = [b.T_cw @ se3_inverse(a.T_cw) for (_, a), (_, b) in steps]
-        measured = [_measured(a, b) for (_, a), (_, b) in steps]
-        if not steps:
-            return vote_on_scale(empty, empty, self.config)
-        return vote_on_scale(torch.stack(seen), torch.stack(measured), self.config)
+        steps, measured = self._measured(ids)
+        T = [self.keyframes[k].T_cw for k in ids]
+        seen = _stacked([T[n] @ se3_inverse(T[m]) for m, n in steps])
+        return vote_on_scale(seen, measured, self.config)
 
     def _take(self, vote: ScaleVote) -> None:
         enough = int(vote.fits.sum()) >= MIN_MOTIONS and vote.fraction >= MIN_AGREEMENT
@@ -115,19 +121,5 @@ class Odometry:
             self.found.scale, self.found.deviation = vote.scale, vote.deviation
 
 
-def _steps(
-    known: Sequence[tuple[int, Keyframe]],
-) -> list[tuple[tuple[int, Keyframe], tuple[int, Keyframe]]]:
-    """Neighbours whose poses are of one world."""
-    return [(a, b) for a, b in pairwise(known) if _world(a[1]) == _world(b[1])]
-
-
-def _world(keyframe: Keyframe) -> int | None:
-    return None if keyframe.pose is None else keyframe.pose.world
-
-
-def _measured(a: Keyframe, b: Keyframe) -> torch.Tensor:
-    """The motion from a keyframe to another, metres."""
-    assert a.pose is not None
-    assert b.pose is not None
-    return b.pose.T_cw @ se3_inverse(a.pose.T_cw)
+def _stacked(motions: list[torch.Tensor]) -> Float[torch.Tensor, "m 4 4"]:
+    return torch.stack(motions) if motions else torch.zeros(0, 4, 4, dtype=torch.float64)

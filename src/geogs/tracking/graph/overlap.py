@@ -15,9 +15,11 @@ from geogs.world.keyframes import KeyframeSet
 TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""
 LARGEST_ZOOM = 2.5
-"""By how much larger one of two keyframes may show what the other looks at: matching compares
+"""Ratio of the sizes in which two keyframes may show what either looks at: matching compares
 windows of one size. Two that look towards each other from rooms away, through all walls between,
 would pass by motion alone, as either sees what the other looks at far ahead, where little moves."""
+STEP = 2
+"""Every such row and column of cells is looked at, as for distances between keyframes."""
 TARGETS_TOGETHER = 32
 """Keyframes against which all others are tested at a time; bounds memory."""
 
@@ -38,7 +40,7 @@ class _Spheres:
         return _Spheres(centre, 1.001 * reach.amax(1, keepdim=True), torch.ones(1))
 
     def of(self, rows: Int[Tensor, "m"]) -> "_Spheres":
-        """Those of some of the keyframes."""
+        """The spheres of some of the keyframes."""
         return _Spheres(self.centre[rows], self.radius[rows], self.fraction)
 
     def reach(
@@ -50,14 +52,14 @@ class _Spheres:
 
 
 def may_overlap(
-    store: KeyframeSet, source: Sequence[int], target: Sequence[int], least: float, step: int
+    store: KeyframeSet, source: Sequence[int], target: Sequence[int], least: float
 ) -> Bool[np.ndarray, "n m"]:
-    """False where no more than ``least`` of every ``step``-th cell of a source falls into a target.
+    """False where no more than ``least`` of the cells of a source falls into a target.
 
     Every tile whose bounding sphere reaches into the target's view is counted as if all its cells
     did, so True proves nothing and False is certain.
     """
-    spheres = _spheres(store, source, step)
+    spheres = _spheres(store, source)
     whole = spheres.around()
     out = np.full((len(source), len(target)), least <= 1e-6)
     for begin in range(0, len(target), TARGETS_TOGETHER):
@@ -73,7 +75,7 @@ def may_overlap(
 def alike_in_size(
     store: KeyframeSet, first: Sequence[int], second: Sequence[int]
 ) -> Bool[np.ndarray, "n m"]:
-    """Whether two keyframes show what either looks at in sizes up to ``LARGEST_ZOOM`` times others.
+    """Whether two keyframes show what either looks at in sizes of a ratio up to ``LARGEST_ZOOM``.
 
     What a keyframe looks at is the point on its optical axis at the median depth.
     """
@@ -95,9 +97,9 @@ def alike_in_size(
     return alike
 
 
-def _spheres(store: KeyframeSet, ids: Sequence[int], step: int) -> _Spheres:
+def _spheres(store: KeyframeSet, ids: Sequence[int]) -> _Spheres:
     grid = store.grid
-    rows, columns = torch.arange(0, grid.height, step), torch.arange(0, grid.width, step)
+    rows, columns = torch.arange(0, grid.height, STEP), torch.arange(0, grid.width, STEP)
     tile = (rows * TILES[0] // grid.height)[:, None] * TILES[1] + columns * TILES[1] // grid.width
     cells = (rows[:, None] * grid.width + columns).reshape(-1)
     rays = grid.rays.cpu()[cells]

@@ -88,8 +88,8 @@ def _by_distance(
     if wanted.any():
         wanted = wanted & alike_in_size(store, first, second)
     if int(wanted.sum()) > PAIRS_TOGETHER[0]:
-        wanted = wanted & may_overlap(store, first, second, LEAST_OVERLAP, 2)
-        wanted &= may_overlap(store, second, first, LEAST_OVERLAP, 2).T
+        wanted = wanted & may_overlap(store, first, second, LEAST_OVERLAP)
+        wanted &= may_overlap(store, second, first, LEAST_OVERLAP).T
     at = np.stack(np.nonzero(wanted), 1)
     pairs = np.stack([rows[at[:, 0]], columns[at[:, 1]]], 1)
 
@@ -103,8 +103,7 @@ def _by_distance(
         return []
     size = PAIRS_TOGETHER[store.grid.on_gpu] // 2
     parts = [pairs[k : k + size] for k in range(0, len(pairs), size)]
-    side_by_side = len(parts) > 1 and not store.grid.on_gpu
-    found = thread_map(distances, parts) if side_by_side else [distances(p) for p in parts]
+    found = [distances(p) for p in parts] if store.grid.on_gpu else thread_map(distances, parts)
     distance = np.concatenate(found)
     near = np.nonzero(distance <= max_distance)[0]
     order = near[np.argsort(distance[near], kind="stable")]

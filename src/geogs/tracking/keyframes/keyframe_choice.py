@@ -11,19 +11,19 @@ from jaxtyping import UInt8
 from geogs.concurrent import BackgroundTask
 from geogs.config import TrackingConfig
 
-LEAST_FLOW = 0.2
+MIN_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
 hardly moved, so it is the image that is poor."""
 WITH_ROTATION = 1.4
-"""Times the parallax that makes a keyframe is the motion that does before depths are known, since
-part of it is the rotation's."""
-FARTHEST = 0.15
+"""Motion that makes a keyframe before depths are known, in multiples of the parallax that does
+later: part of it is the rotation's."""
+MAX_FLOW = 0.15
 """Motion that makes a keyframe without any parallax, of the long edge: over larger ones flow finds
 fewer matches, and worse ones."""
-LATEST, CLOSER = 5, 1 / 3
-"""Where no more frames come than lie between two of so many latest keyframes, so much of the usual
-parallax makes one: what comes into view there is seen by no later keyframe, and by one alone it has
-no depth."""
+LATEST, END_FRACTION = 5, 1 / 3
+"""Where fewer frames are left than lie between two of so many latest keyframes, this fraction of
+the usual parallax makes one: what comes into view there is seen by no later keyframe, and one alone
+gives no depth."""
 BLUR_RATIO = 0.7
 """A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
 BLUR_WAIT = 0.4
@@ -62,11 +62,11 @@ def calls_for_keyframe(
     """
     more = 1 + patience
     enough = config.keyframe_parallax * more * long_edge
-    if overlap < config.keyframe_overlap / more and flow >= LEAST_FLOW * enough:
+    if overlap < config.keyframe_overlap / more and flow >= MIN_FLOW * enough:
         return True
     if parallax is None:
         return flow >= WITH_ROTATION * part * enough
-    return parallax >= part * enough or flow >= FARTHEST * more * long_edge
+    return parallax >= part * enough or flow >= MAX_FLOW * more * long_edge
 
 
 def is_near_end(left: int | None, latest: Iterable[int]) -> bool:
@@ -130,7 +130,7 @@ class KeyframeChoice:
         for long: nothing else sees what comes into view meanwhile. ``near`` says that
         :func:`is_near_end`.
         """
-        patience, part = BLUR_WAIT if self._is_blurred() else 0.0, CLOSER if near else 1.0
+        patience, part = BLUR_WAIT if self._is_blurred() else 0.0, END_FRACTION if near else 1.0
         return calls_for_keyframe(
             self.config, self.long_edge, flow, overlap, parallax, patience, part
         )

@@ -1,7 +1,5 @@
 """A depth sensor in the tracker: what it says of a keyframe's cells."""
 
-from collections.abc import Sequence
-
 import torch
 
 from geogs.bundle.device_choice import grid_fields
@@ -25,10 +23,9 @@ class KeyframeDepthSensor:
 
         Cells that the sensor does not know are filled from those around, without information.
         """
-        if not self._measure(keyframe, depth):
+        measured = self._measure(keyframe, depth)
+        if measured is None:
             return False
-        measured = keyframe.measured
-        assert measured is not None
         keyframe.inverse_depth, keyframe.information = measured.inverse_depth, measured.information
         if float(keyframe.has_known_depth.float().mean()) < least:
             keyframe.measured = None
@@ -39,30 +36,23 @@ class KeyframeDepthSensor:
 
     def join(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> None:
         """Let a new keyframe know what was measured, over the depth it was given by others."""
-        if not self._measure(keyframe, depth):
+        measured = self._measure(keyframe, depth)
+        if measured is None:
             return
-        measured = keyframe.measured
-        assert measured is not None
         known = measured.information > 0
         depths = torch.where(known, measured.inverse_depth, keyframe.inverse_depth)
         information = torch.where(known, measured.information, keyframe.information)
         keyframe.inverse_depth = grid_fields(self.grid).fill(depths, information)
         keyframe.information = information
 
-    def _measure(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> bool:
-        """Keep the picture and what it says of the cells; False where there is none."""
+    def _measure(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> MeasuredCells | None:
+        """Keep the picture and what it says of the cells, which is returned, if there is one."""
         metres = None if depth is None else depth.metres()
         if metres is None:
-            return False
+            return None
         keyframe.sensor_depth = metres
         grid = self.grid
         cells = sensor_depth(metres, self.config).at_cells(OFFSET, STRIDE, grid.height, grid.width)
         inverse_depth, information = (m.reshape(-1) for m in cells.tensors(grid.device))
         keyframe.measured = MeasuredCells(inverse_depth, information)
-        return True
-
-
-def stands_alone(keyframes: Sequence[Keyframe]) -> bool:
-    """Whether the second of three keyframes is the only one of them whose depth was measured."""
-    before, middle, after = keyframes
-    return middle.measured is not None and before.measured is None and after.measured is None
+        return keyframe.measured

@@ -18,23 +18,23 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 
 MIN_KNOWN = 0.1
-"""Where the camera is cannot be told when the depth of less than this fraction of a keyframe is
+"""The camera's position is not known when the depth of less than this fraction of a keyframe is
 known to 30 % and found in the image: then it is followed as if it only rotated."""
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
 FIT_HUBER = 5.0
 """Standard deviations of the flow beyond which a match counts linearly in it."""
-SAME = 1.0
+MAX_DIFFERENCE = 1.0
 """Pixels by which matches of two ways to the same place differ in the median at most; those of two
 repetitions of a pattern differ by its period."""
-DOUBTFUL = 0.7
+DOUBTFUL_OVERLAP = 0.7
 """A frame near where it was expected is also looked for without a guess where less than this
 fraction of the keyframe's known depths agrees: a guess that is off by half a period of a pattern
 leads to the wrong one of its repetitions, which agree over a part of the image."""
-BORNE_OUT = 0.95
-"""Correlation of the images' windows from which a place to which flow leads with a guess and
-without needs no third opinion. Of 32 wrong places before rendered chessboards 3 are left so, as
-where features are always asked, and 9 where both ways are enough; a real corridor has 0.97."""
+CONFIRMED_NCC = 0.95
+"""Correlation of the images' windows from which a pose to which flow leads with a guess and without
+needs no third opinion. Of 32 wrong poses before rendered chessboards 3 are left so, as where
+features are always asked, and 9 where both ways are enough; a real corridor has 0.97."""
 FEATURE_CANDIDATES = 2
 """Keyframes with which the features of a frame are compared when the camera is lost."""
 
@@ -62,13 +62,13 @@ class FrameMotion:
     residual: float
     """Median distance in pixels between matches and reprojection."""
     check: PhotometricCheck
-    """What the images say of it."""
+    """How well the images agree there."""
 
     def is_where(self, other: "FrameMotion") -> bool:
         """Whether matches of the same keyframe say the same as another's, in the median."""
         both = self.match.sure()[0] & other.match.sure()[0]
         off = (self.match.pixels - other.match.pixels)[0, both].norm(dim=-1)
-        return len(off) > 0 and float(off.median()) < SAME
+        return len(off) > 0 and float(off.median()) < MAX_DIFFERENCE
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class FrameLocator:
         match: FlowMatch,
         is_expected: bool = True,
     ) -> FrameMotion | None:
-        """As :meth:`locate`, by flow from the keyframe that has been measured."""
+        """The same as :meth:`locate`, by flow from the keyframe that has been measured."""
         T, T_ji, fit = motion_solver(self.grid).fit(
             T_guess,
             keyframe,
@@ -196,7 +196,7 @@ class FrameLocator:
         return self.locate_relative(keyframe, encoded, T_rel)
 
     def relocate_by_features(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
-        """As :meth:`relocate`, by sparse features: the motion may be of any size."""
+        """The same as :meth:`relocate`, by sparse features: the motion may be of any size."""
         grey = self.operator.grey
         found = match_features(grey(keyframe.encoded), grey(encoded))
         T_rel = None if found is None else pnp_features(self.grid, keyframe, found)
@@ -217,11 +217,13 @@ class FrameLocator:
     ) -> FrameMotion | None:
         """The frame where most of the keyframe agrees: as expected, or where nothing but the
         images led, if that was doubtful; features are asked where flow led elsewhere."""
-        if expected is None or expected.overlap >= DOUBTFUL:
+        if expected is None or expected.overlap >= DOUBTFUL_OVERLAP:
             return expected
         cold = with_depth(self.relocate(keyframe, encoded))
         found = [expected] if cold is None else [expected, cold]
-        if cold is None or not (cold.is_where(expected) and cold.check.correlation >= BORNE_OUT):
+        if cold is None or not (
+            cold.is_where(expected) and cold.check.correlation >= CONFIRMED_NCC
+        ):
             features = with_depth(self.relocate_by_features(keyframe, encoded))
             found += [] if features is None else [features]
         return max(found, key=lambda motion: motion.matched)

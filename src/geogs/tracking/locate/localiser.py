@@ -4,16 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from geogs.bundle.device_choice import grid_fields
 from geogs.tracking.keyframes.segment_map import SegmentMap
-from geogs.tracking.locate.frame_locator import (
-    FrameLocator,
-    FrameMotion,
-    Recognition,
-    with_depth,
-)
+from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, Recognition, with_depth
 from geogs.tracking.locate.orientation_follower import Followed
-from geogs.tracking.locate.visible_keyframes import visible_keyframes
 from geogs.tracking.matching.flow_chain import MIN_MATCHED
 from geogs.tracking.matching.photometric_check import MIN_NCC
 from geogs.types import Frame
@@ -21,11 +18,16 @@ from geogs.world.keyframes import Keyframe
 
 MAX_RESIDUAL = 0.008
 """The camera is lost when the median reprojection error exceeds this, of the long edge."""
-RECOGNISED = 0.25
+MIN_RECOGNISED = 0.25
 """A keyframe that an image was recognised as counts if this fraction of it finds a match: twice
 what is asked where the camera was expected."""
-TRIED = 5
+MAX_TRIED = 5
 """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
+MAX_FACING, MAX_VISIBLE = 12, 2
+"""Keyframes that face most nearly the same way as a camera, and those of them that see most of the
+same, which are worth a measurement."""
+MIN_OVERLAP = 0.15
+"""Fraction of a keyframe's cells that must have known depth and fall into the image."""
 RELOCALISE_EVERY = 5
 """While a camera only rotates, its orientation says what it sees; only every so many frames it is
 searched for as if it could be anywhere."""
@@ -74,20 +76,33 @@ class SegmentLocaliser:
     def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
         """The frame at one of some keyframes that look like it.
 
-        One is believed where the dense flow agrees with it over ``RECOGNISED`` of the cells.
+        One is believed where the dense flow agrees with it over ``MIN_RECOGNISED`` of the cells.
         """
         for candidate in recognised:
             if candidate.keyframe not in self.map.keyframes:
                 continue
             keyframe = self.map.keyframes[candidate.keyframe]
-            motion = self.locator.locate_relative(keyframe, encoded, candidate.T_rel)
-            motion = with_depth(motion)
-            if motion is not None and motion.matched >= RECOGNISED:
+            motion = with_depth(self.locator.locate_relative(keyframe, encoded, candidate.T_rel))
+            if motion is not None and motion.matched >= MIN_RECOGNISED:
                 return motion
         return None
 
     def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
         """Where to search for a lost camera: recent keyframes, and older ones by turns."""
-        recent, older = keyframes[: -TRIED - 1 : -1], keyframes[:-TRIED]
-        first = (self.map.segment.status.misses * TRIED) % max(len(older), 1)
-        return recent + (older[first:] + older[:first])[:TRIED]
+        recent, older = keyframes[: -MAX_TRIED - 1 : -1], keyframes[:-MAX_TRIED]
+        first = (self.map.segment.status.misses * MAX_TRIED) % max(len(older), 1)
+        return recent + (older[first:] + older[:first])[:MAX_TRIED]
+
+
+def visible_keyframes(keyframes: Sequence[Keyframe], T_cw: Float[Tensor, "4 4"]) -> list[Keyframe]:
+    """The keyframes most of whose known depth falls into the image of a camera, best first."""
+    if not keyframes:
+        return []
+    axis = T_cw[2, :3]
+    facing = sorted(keyframes, key=lambda k: -float(k.T_cw[2, :3] @ axis))[:MAX_FACING]
+    grid = facing[0].grid
+    there, _ = grid_fields(grid).reproject(facing, [T_cw] * len(facing))
+    known = torch.stack([k.has_known_depth for k in facing])
+    seen = (grid.inside(there) & known).float().mean(1).tolist()
+    ranked = sorted(zip(seen, facing, strict=True), key=lambda pair: -pair[0])
+    return [k for fraction, k in ranked[:MAX_VISIBLE] if fraction >= MIN_OVERLAP]

@@ -29,13 +29,13 @@ class PoseDeviation:
     position: float
     """The camera's centre, all axes together, map units; infinite where nothing is known."""
     rotation: float
-    """Its orientation, radians."""
+    """The camera's orientation, radians."""
 
 
 def pose_deviation(
     grid: SampleGrid, keyframe: Keyframe, T_rel: Float[Tensor, "4 4"], match: FlowMatch
 ) -> PoseDeviation:
-    """What one edge, from a keyframe to a frame at ``T_rel`` from it, leaves open of the pose.
+    """Deviations of the pose of a frame at ``T_rel`` from a keyframe, by the one edge between them.
 
     The inverse of sum J^T W J over the cells, J the derivative of a cell's position by a left
     perturbation of the pose, and 1 / W the variance of its match and of what its depth's does to
@@ -63,6 +63,6 @@ def left_open(H: Float[Tensor, "6 6"]) -> PoseDeviation:
 
 
 def deviation_of(grid: SampleGrid, keyframe: Keyframe, motion: FrameMotion) -> DeviationOf:
-    """The same of a frame located at a keyframe, by what is known now, when it is asked for."""
+    """Computes the same later of a frame located at a keyframe, by what is known now."""
     T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw).to(motion.T_cw)
     return partial(pose_deviation, grid, copy(keyframe), T_rel, motion.match)

@@ -34,16 +34,16 @@ MIN_WINDOWS = 24
 
 @dataclass(frozen=True)
 class PhotometricCheck:
-    """What the images say of a location."""
+    """How well the images agree at a location."""
 
     correlation: float
     """Median normalised cross-correlation (NCC) of the windows, in [-1, 1]; 0 without any."""
     windows: int
-    """How many there are: with texture and known depth, in view of both images."""
+    """Number of windows with texture and known depth, in view of both images."""
 
     @staticmethod
     def of(numbers: Float[Tensor, "2"]) -> "PhotometricCheck":
-        """What :func:`correlation_at` returns as plain numbers; waits for a GPU."""
+        """The check of what :func:`correlation_at` returns; waits for a GPU."""
         correlation, windows = numbers.tolist()
         return PhotometricCheck(correlation, int(windows))
 
@@ -72,7 +72,10 @@ def correlation_at(
     may be on the CPU, are on the grid's device; so is the result, and nothing waits for a GPU.
     """
     if grid.on_gpu:
-        return _on_gpu(grid, first, second, T_ji, inverse_depth, information)
+        from geogs.tracking.cuda.photometric_check import median_correlation
+
+        step, at = _spread(grid).step, (to_device(T_ji, first.device), inverse_depth, information)
+        return median_correlation(grid, first, second, step, MIN_CONTRAST**2, *at)
     some = _spread(grid)
     positions = reprojected_windows(grid, T_ji, inverse_depth)
     return _median_correlation(grid, first, second, positions, information[some] > 0)
@@ -89,12 +92,14 @@ def correlation_matched(
     Says less, since a flow leads where images look alike; but it cannot make them alike.
     """
     if grid.on_gpu:
-        return _on_gpu(grid, first, second, pixels=pixels)
+        from geogs.tracking.cuda.photometric_check import median_correlation
+
+        step = _spread(grid).step
+        return median_correlation(grid, first, second, step, MIN_CONTRAST**2, pixels=pixels)
     some = _spread(grid)
     positions = pixels[some, None] + _offsets(grid)
-    return _median_correlation(
-        grid, first, second, positions, torch.ones_like(positions[:, 0, 0]) > 0
-    )
+    every = torch.ones(len(positions), dtype=torch.bool)
+    return _median_correlation(grid, first, second, positions, every)
 
 
 def matched_motion(
@@ -111,26 +116,6 @@ def matched_motion(
     used = weight[:, 0] > 0
     median = _median_where((pixels - grid.pixels).norm(dim=-1), used)[:1]
     return torch.cat([used.to(median).mean()[None], median])
-
-
-def _on_gpu(
-    grid: SampleGrid,
-    first: Float[Tensor, "h w"],
-    second: Float[Tensor, "h w"],
-    T_ji: Float[Tensor, "4 4"] | None = None,
-    inverse_depth: Float[Tensor, "p"] | None = None,
-    information: Float[Tensor, "p"] | None = None,
-    pixels: Float[Tensor, "p 2"] | None = None,
-) -> Float[Tensor, "2"]:
-    """The same by kernels: where a pose and depths put the cells, or at ``pixels``."""
-    from geogs.tracking.cuda.photometric_check import median_correlation
-
-    if T_ji is not None:
-        T_ji = to_device(T_ji, first.device)
-    return median_correlation(
-        grid, first, second, _spread(grid).step, MIN_CONTRAST**2, T_ji, inverse_depth, information,
-        pixels,
-    )  # fmt: skip
 
 
 def reprojected_windows(

@@ -18,15 +18,15 @@ from geogs.tracking.matching.pnp import pnp
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
-FARTHEST = 50.0
+MAX_BASELINES = 50.0
 """Baselines beyond which a point says nothing on which of four poses is the right one."""
-COMPARED = 5
+MAX_PAIRS = 5
 """Pairs of views that are compared by what other views say of their depths."""
-LASTING = 2 / 3
+MIN_LASTING = 2 / 3
 """Fraction of the views that a cell is matched in which is followed longest."""
-SHARE = 0.05, 0.8
+LASTING_FRACTION = 0.05, 0.8
 """Fractions of the first matches that those followed longest may be, for the rest to be asked."""
-CLEARLY = 1.2
+MIN_SUPPORT_RATIO = 1.2
 """Times as much must the rest agree without them for them to move by themselves. In streets and
 rooms where nothing moves it was 1.00 to 1.06, with trucks that had bent the pose 1.4 to 2."""
 
@@ -54,9 +54,9 @@ def best_two_view(
     the pairs that have parallax over most good cells are compared: the depth that most cells
     agree with in the other views, where they are matched, is right.
 
-    What is followed longest, as the truck ahead, has no say in that, and most matches: a camera
-    that turns with it explains it, far away, and nearly all the rest. So pairs without it are
-    compared as well, and taken where the rest agrees with them clearly more.
+    What is followed longest, such as a truck ahead, has most matches, and a camera that turns with
+    it explains it, far away, and nearly all the rest. So pairs without it are compared as well, and
+    taken where the rest agrees with them clearly more.
 
     Args:
         camera: of all views.
@@ -79,17 +79,18 @@ def best_two_view(
     with_them, alone = (
         float(_support(grid, flows, n, view)[~lasting].sum()) for view in (same, apart)
     )
-    return other if alone > CLEARLY * with_them else best
+    return other if alone > MIN_SUPPORT_RATIO * with_them else best
 
 
 def followed_longest(grid: SampleGrid, flows: Sequence[FlowMatch]) -> Bool[Tensor, "p"]:
     """Cells of the first view, and those around, that are matched in most views; none where these
     are hardly any, or most of what is matched at first."""
     sure = torch.stack([match.sure()[0] for match in flows])
-    lasting = (sure.float().mean(0) >= LASTING).view(grid.height, grid.width)
+    lasting = (sure.float().mean(0) >= MIN_LASTING).view(grid.height, grid.width)
     lasting = widened(lasting, 1).view(-1)
-    share = float((lasting & sure[0]).sum()) / max(int(sure[0].sum()), 1)
-    return lasting & (SHARE[0] <= share <= SHARE[1])
+    fraction = float((lasting & sure[0]).sum()) / max(int(sure[0].sum()), 1)
+    least, most = LASTING_FRACTION
+    return lasting & (least <= fraction <= most)
 
 
 def without(match: FlowMatch, cells: Bool[Tensor, "p"]) -> FlowMatch:
@@ -105,7 +106,7 @@ def _with_parallax(
     able = [(n, v) for n, v in enumerate(found) if v is not None and v.parallax >= min_parallax]
     # Parallax helps until the views no longer overlap.
     able.sort(key=lambda c: -min(c[1].parallax, 3 * min_parallax) * int(c[1].good.sum()))
-    return able[:COMPARED]
+    return able[:MAX_PAIRS]
 
 
 def _best_of(
@@ -208,8 +209,8 @@ def _pose_of(
     """The one of the four poses of an essential matrix that sees most points before both cameras.
 
     Returns the rotation, the unit translation (first camera to second) and which points lie there,
-    nearer than ``FARTHEST`` baselines. From z R a + t = z' b for the rays a and b of a point its
-    two depths follow by the cross products with b and with R a.
+    nearer than ``MAX_BASELINES``. From z R a + t = z' b for the rays a and b of a point its two
+    depths follow by the cross products with b and with R a.
     """
     R1, R2, t = cv2.decomposeEssentialMat(E)
     t, best = t[:, 0], None
@@ -221,7 +222,7 @@ def _pose_of(
         z_second = -(np.cross(t, rotated) * across).sum(1) / square
         for sign in (1.0, -1.0):
             z, other = sign * z_first, sign * z_second
-            seen = (z > 0) & (z < FARTHEST) & (other > 0) & (other < FARTHEST)
+            seen = (z > 0) & (z < MAX_BASELINES) & (other > 0) & (other < MAX_BASELINES)
             if best is None or seen.sum() > best[2].sum():
                 best = R, sign * t, seen
     assert best is not None

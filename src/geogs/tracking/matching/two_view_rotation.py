@@ -22,11 +22,11 @@ from geogs.world.grid import SampleGrid
 AGREEING = 0.4
 """Fraction of the matched cells that must agree with a rotation for it to be believed."""
 SHARPENED = (0.1, 0.03, 0.01, 0.005, 0.005)
-"""Distances in the image, of the long edge, beyond which a cell loses its say, step by step."""
+"""Distances in the image, of the long edge, beyond which a cell counts little, step by step."""
 TOLERANCE = 0.008
 """Distance within which a cell agrees with a rotation, of the long edge."""
 MOST_CELLS = 1024
-"""That are fitted; evenly spread ones of more."""
+"""Most cells that are fitted, evenly spread ones of more."""
 MIN_SIGMA = 0.1
 """Pixels: no cell counts as more precise than this."""
 LEAST_DEVIATION = 2e-4
@@ -62,7 +62,7 @@ class TwoViewRotation:
 def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | None:
     """The rotation between two views by the model that their flow (one edge) speaks for.
 
-    None where too few cells agree with either. Those that are merely guessed have no say.
+    None where too few cells agree with either. Those that are merely guessed do not count.
     """
     pair = match.on_cpu().only_sure()
     rotated = fit_rotation(grid, pair)
@@ -174,7 +174,7 @@ def _linearised(
     focal: Float64[np.ndarray, "2"],
     centre: Float64[np.ndarray, "2"],
 ) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 3"]]:
-    """What is missing from projections to where points are seen, and how a rotation moves them."""
+    """Residuals of projections, and their derivatives by a rotation on the left."""
     z = np.maximum(points[:, 2], 1e-3)
     x, y = points[:, 0] / z, points[:, 1] / z
     J = np.stack([
