@@ -82,7 +82,7 @@ def walk(scene: Scene, seed: int = 0) -> Motion:
         position = np.column_stack([x, y, z])
         ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.full_like(x, -0.12)])
         T_wc = look_at(position, position + ahead)
-        return with_shake(T_wc, np.random.default_rng([seed, 0x5A4]), _RATE * times)
+        return with_shake(T_wc, seed, _RATE * times)
 
     return Motion(path, _RATE, WALK_METRES / _SPEED)
 

@@ -86,7 +86,7 @@ class SeenSurface:
     """The surface points that depth maps of one camera have shown, one to a voxel."""
 
     def __init__(self, scene: Scene, camera: Camera | RadialCamera, voxel: float = 0.01) -> None:
-        x, y = (camera if isinstance(camera, RadialCamera) else RadialCamera(camera)).rays
+        x, y = RadialCamera.of(camera).rays
         self._rays = np.stack([x, y, np.ones_like(x)], -1)
         self._voxel = voxel
         # A cell of margin, since walls lie exactly on the border.
