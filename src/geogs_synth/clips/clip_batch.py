@@ -31,7 +31,7 @@ class ClipBatch:
     solids: SolidBatch
     """What stands in the rooms when the first view is taken; hides points from views."""
     solid: Int[Tensor, "b v h w"]
-    """FloorPose of the solid that each pixel shows; -1 for the room itself."""
+    """Place of the solid that each pixel shows; -1 for the room itself."""
     sweep: Float[Tensor, "b v 6"] | None = None
     """What the cameras do while their rows are read, as in :class:`CameraBatch`."""
     dynamics: Dynamics | None = None

@@ -1,7 +1,7 @@
 """Candidate camera paths through random rooms; which of them is filmed is decided elsewhere."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from jaxtyping import Float
@@ -101,9 +101,7 @@ def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tenso
 def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _PathSteps:
     """All candidates of a room move in the same manner, so that none is taken less often."""
     b, k = forward.shape[:2]
-    kind = draw.choose(
-        (weights.hand_held, weights.medium, weights.wide, weights.rotation, weights.forward), b
-    )
+    kind = draw.choose(astuple(weights), b)
     rows = [[*m.length, m.rotation, *m.hold, m.along_axis] for m in _KINDS]
     numbers = torch.tensor(rows)[kind][:, None].expand(b, k, 6)
     low, high, rotation, hold_low, hold_high, along = numbers.unbind(-1)
