@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs_synth.clips.furnishing import Furnishing
 from geogs_synth.draw import Draw
-from geogs_synth.scene.batch import concatenated, gathered
+from geogs_synth.scene.batch import concatenate, gather
 from geogs_synth.scene.rooms import Surfaces
 
 _PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
@@ -43,7 +43,7 @@ def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int)
     owner = torch.stack([2 * layout.material, 2 * layout.material + 1], -1).flatten().repeat(b, 1)
     # The ends of most solids look like their sides.
     owner = torch.where(draw.chance(0.6, b, 2 * n), owner - owner % 2, owner)
-    return concatenated(gathered(walls, wall), gathered(solids, owner))
+    return concatenate(gather(walls, wall), gather(solids, owner))
 
 
 def _texture(

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs_synth.draw import Draw, about_z
-from geogs_synth.scene.batch import chosen
+from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids, upright
 
 BOARDS, LEAVES = 5, 7
@@ -78,7 +78,7 @@ def cupboards(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPie
     round_ = draw.chance(0.12, *n)
     barrel = torch.stack([d, d * draw.uniform(0.5, 1.2, *n), h], -1)[..., None, :]
     cylinder = replace(piece, kind=torch.full_like(piece.kind, FRUSTUM), half=barrel)
-    piece = chosen(round_, cylinder, piece)
+    piece = where(round_, cylinder, piece)
     return piece, stand(draw, size, torch.stack([w, d], -1), 0.7)
 
 

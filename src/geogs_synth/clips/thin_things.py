@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from geogs_synth.clips.pieces import FloorPose, Numbers, StandingPiece, boxes, stand
 from geogs_synth.draw import Draw
-from geogs_synth.scene.batch import chosen
+from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import FRUSTUM, SolidBatch, Solids
 
 BALUSTERS, BARS, SEGMENTS, TWIGS = 12, 5, 5, 12
@@ -42,7 +42,7 @@ def lattices(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiec
     piece = boxes(*rows)
     lying = replace(piece, centre=piece.centre[..., [0, 2, 1]], half=piece.half[..., [0, 2, 1]])
     place = stand(draw, size, torch.stack([w, torch.where(flat, tall, deep)], -1), 0.2)
-    return chosen(flat, lying, piece), _lifted(draw, size, place, tall)
+    return where(flat, lying, piece), _lifted(draw, size, place, tall)
 
 
 def cables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:

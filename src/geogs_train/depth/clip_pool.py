@@ -38,8 +38,8 @@ class StoredClips:
             (clips.images * 255).round().to(torch.uint8),
             clips.depth,
             clips.normal.half(),
-            clips.T_cw,
-            clips.intrinsics,
+            clips.views.T_cw,
+            clips.views.intrinsics,
             coarse.quantile(levels, -1).movedim(0, -1),
         )
 

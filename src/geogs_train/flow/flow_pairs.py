@@ -98,14 +98,14 @@ def _starts(
     if clips.dynamics is not None:
         # What poses and depths say knows of no motion but the camera's.
         truth = clips.still_flow(_at_cells(clips.points(pair[0])), pair[1])
-        largest = torch.full_like(clips.intrinsics[:, 0], options.largest)
+        largest = torch.full_like(clips.views.intrinsics[:, 0], options.largest)
         largest = torch.where(clips.dynamics.kind == PAPERED, REPEATING, largest)
     depth = _at_cells(clips.depth[:, pair[0]])
     cells = cell_pixels(depth.shape[1], depth.shape[2], depth).reshape(*depth.shape[1:], 2)
-    intrinsics = clips.intrinsics.float()
+    intrinsics = clips.views.intrinsics.float()
     f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]
     rays = torch.cat([(cells - c) / f, torch.ones_like(depth)[..., None]], -1)
-    T_cw = clips.T_cw.float()
+    T_cw = clips.views.T_cw.float()
     T_ji = T_cw[:, pair[1]] @ se3_inverse(T_cw[:, pair[0]])
     return disturbed_starts(
         truth, depth, rays, T_ji, intrinsics, cells, options, generator, largest

@@ -116,7 +116,7 @@ def test_people_move_and_their_flow_is_their_own(sampler):
     clips = film(sampler, "people", 4)
     assert clips.dynamics is not None
     truth, still = clips.flow(0, 1), clips.still_flow(clips.points(0), 1)
-    moving = clips.dynamics.ways_of(clips.solid[:, 0]).norm(dim=-1) > 0
+    moving = clips.dynamics.velocity_of(clips.solid[:, 0]).norm(dim=-1) > 0
     apart = (truth.pixels - still).norm(dim=-1)
     assert 0.005 < moving.float().mean() < 0.7
     assert apart[~moving].max() < 1e-3
@@ -136,7 +136,7 @@ def test_a_street_has_a_sky_that_stays_where_it_is_and_ground_below(sampler):
     assert 0.03 < far.float().mean() < 0.8
     low = depth[:, 40:]
     assert (low < 60).float().mean() > 0.6
-    shift = (clips.T_cw[:, 1, :3, 3] - clips.T_cw[:, 0, :3, 3]).norm(dim=-1)
+    shift = (clips.views.T_cw[:, 1, :3, 3] - clips.views.T_cw[:, 0, :3, 3]).norm(dim=-1)
     assert shift.max() < 300
     assert clips.images.isfinite().all()
     assert clips.images.std() > 0.05
