@@ -13,15 +13,15 @@ from geogs_train.course import Worker
 
 MOST_PROCESSES = 6
 AHEAD = 8
-"""Plans that are ready, beside those that are being drawn."""
+"""Plans that are ready, besides those that are being drawn."""
 
 
 class PlansAhead:
     """The plans of consecutive steps; drawing one takes longer than a step on a GPU may."""
 
     def __init__(self, rooms: RoomSampler, batch: int, worker: Worker, least: int = 1) -> None:
-        """At ``least`` so many processes draw them ahead for a GPU; on a CPU they are drawn when
-        they are asked for."""
+        """For a GPU, ``least`` or more processes draw them ahead; on a CPU they are drawn on
+        demand."""
         self._on_demand = partial(rooms.plan, batch=batch, rank=worker.rank)
         self._pool: ProcessPoolExecutor | None = None
         if worker.device.type == "cuda":
@@ -47,12 +47,12 @@ class PlansAhead:
         return plan
 
     def rest(self) -> None:
-        """Draw nothing until a plan is asked for again."""
+        """Discards the plans drawn ahead; none are drawn until one is asked for again."""
         while self._waiting:
             self._waiting.popleft()[1].cancel()
 
     def close(self) -> None:
-        """End the processes."""
+        """Ends the processes."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -31,7 +31,7 @@ class DepthSensor:
     def measure(
         self, depth: Float32[np.ndarray, "h w"], focal: float, seed: int, frame: int
     ) -> Float32[np.ndarray, "h w"]:
-        """What it measures of exact depth z in metres; 0 where nothing, as in the truth.
+        """Measured depth of exact depth z, in metres; 0 where there is none.
 
         ``focal`` in pixels. The same frame of the same seed has the same noise.
         """

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch, pixel_grid, project, rays
 from geogs_synth.clips.dynamics import Dynamics
-from geogs_synth.raycast.caster import FlowTruth
-from geogs_synth.raycast.casters import caster_for
+from geogs_synth.raycast.caster_choice import caster_for
+from geogs_synth.raycast.rendered_rooms import FlowTruth
 from geogs_synth.scene.solids import SolidBatch
 
 

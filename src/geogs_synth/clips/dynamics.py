@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.camera.motion_blur import exposed, motion_while_open
-from geogs_synth.clips.covering import bared, papered
+from geogs_synth.clips.materials import bared, papered
 from geogs_synth.clips.movers import BODIES, PARTS, people, traffic
 from geogs_synth.clips.path_choice import too_near
 from geogs_synth.clips.paths import Paths
@@ -16,7 +16,7 @@ from geogs_synth.clips.room_options import BARE, PAPERED, PEOPLE, STREET, RoomOp
 from geogs_synth.clips.shake import Shake, draw_shake
 from geogs_synth.clips.street_clips import draw_street
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.caster import RenderedRooms
+from geogs_synth.raycast.rendered_rooms import RenderedRooms
 from geogs_synth.scene.batch import where
 from geogs_synth.scene.rooms import Rooms
 from geogs_synth.scene.solids import NONE, SolidBatch, Solids
@@ -30,7 +30,7 @@ class Dynamics:
     """Kind of the scene, its number in :mod:`geogs_synth.clips.room_options`."""
     shake: Shake
     velocity: Float[Tensor, "b n 3"]
-    """Of the solid in each place, metres from view to view."""
+    """Velocity of the solid in each place, metres from view to view."""
 
     def velocity_of(self, solid: Int[Tensor, "b *s"]) -> Float[Tensor, "b *s 3"]:
         """Velocity of the solids that pixels show; zero for the room itself."""

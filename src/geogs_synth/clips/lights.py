@@ -21,7 +21,7 @@ def draw_lights(draw: Draw, size: Float[Tensor, "b 3"], views: int, change: floa
 
 
 def _draw(draw: Draw, size: Float[Tensor, "b 3"]) -> Lights:
-    """One state of the light: a single view."""
+    """The light of a single view."""
     b = len(size)
     n = (b, 1, MOST_LIGHTS)
     position = draw.uniform(0.05, 0.95, *n, 3)

@@ -1,4 +1,4 @@
-"""Candidate camera paths through random rooms; which of them is filmed is decided elsewhere."""
+"""Candidate camera paths through random rooms, of which ``path_choice`` takes one."""
 
 import math
 from dataclasses import astuple, dataclass
@@ -27,7 +27,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class _Motion:
-    """What a kind of motion draws from."""
+    """Ranges that a kind of motion is drawn from."""
 
     length: tuple[float, float]
     """Metres between two views."""
@@ -36,7 +36,7 @@ class _Motion:
     hold: tuple[float, float]
     """Fraction of the rotation that keeps the same point in view."""
     along_axis: float = 0.0
-    """0 moves anyhow, 1 along the optical axis."""
+    """0 moves in any direction, 1 along the optical axis."""
 
 
 _KINDS = (
@@ -133,7 +133,7 @@ def _keep_in_view(
 
 
 def looking(forward: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
-    """Camera to world for an upright camera that looks ahead like this."""
+    """Camera to world of an upright camera with this viewing direction."""
     up = torch.zeros_like(forward)
     up[..., 2] = 1
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)

@@ -18,8 +18,8 @@ from geogs_synth.clips.path_choice import choose_cameras, too_near
 from geogs_synth.clips.paths import Paths, draw_paths
 from geogs_synth.clips.room_options import RoomOptions, only_scene
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.caster import RenderedRooms
-from geogs_synth.raycast.casters import caster_for
+from geogs_synth.raycast.caster_choice import caster_for
+from geogs_synth.raycast.rendered_rooms import RenderedRooms
 from geogs_synth.scene.batch import on_device
 from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, room_per_view
 from geogs_synth.textures.bank import make_bank
@@ -31,11 +31,10 @@ _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything random about a batch but the noise of its pixels; on the host."""
+    """Everything random of a batch except the noise of its pixels; on the host."""
 
     key: tuple[int, ...]
     """What the random numbers depend on."""
-
     rooms: Rooms
     paths: Paths
     flaws: RandomFlaws

@@ -68,10 +68,10 @@ def _houses(draw: Draw, b: int) -> list[SolidBatch]:
         front = line + draw.uniform(0, 1.5, *n) * draw.chance(0.4, *n)
         half = torch.stack([long, deep, tall], -1)
         centre = torch.stack([x, side * (front + deep), tall], -1)
-        rows.append(_boxes(half, centre, draw.chance(0.92, *n)))
+        rows.append(_some(BOX, draw.chance(0.92, *n), centre, half))
         kerb = torch.tensor([250.0, 1.6, 0.08]).expand(b, 1, 3)
         at = torch.stack([torch.zeros(b, 1), side * (line - 1.6), torch.full((b, 1), 0.08)], -1)
-        rows.append(_boxes(kerb, at, draw.chance(0.7, b, 1)))
+        rows.append(_some(BOX, draw.chance(0.7, b, 1), at, kerb))
     return rows
 
 
@@ -88,7 +88,7 @@ def _cars(draw: Draw, b: int) -> SolidBatch:
     top = half * torch.tensor([0.55, 0.9, 0.7])
     above = at + torch.nn.functional.pad((half + top)[..., 2:], (2, 0))
     there = draw.chance(0.5, *n)
-    return Solids.join([_boxes(half, at, there), _boxes(top, above, there)])
+    return Solids.join([_some(BOX, there, at, half), _some(BOX, there, above, top)])
 
 
 def _trees(draw: Draw, b: int) -> SolidBatch:
@@ -100,10 +100,7 @@ def _trees(draw: Draw, b: int) -> SolidBatch:
     top = torch.stack([x, y, 2 * stem + 0.8 * crown[..., 2]], -1)
     there = draw.chance(0.5, *n)
     trunk = torch.stack([radius, 0.8 * radius, stem], -1)
-    return Solids.join([
-        upright(torch.where(there, FRUSTUM, NONE), foot, trunk),
-        upright(torch.where(there, ELLIPSOID, NONE), top, crown),
-    ])  # fmt: skip
+    return Solids.join([_some(FRUSTUM, there, foot, trunk), _some(ELLIPSOID, there, top, crown)])
 
 
 def _posts(draw: Draw, b: int) -> SolidBatch:
@@ -112,12 +109,13 @@ def _posts(draw: Draw, b: int) -> SolidBatch:
     tall, radius = draw.log_uniform(0.4, 4.0, *n), draw.log_uniform(0.03, 0.15, *n)
     y = draw.uniform(4, 8, *n) * (1 - 2.0 * draw.integers(2, *n))
     at = torch.stack([draw.uniform(-8, 50, *n), y, tall], -1)
-    kind = torch.where(draw.chance(0.6, *n), FRUSTUM, NONE)
-    return upright(kind, at, torch.stack([radius, radius, tall], -1))
+    half = torch.stack([radius, radius, tall], -1)
+    return _some(FRUSTUM, draw.chance(0.6, *n), at, half)
 
 
-def _boxes(half: Tensor, centre: Tensor, there: Tensor) -> SolidBatch:
-    return upright(torch.where(there, BOX, NONE), centre, half)
+def _some(kind: int, there: Tensor, centre: Tensor, half: Tensor) -> SolidBatch:
+    """Upright solids of a kind, some of them not there."""
+    return upright(torch.where(there, kind, NONE), centre, half)
 
 
 def _surfaces(draw: Draw, surfaces: Surfaces) -> Surfaces:

@@ -13,7 +13,7 @@ from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import FRUSTUM, SolidBatch, Solids
 
 BALUSTERS, BARS, SEGMENTS, TWIGS = 12, 5, 5, 12
-"""Of a railing; of a lattice, each way; of a cable; of a bush."""
+"""Parts of a railing, of a lattice in each direction, of a cable, of a bush."""
 
 
 def railings(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
@@ -63,7 +63,7 @@ def cables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
 
 
 def bushes(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
-    """Twigs turned anyhow, or leaves, or flat sticks, around a point above the floor."""
+    """Randomly rotated twigs, leaves or flat sticks around a point above the floor."""
     n = (len(size), count)
     reach = draw.log_uniform(0.08, 0.5, *n)[..., None]
     length = reach * draw.uniform(0.3, 1.0, *n, TWIGS)

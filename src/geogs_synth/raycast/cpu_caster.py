@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch, pixel_grid, project, rays, row_centre
-from geogs_synth.raycast.caster import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.raycast.rays import Hit, closest_hit, occluded
+from geogs_synth.raycast.rendered_rooms import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.raycast.room_shading import ambient_access, shade
 from geogs_synth.raycast.room_surface import surface_point
 from geogs_synth.scene.batch import one_scene

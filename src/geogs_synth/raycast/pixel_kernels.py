@@ -225,7 +225,7 @@ def _around(solid, face, row, column, found):
 
 @njit(**COMPILED)
 def _gain(solids, lighting, i, world, normal, out):
-    """What the texture of solid i is multiplied with."""
+    """Factor on the texture of solid i."""
     if solids.emission[i] > 0.0:
         for k in range(3):
             out[k] = solids.emission[i]

@@ -14,7 +14,7 @@ Part = TypeVar("Part")
 
 
 def map_tensors(change: Callable[..., Tensor], first: Part, *others: Part) -> Part:
-    """What ``change`` makes of the tensors of one part, or of those that correspond in several."""
+    """Applies ``change`` to the tensors of one part, or to those that correspond in several."""
     values: list[Any] = []
     for field in fields(first):  # type: ignore[arg-type]
         own = [getattr(part, field.name) for part in (first, *others)]
@@ -36,7 +36,7 @@ def one_scene(part: Part, scene: int) -> Part:
 
 
 def where(which: Bool[Tensor, "*b"], first: Part, second: Part) -> Part:
-    """The first where ``which`` says so, else the second."""
+    """The first where ``which``, else the second."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(which.reshape(*which.shape, *[1] * (a.ndim - which.ndim)), a, b)

@@ -71,7 +71,7 @@ class Solids(Generic[Array]):
 
 
 SolidBatch = Solids[Tensor]
-"""Those of a batch of scenes."""
+"""Solids of a batch of scenes."""
 
 
 def upright(

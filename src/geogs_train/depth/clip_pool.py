@@ -1,6 +1,6 @@
 """Clips of random rooms that stay on the device: more keyframes a second than can be rendered."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float16, UInt8
@@ -45,7 +45,7 @@ class StoredClips:
 
     def tensors(self) -> list[Tensor]:
         """In the order of the fields."""
-        return [getattr(self, f.name) for f in fields(self)]
+        return [*vars(self).values()]
 
 
 class ClipPool:

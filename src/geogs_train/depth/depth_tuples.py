@@ -1,4 +1,4 @@
-"""Samples from a pool of clips: a keyframe, neighbours, and what is wrong with what is known."""
+"""Samples from a pool of clips: a keyframe and neighbours, with errors such as a tracker's."""
 
 import math
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class DepthBatch:
     """Samples with their truth."""
 
     views: StereoViews
-    """What is known, disturbed; lengths in metres."""
+    """The network's input, with errors; lengths in metres."""
     depth: Float[Tensor, "b h w"]
     """Depth of the keyframe, metres."""
     normal: Float[Tensor, "b 3 h w"]
@@ -143,7 +143,7 @@ def known_range(
 def disturbed_poses(
     T: Float[Tensor, "b k 4 4"], options: TupleOptions, chance: Chance
 ) -> Float[Tensor, "b k 4 4"]:
-    """Poses that are off by what a tracker's are; in a fraction of the samples."""
+    """Poses with errors such as a tracker's, in a fraction of the samples."""
     b, k = T.shape[:2]
     wrong = (chance.uniform(b, 1, 1) < options.disturbed).float()
     rotation = torch.deg2rad(chance.log_uniform(options.rotation, b, 1, 1)) * chance.normal(b, k, 3)
@@ -156,7 +156,7 @@ def disturbed_poses(
 def relit(
     images: Float[Tensor, "b v 3 h w"], strength: float, chance: Chance
 ) -> Float[Tensor, "b v 3 h w"]:
-    """Images under other exposure, white balance and tone, each a little different, with noise."""
+    """Images with random exposure, white balance and tone, each a little different, and noise."""
     b, v = images.shape[:2]
 
     def vary(deviation: float, *channels: int) -> Float[Tensor, "b v c 1 1"]:

@@ -17,7 +17,7 @@ from geogs_train.depth.depth_tuples import Chance, DepthBatch, draw_tuples
 
 SEED = 3141
 EVERY = 3
-"""Every so many-th pixel across and down is looked at."""
+"""Step between the pixels that are scored, across and down."""
 
 
 class DepthValidation:
@@ -50,7 +50,7 @@ class DepthValidation:
 
     @torch.no_grad()
     def errors(self, network: DepthNetwork) -> list[DepthErrors]:
-        """Scores of a network, batch by batch."""
+        """Errors of a network, batch by batch."""
         network.eval()
         found = (network(b.views) for b in self.batches)
         parts = [

@@ -1,4 +1,4 @@
-"""What the flow network says of a batch, and what it is trained to say."""
+"""Estimates of the flow network for a batch, and the loss that it is trained by."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 
 MAX_ERROR = 100.0
-"""Errors beyond so many pixels count as such; nothing is learned from how far lost a cell is."""
+"""Errors in pixels are clamped here: how far a lost cell is off teaches nothing."""
 
 
 def run_network(
