@@ -130,7 +130,7 @@ def schedule(step: int, progress: float, options: TrainingSchedule) -> float:
 
 
 def _on_device(network: nn.Module, device: torch.device) -> Any:
-    """Moves a network to a device, channels last, which is fast (and unknown to PyTorch's stubs)."""
+    """Moves a network to a device, with channels last, which PyTorch's stubs do not know."""
     return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 

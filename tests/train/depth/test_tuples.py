@@ -6,13 +6,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from depth_tuples import TRAINING, use_fast_rooms
+from depth_tuples import TRAINING
 from geogs.depth.network.plane_views import cell_rays
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.course import Worker
 from geogs_train.depth.clip_pool import ClipPool, StoredClips
 from geogs_train.depth.depth_options import TupleOptions
 from geogs_train.depth.depth_tuples import Chance, disturbed_poses, draw_tuples, known_range, relit
+from random_rooms import use_fast_rooms
 
 EXACT = TupleOptions(dud=0.0, missing=0.0, disturbed=0.0, photometric=0.0)
 
