@@ -53,7 +53,7 @@ def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) ->
     if run.resume:
         load_checkpoint(trainer, out)
     first = worker.rank == 0
-    validation = course.examination(run.validation_batches) if first else None
+    validation = course.validation(run.validation_batches) if first else None
     out.mkdir(parents=True, exist_ok=True)
     since, at = time.monotonic(), trainer.step
     clock = Clock(run.minutes, trainer.progress, worker) if run.paced and run.minutes else None

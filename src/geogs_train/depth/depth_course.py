@@ -82,7 +82,7 @@ class DepthCourse:
         """Nothing random."""
         return depth_loss(network(batch.views), batch, self.options.loss)
 
-    def examination(self, batches: int) -> DepthValidation:
+    def validation(self, batches: int) -> DepthValidation:
         """The validation set."""
         found = DepthValidation(self.options, self.worker.device, batches)
         count = min(batches, CALIBRATION_BATCHES)
@@ -98,7 +98,7 @@ class DepthCourse:
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
         """Write weights as they are shipped; calibrated on rooms that neither training nor
         validation show."""
-        assert self._held_out is not None  # by the examination
+        assert self._held_out is not None  # made with the validation set
         calibration = calibrated(DepthErrors.join(self._held_out.errors(network)))
         write_weights(network, path, step, scores=scores, calibration=calibration)
 

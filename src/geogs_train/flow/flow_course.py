@@ -73,7 +73,7 @@ class FlowCourse:
         found = run_network(network, batch, self.options.iterations)
         return flow_loss(*found, batch, self.options)
 
-    def examination(self, batches: int) -> SceneValidation:
+    def validation(self, batches: int) -> SceneValidation:
         """The validation set."""
         return SceneValidation(self.options, self.worker.device, batches)
 
