@@ -1,4 +1,4 @@
-"""Random tensors of given shapes that depend on a few numbers only."""
+"""Random tensors of given shapes, and rotations."""
 
 import hashlib
 import math
@@ -12,12 +12,17 @@ from geogs.geometry.lie import quaternion_to_matrix, so3_hat
 
 
 class Draw:
-    """A stream of random tensors that depends on the given numbers only."""
+    """Random tensors of a generator, on its device."""
 
-    def __init__(self, device: torch.device, *key: int) -> None:
+    def __init__(self, generator: torch.Generator) -> None:
+        self.device = generator.device
+        self._generator = generator
+
+    @staticmethod
+    def keyed(device: torch.device, *key: int) -> "Draw":
+        """A stream of random tensors that depends on the given numbers only."""
         digest = hashlib.blake2b(repr(key).encode(), digest_size=8).digest()
-        self.device = device
-        self._generator = torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+        return Draw(torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1))
 
     def uniform(self, low: float | int, high: float | int, *shape: int) -> Float[Tensor, "..."]:
         """Uniform in [low, high)."""

@@ -23,10 +23,7 @@ from geogs_train.training_run import LOG, train
 
 
 def launch(
-    training: FlowTraining | DepthTraining,
-    run: TrainingRunOptions,
-    out: Path,
-    device: str,
+    training: FlowTraining | DepthTraining, run: TrainingRunOptions, out: Path, device: str
 ) -> None:
     """Train, and draw the curves; a run that is gone on with keeps its settings.
 

@@ -91,7 +91,7 @@ class RoomSampler:
         else:
             rendering = self._render_moving(rooms, views, dynamics.velocity)
             light = dynamics.blurred(rendering, views)
-        images = develop(Draw(self.device, *key), plan.flaws, light)
+        images = develop(Draw.keyed(self.device, *key), plan.flaws, light)
         return ClipBatch(
             images, light, rendering.depth, rendering.normal, rendering.solid,
             views, solids, dynamics,
@@ -116,7 +116,7 @@ def draw_plan(
     Drawn on the host: thousands of tiny steps, which a GPU would not do faster.
     """
     key = (seed, int(options.validation), step, rank)
-    draw = Draw(torch.device("cpu"), *key)
+    draw = Draw.keyed(torch.device("cpu"), *key)
     size = _draw_sizes(draw, batch)
     layout = draw_furnishing(draw, size, options.least_density, options.most_density, options.thin)
     surfaces = draw_surfaces(draw, layout, options.textures, materials)

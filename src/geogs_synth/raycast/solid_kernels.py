@@ -104,11 +104,7 @@ def outward_normal(kind, half, face, px, py, pz):
     if kind == BOX or face >= 4:
         sign = 1.0 if face & 1 else -1.0
         axis = face >> 1
-        return (
-            sign if axis == 0 else 0.0,
-            sign if axis == 1 else 0.0,
-            sign if axis == 2 else 0.0,
-        )
+        return (sign if axis == 0 else 0.0, sign if axis == 1 else 0.0, sign if axis == 2 else 0.0)
     if kind == FRUSTUM:
         slope = 0.5 * (half[1] - half[0]) / half[2]
         nx, ny = px, py

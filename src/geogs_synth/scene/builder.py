@@ -92,13 +92,7 @@ class SceneBuilder:
         self._add(BOX, centre, half, [texture] * 6, rotation, 0.0)
 
     def frustum(
-        self,
-        base: Triple,
-        radii: Pair,
-        height: Number,
-        texture: int,
-        *,
-        emission: Number = 0.0,
+        self, base: Triple, radii: Pair, height: Number, texture: int, *, emission: Number = 0.0
     ) -> None:
         """An upright cone frustum on ``base``, the centre of its lower disc; radii below, above."""
         half = np.array([radii[0], radii[1], height / 2])

@@ -14,9 +14,7 @@ _TOLERANCE = 4e-4
 """Largest distance in metres between a chord and the arc it replaces."""
 
 
-def scene_mesh(
-    scene: Scene,
-) -> tuple[Float64[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
+def scene_mesh(scene: Scene) -> tuple[Float64[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
     """Vertices (world, metres) and triangles, counter-clockwise from outside.
 
     Boxes are exact; round solids are inscribed and deviate by less than 1 mm. Surfaces hidden

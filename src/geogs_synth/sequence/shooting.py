@@ -75,7 +75,7 @@ class Shooting:
     def sample_times(
         self, truth: RenderedView, T_wc: np.ndarray, time: float
     ) -> Float64[np.ndarray, "s"]:
-        """Times at which the light of the middle row is sampled; more where the image moves more."""
+        """Times of the middle row at which light is sampled; more where the image moves more."""
         exposure = self._flaws.exposure
         ends = time + exposure * np.array([-0.5, 0.5])
         motion = self._image_motion(truth, T_wc, time, ends) if exposure else 0.0

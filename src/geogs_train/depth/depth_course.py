@@ -16,7 +16,7 @@ from geogs_train.depth.confidence_fit import calibrated
 from geogs_train.depth.depth_loss import depth_loss
 from geogs_train.depth.depth_options import DepthTraining
 from geogs_train.depth.depth_scores import DepthErrors, DepthScores
-from geogs_train.depth.depth_tuples import Chance, DepthBatch, draw_tuples
+from geogs_train.depth.depth_tuples import DepthBatch, draw_tuples
 from geogs_train.depth.depth_validation import DepthValidation
 from geogs_train.trained_weights import write_weights
 
@@ -69,13 +69,13 @@ class DepthCourse:
         if not small:
             self._pools[True].empty()
         clips = self._pools[small].at(step // options.pool.refresh)
-        shared = Draw(torch.device("cpu"), options.seed, step)
+        shared = Draw.keyed(torch.device("cpu"), options.seed, step)
         least, most = options.tuples.least_neighbours, options.tuples.most_neighbours
         count = least + int(shared.integers(most - least + 1, 1))
         seed = hash((options.seed, step, self.worker.rank)) % 2**62
-        chance = Chance(torch.Generator(device).manual_seed(seed))
+        draw = Draw(torch.Generator(device).manual_seed(seed))
         size = options.small_batch if small else options.batch
-        batch = draw_tuples(clips, size, count, options.tuples, chance)
+        batch = draw_tuples(clips, size, count, options.tuples, draw)
         return replace(batch, progress=progress)
 
     def loss(self, network: DepthNetwork, batch: DepthBatch) -> Float[Tensor, ""]:

@@ -86,9 +86,7 @@ def surfaces_of_cells(
 
 
 def from_either(
-    found: Float[Tensor, "b h w"],
-    nearest: Float[Tensor, "b h w"],
-    farthest: Float[Tensor, "b h w"],
+    found: Float[Tensor, "b h w"], nearest: Float[Tensor, "b h w"], farthest: Float[Tensor, "b h w"]
 ) -> Float[Tensor, "b h w"]:
     """Distance from the closer of two surfaces, between which there is no depth."""
     return torch.minimum((found - nearest).abs(), (found - farthest).abs())

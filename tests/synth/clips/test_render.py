@@ -180,7 +180,7 @@ def test_paths_of_many_views(sampler):
 
 
 def test_draws_follow_their_shares():
-    draw = Draw(torch.device("cpu"), 1)
+    draw = Draw.keyed(torch.device("cpu"), 1)
     counts = torch.bincount(draw.choose((1.0, 2.0, 1.0), 4000)) / 4000
     torch.testing.assert_close(counts, torch.tensor([0.25, 0.5, 0.25]), rtol=0, atol=0.04)
     R = draw.rotation(10)
@@ -197,7 +197,7 @@ def test_compression_keeps_what_it_does_not_round():
 
 
 def test_pictures_without_flaws_are_those_of_the_light():
-    draw = Draw(torch.device("cpu"), 0)
+    draw = Draw.keyed(torch.device("cpu"), 0)
     flaws = draw_flaws(draw, 2, 2, disturbance=0.0)
     light = torch.rand(2, 2, 3, 24, 32, generator=torch.Generator().manual_seed(1))
     image = develop(draw, flaws, light)

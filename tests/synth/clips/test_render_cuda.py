@@ -43,7 +43,7 @@ def furnished(device: torch.device) -> tuple[Rooms, CameraBatch]:
     options = RoomOptions(
         width=width, height=height, least_density=0.7, most_density=0.9, candidates=8
     )
-    draw = Draw(torch.device("cpu"), 3)
+    draw = Draw.keyed(torch.device("cpu"), 3)
     size = draw.uniform(3.0, 6.0, 2 if large else 1, 3)
     layout = draw_furnishing(draw, size, options.least_density, options.most_density)
     surfaces = draw_surfaces(draw, layout, 2, 1)

@@ -50,10 +50,10 @@ def test_usual_rooms_are_what_they_were_before_there_were_others():
 
 def test_kinds_come_as_often_as_asked_for():
     shares = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
-    kind = Draw(CPU, 1).choose(astuple(shares), 4000)
+    kind = Draw.keyed(CPU, 1).choose(astuple(shares), 4000)
     share = torch.bincount(kind, minlength=len(SCENE_KINDS)) / 4000
     assert share.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
-    assert Draw(CPU, 1).choose(astuple(only_scene("street")), 5).tolist() == [STREET] * 5
+    assert Draw.keyed(CPU, 1).choose(astuple(only_scene("street")), 5).tolist() == [STREET] * 5
 
 
 def test_points_are_where_the_row_that_sees_them_says():
@@ -158,7 +158,7 @@ def test_papered_walls_start_from_the_right_one(sampler):
 
 def test_only_shaken_clips_are_read_row_by_row():
     kind = torch.tensor([0, 1] * 200)
-    shake = draw_shake(Draw(CPU, 5), kind, 2)
+    shake = draw_shake(Draw.keyed(CPU, 5), kind, 2)
     assert (shake.sweep[kind == 0] == 0).all()
     assert (shake.exposure[kind == 0] == 0).all()
     rolling = shake.sweep[kind == 1].abs().amax((1, 2)) > 0
