@@ -7,6 +7,8 @@ from collections import deque
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 
+import torch
+
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import Plan, RoomSampler, draw_plan
 from geogs_train.course import Worker
@@ -60,8 +62,6 @@ class PlansAhead:
 def _pickled_plan(
     options: RoomOptions, materials: int, seed: int, batch: int, rank: int, step: int
 ) -> bytes:
-    import torch
-
     torch.set_num_threads(1)
     # As bytes, so that no tensor is handed over through shared memory, which containers lack.
     return pickle.dumps(draw_plan(options, materials, seed, step, batch, rank))

@@ -17,6 +17,11 @@ class Worker:
     rank: int = 0
     count: int = 1
 
+    def generator(self, seed: int, step: int) -> torch.Generator:
+        """Random numbers of a step of this worker, on its device."""
+        key = hash((seed, step, self.rank)) % 2**62
+        return torch.Generator(self.device).manual_seed(key)
+
     def shared(self, value: float) -> float:
         """The first worker's value, for all; they wait for each other."""
         if self.count == 1:

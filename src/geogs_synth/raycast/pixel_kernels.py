@@ -49,16 +49,10 @@ class Lighting(NamedTuple):
 def _hit_pixel(solids, i, x, y):
     """Depth and face at which the pixel ray (x, y, 1) meets solid i."""
     o, m = solids.origin[i], solids.matrix[i]
-    return hit(
-        solids.kind[i],
-        solids.half[i],
-        o[0],
-        o[1],
-        o[2],
-        m[0, 0] * x + m[0, 1] * y + m[0, 2],
-        m[1, 0] * x + m[1, 1] * y + m[1, 2],
-        m[2, 0] * x + m[2, 1] * y + m[2, 2],
-    )
+    dx = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+    dy = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+    dz = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+    return hit(solids.kind[i], solids.half[i], o[0], o[1], o[2], dx, dy, dz)
 
 
 @njit(**COMPILED)

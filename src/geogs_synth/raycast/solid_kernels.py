@@ -134,16 +134,10 @@ def crossing(kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, reach
     oz = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
     if from_outside and _inside(kind, half, ox, oy, oz):
         return np.inf, 0
-    return hit(
-        kind,
-        half,
-        ox,
-        oy,
-        oz,
-        r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
-        r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
-        r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
-    )
+    lx = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
+    ly = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz
+    lz = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
+    return hit(kind, half, ox, oy, oz, lx, ly, lz)
 
 
 @njit(**COMPILED)

@@ -64,7 +64,7 @@ class DepthCourse:
     def batch(self, step: int, progress: float) -> DepthBatch:
         """The size of the images, by the fraction of the run that is done, and the number of
         neighbours are those of all workers."""
-        options, device = self.options, self.worker.device
+        options = self.options
         small = progress < options.small
         if not small:
             self._pools[True].empty()
@@ -72,8 +72,7 @@ class DepthCourse:
         shared = Draw.keyed(torch.device("cpu"), options.seed, step)
         least, most = options.tuples.least_neighbours, options.tuples.most_neighbours
         count = least + int(shared.integers(most - least + 1, 1))
-        seed = hash((options.seed, step, self.worker.rank)) % 2**62
-        draw = Draw(torch.Generator(device).manual_seed(seed))
+        draw = Draw(self.worker.generator(options.seed, step))
         size = options.small_batch if small else options.batch
         batch = draw_tuples(clips, size, count, options.tuples, draw)
         return replace(batch, progress=progress)
