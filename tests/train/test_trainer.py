@@ -165,7 +165,7 @@ def test_the_descriptors_loss_equals_loops():
             if max(map(abs, away)) > 3:
                 continue
             centre = (batch.probe[0, p] * level.scale + level.shift).tolist()
-            logits, shares = [], []
+            logits, fractions = [], []
             for dv in range(-3, 4):
                 for du in range(-3, 4):
                     value = 0.0
@@ -179,9 +179,9 @@ def test_the_descriptors_loss_equals_loops():
                                 )
                                 value += (1 - abs(u - c)) * (1 - abs(v - r)) * float(dot) / 8
                     logits.append(value)
-                    shares.append(max(0, 1 - abs(away[0] - du)) * max(0, 1 - abs(away[1] - dv)))
+                    fractions.append(max(0, 1 - abs(away[0] - du)) * max(0, 1 - abs(away[1] - dv)))
             log = torch.tensor(logits).log_softmax(0)
-            total -= float((torch.tensor(shares) * log).sum())
+            total -= float((torch.tensor(fractions) * log).sum())
             count += 1
         expected += total / max(count, 1)
     assert expected > 1

@@ -1,4 +1,4 @@
-"""What stands where in random rooms."""
+"""Furniture and other things in random rooms, and where they stand."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -26,7 +26,7 @@ class Furnishing:
 
 @dataclass(frozen=True)
 class _Group:
-    """Places that are filled in the same way."""
+    """Places that hold pieces of one kind."""
 
     solids: SolidBatch
     per_material: int

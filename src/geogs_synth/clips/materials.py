@@ -1,4 +1,4 @@
-"""What the surfaces of random rooms look like."""
+"""Appearance of the surfaces of random rooms."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ _PERIOD = (0.06, 0.7)
 
 
 def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int) -> Surfaces:
-    """Looks of the room's six faces and of two surfaces of each solid.
+    """Appearance of the room's six faces and of two surfaces of each solid.
 
     Of the ``textures`` in the bank the first ``materials`` are materials, the others images.
     """
@@ -92,7 +92,7 @@ def _draw(
 
 
 def _matrix(scale: Float[Tensor, "b s"], angle: Float[Tensor, "b s"]) -> Float[Tensor, "b s 2 2"]:
-    """Turned and scaled; upside down, because rows of an image go down."""
+    """Rotation and scale; upside down, because rows of an image go down."""
     c, s = scale * angle.cos(), scale * angle.sin()
     return torch.stack([c, s, s, -c], -1).unflatten(-1, (2, 2))
 

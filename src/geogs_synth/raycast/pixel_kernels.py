@@ -1,5 +1,7 @@
-"""What pixels see of a scene and its shading, compiled; rays are o + t d with d_z = 1 in the camera
-frame, so that t is the depth."""
+"""Ray casting and shading of the pixels of a view, compiled.
+
+Rays are o + t d with d_z = 1 in the camera frame, so that t is the depth.
+"""
 
 import math
 from typing import NamedTuple

@@ -15,7 +15,7 @@ from geogs_synth.scene.batch import gather, map_tensors
 from geogs_synth.scene.solids import NONE, SolidBatch
 
 MOST_SOLIDS = 128
-"""Places for solids in a room that kernels take."""
+"""Most places for solids in a room that the kernels take."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,7 @@ class Rooms:
     lights: Lights
 
     def with_places(self, most: int) -> "Rooms":
-        """With at most so many places for solids: empty ones are taken away first, then the last.
-        As it is where there are no more."""
+        """With at most so many places for solids: empty ones are removed first, then the last."""
         kind = self.solids.kind
         if kind.shape[1] <= most:
             return self

@@ -91,12 +91,12 @@ def write_sequence(
     raycaster = (raycaster or Raycaster(location.scene, threads)).with_bodies(bodies)
     shooting = Shooting(raycaster, lens, location.motion.path, flaws, rate, seed)
     quality = _JPEG_QUALITY if flaws.jpeg is None else flaws.jpeg
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
 
     def shoot(index: int) -> Shot:
         shot = shooting.shoot(index)
-        name = results / f"frame{index:06d}.{image_format}"
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
-        _write_image(name, cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), options)
+        bgr = cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR)
+        _write_image(results / f"frame{index:06d}.{image_format}", bgr, options)
         if depth:
             metres = shot.truth.depth
             if depth_sensor is not None:

@@ -115,7 +115,7 @@ class Shooting:
         some = slice(step // 2, None, step)
         x, y = (axis[some, some].ravel() for axis in self.lens.rays)
         depth, solid = truth.depth[some, some].ravel(), truth.solid[some, some].ravel()
-        # The sky is as far as nothing else.
+        # The sky is farther than anything else.
         depth = np.where(depth > 0, depth, 1e4)
         points = np.stack([x, y, np.ones_like(x)], 1) * depth[:, None]
         world = points @ T_wc[:3, :3].T + T_wc[:3, 3]

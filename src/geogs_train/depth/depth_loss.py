@@ -25,7 +25,7 @@ CELL_SPREAD = 0.05
 NEAR_EDGE = 4
 """Pixels around a pixel within which another depth makes it one of an edge."""
 CHOICE = 0.15
-"""Steps between planes over which the right one of the depths tried at 1/2 is not told apart."""
+"""Temperature of the targets for the depths tried at 1/2, in steps between planes."""
 SCALES = 4
 """Scales of differences, each twice as far apart."""
 

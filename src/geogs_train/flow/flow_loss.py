@@ -61,7 +61,7 @@ def descriptor_loss(features: FlowFeatures, batch: FlowBatch) -> Float[Tensor, "
     A window is read as logits over its 49 places; the truth is shared by the four around it.
     Cells that the second view does not see, and levels whose window misses the truth, do not count.
     Sum over the levels of the mean over the cells. It makes descriptors tell places apart within
-    the first hundreds of steps, which the flow's error alone takes thousands for.
+    the first hundreds of steps; the flow's error alone takes thousands.
     """
     windows = correlation_windows(features.source, features.pyramid, batch.edges, batch.probe)
     windows = windows.unflatten(-1, (-1, WINDOW)).log_softmax(-1)

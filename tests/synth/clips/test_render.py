@@ -143,9 +143,9 @@ def test_validation_has_other_rooms_and_textures(sampler):
 
 def test_statistics_of_the_clips(clips):
     truth = clips.flow(0, 1)
-    share = truth.visible.float().mean((1, 2))
-    assert share.mean() > 0.5
-    assert share.median() < 0.97
+    fraction = truth.visible.float().mean((1, 2))
+    assert fraction.mean() > 0.5
+    assert fraction.median() < 0.97
     y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     motion = (truth.pixels - torch.stack([x, y], -1)).norm(dim=-1)[truth.visible] * 512 / 64
     assert motion.quantile(0.1) < 25

@@ -49,10 +49,10 @@ def test_usual_rooms_are_what_they_were_before_there_were_others():
 
 
 def test_kinds_come_as_often_as_asked_for():
-    shares = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
-    kind = Draw.keyed(CPU, 1).choose(astuple(shares), 4000)
-    share = torch.bincount(kind, minlength=len(SCENE_KINDS)) / 4000
-    assert share.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
+    weights = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
+    kind = Draw.keyed(CPU, 1).choose(astuple(weights), 4000)
+    fraction = torch.bincount(kind, minlength=len(SCENE_KINDS)) / 4000
+    assert fraction.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
     assert Draw.keyed(CPU, 1).choose(astuple(only_scene("street")), 5).tolist() == [STREET] * 5
 
 
