@@ -140,7 +140,7 @@ class Suite:
         height = 1.52 + 0.06 * np.sin(2 * np.pi * s / 3.1)
         looked = 1.22 + 0.12 * np.sin(2 * np.pi * s / 5.3)
         T_wc = look_at(np.column_stack([position, height]), np.column_stack([target, looked]))
-        return with_shake(T_wc, np.random.default_rng([self.seed, 0x5A4]))
+        return with_shake(T_wc, self.seed, np.arange(frames))
 
     def _waypoints(self) -> Float64[np.ndarray, "n 2"]:
         """Round the ring, from the middle of the first room."""

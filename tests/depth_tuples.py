@@ -1,11 +1,7 @@
 """Tiny rooms, a tiny depth network, and a course of them."""
 
-import pytest
 import torch
 
-import geogs_synth.clips.sampler as sampler_module
-import geogs_synth.raycast.cuda_caster as cuda_module
-from cuda_emulator import use_emulator
 from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs.depth.network.stereo_views import StereoViews
 from geogs_synth.clips.room_options import RoomOptions
@@ -43,12 +39,6 @@ TRAINING = DepthTraining(
     network=NETWORK,
     warmup=2,
 )
-
-
-def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:
-    """Render with the emulated CUDA kernel."""
-    use_emulator(patch, cuda_module)
-    patch.setattr(sampler_module, "caster_for", lambda _device: cuda_module.CudaCaster())
 
 
 def random_views(b: int, k: int, h: int, w: int, seed: int = 0) -> StereoViews:

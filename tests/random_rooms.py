@@ -1,5 +1,7 @@
 """Rooms with known contents for the tests of the training data."""
 
+import functools
+
 import pytest
 import torch
 
@@ -10,12 +12,16 @@ from cuda_emulator import use_emulator
 from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
 from geogs_synth.scene.solids import NONE, SolidBatch, Solids
+from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
+
+bank_of = functools.cache(make_bank)
 
 
 def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:
-    """Render with the emulated CUDA kernels."""
+    """Render with the emulated CUDA kernels, and draw each bank of textures once in a process."""
     use_emulator(patch, cuda_module)
+    patch.setattr(sampler_module, "make_bank", bank_of)
     for module in (clips_module, sampler_module):
         patch.setattr(module, "caster_for", lambda _device: cuda_module.CudaCaster())
 

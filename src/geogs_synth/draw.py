@@ -1,4 +1,4 @@
-"""Random tensors of given shapes that depend on a few numbers only."""
+"""Random tensors of given shapes, and rotations."""
 
 import hashlib
 import math
@@ -8,35 +8,42 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.geometry.lie import quaternion_to_matrix
+from geogs.geometry.lie import quaternion_to_matrix, so3_hat
 
 
 class Draw:
-    """A stream of random tensors that depends on the given numbers only."""
+    """Random tensors of a generator, on its device."""
 
-    def __init__(self, device: torch.device, *key: int) -> None:
+    def __init__(self, generator: torch.Generator) -> None:
+        self.device = generator.device
+        self._generator = generator
+
+    @staticmethod
+    def keyed(device: torch.device, *key: int) -> "Draw":
+        """A stream of random tensors that depends on the given numbers only."""
         digest = hashlib.blake2b(repr(key).encode(), digest_size=8).digest()
-        self.device = device
-        self._generator = torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+        return Draw(torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1))
 
     def uniform(self, low: float | int, high: float | int, *shape: int) -> Float[Tensor, "..."]:
-        """Even in [low, high)."""
-        return self._empty(*shape).uniform_(low, high, generator=self._generator)
+        """Uniform in [low, high)."""
+        empty = torch.empty(shape, device=self.device)
+        return empty.uniform_(low, high, generator=self._generator)
 
     def log_uniform(self, low: float, high: float, *shape: int) -> Float[Tensor, "..."]:
-        """Positive, its logarithm even."""
+        """Positive, with a uniform logarithm."""
         return self.uniform(math.log(low), math.log(high), *shape).exp_()
 
     def normal(self, deviation: float | int, *shape: int) -> Float[Tensor, "..."]:
         """Gaussian around zero."""
-        return self._empty(*shape).normal_(0.0, deviation, generator=self._generator)
+        empty = torch.empty(shape, device=self.device)
+        return empty.normal_(0.0, deviation, generator=self._generator)
 
     def chance(self, probability: float, *shape: int) -> Bool[Tensor, "..."]:
         """True with the given probability."""
         return self.uniform(0.0, 1.0, *shape) < probability
 
     def integers(self, end: int, *shape: int) -> Int[Tensor, "..."]:
-        """Even in 0..end-1."""
+        """Uniform in 0..end-1."""
         return torch.randint(end, shape, generator=self._generator, device=self.device)
 
     def choose(self, weights: Sequence[float | int], *shape: int) -> Int[Tensor, "..."]:
@@ -49,11 +56,8 @@ class Draw:
             chosen = torch.where(value >= bound, index, chosen)
         return chosen
 
-    def _empty(self, *shape: int) -> Float[Tensor, "..."]:
-        return torch.empty(shape, device=self.device)
-
     def rotation(self, *shape: int) -> Float[Tensor, "... 3 3"]:
-        """Rotations of any kind, evenly spread."""
+        """Uniformly distributed rotations."""
         return quaternion_to_matrix(self.normal(1.0, *shape, 4))
 
 
@@ -76,8 +80,6 @@ def rotated(
 def rotation_matrix(vector: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
     """Rotations by rotation vectors (axis times angle in radians)."""
     angle = vector.norm(dim=-1, keepdim=True)[..., None]
-    x, y, z = (vector / angle[..., 0].clamp_min(1e-9)).unbind(-1)
-    o = torch.zeros_like(x)
-    K = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+    K = so3_hat(vector / angle[..., 0].clamp_min(1e-9))
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
     return eye + angle.sin() * K + (1 - angle.cos()) * (K @ K)

@@ -1,4 +1,4 @@
-"""How the shipped flow network is made: random rooms on the GPU, loss and loop."""
+"""Training of the networks that are shipped: random rooms on the GPU, losses and loop."""
 
 from geogs.cli.command import Command
 

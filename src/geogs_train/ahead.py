@@ -7,21 +7,23 @@ from collections import deque
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 
+import torch
+
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import Plan, RoomSampler, draw_plan
 from geogs_train.course import Worker
 
 MOST_PROCESSES = 6
 AHEAD = 8
-"""Plans that are ready, beside those that are being drawn."""
+"""Plans that are ready, besides those that are being drawn."""
 
 
 class PlansAhead:
     """The plans of consecutive steps; drawing one takes longer than a step on a GPU may."""
 
     def __init__(self, rooms: RoomSampler, batch: int, worker: Worker, least: int = 1) -> None:
-        """At ``least`` so many processes draw them ahead for a GPU; on a CPU they are drawn when
-        they are asked for."""
+        """For a GPU, ``least`` or more processes draw them ahead; on a CPU they are drawn on
+        demand."""
         self._on_demand = partial(rooms.plan, batch=batch, rank=worker.rank)
         self._pool: ProcessPoolExecutor | None = None
         if worker.device.type == "cuda":
@@ -47,12 +49,12 @@ class PlansAhead:
         return plan
 
     def rest(self) -> None:
-        """Draw nothing until a plan is asked for again."""
+        """Discards the plans drawn ahead; none are drawn until one is asked for again."""
         while self._waiting:
             self._waiting.popleft()[1].cancel()
 
     def close(self) -> None:
-        """End the processes."""
+        """Ends the processes."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
@@ -60,8 +62,6 @@ class PlansAhead:
 def _pickled_plan(
     options: RoomOptions, materials: int, seed: int, batch: int, rank: int, step: int
 ) -> bytes:
-    import torch
-
     torch.set_num_threads(1)
     # As bytes, so that no tensor is handed over through shared memory, which containers lack.
     return pickle.dumps(draw_plan(options, materials, seed, step, batch, rank))

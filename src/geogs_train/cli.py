@@ -61,9 +61,5 @@ def main(argv: Sequence[str]) -> int:
 
     from geogs_train.launch import launch
 
-    launch(options.training, options.run, options.output, options.device, _say)
+    launch(options.training, options.run, options.output, options.device)
     return 0
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)

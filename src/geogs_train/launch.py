@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,13 @@ from geogs_train.depth.depth_options import DepthTraining
 from geogs_train.flow.flow_course import FlowCourse
 from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.network_trainer import Course
-from geogs_train.pace import shared
 from geogs_train.training_checkpoint import read_options
 from geogs_train.training_options import TrainingRunOptions
 from geogs_train.training_run import LOG, train
 
 
 def launch(
-    training: FlowTraining | DepthTraining,
-    run: TrainingRunOptions,
-    out: Path,
-    device: str,
-    progress: Callable[[str], None],
+    training: FlowTraining | DepthTraining, run: TrainingRunOptions, out: Path, device: str
 ) -> None:
     """Train, and draw the curves; a run that is gone on with keeps its settings.
 
@@ -40,8 +35,8 @@ def launch(
         if run.resume:
             training = read_options(out, type(training))
         course = course_of(training, worker)
-        train(course, run, out, worker, progress)
-        shared(0.0, worker)  # nobody leaves before the first has written everything
+        train(course, run, out, worker)
+        worker.shared(0.0)  # nobody leaves before the first has written everything
     if worker.rank == 0:
         draw_curves(out, course.curves)
 
@@ -75,9 +70,9 @@ def _worker(device: str) -> Iterator[Worker]:
 
 
 def draw_curves(out: Path, panels: Panels) -> None:
-    """Draw ``curves.png`` from the log of a run: the loss, and a panel for each title with names
-    of scores, and whether it is logarithmic. Scores in scores have names with dots; those that a
-    run does not have are left out."""
+    """Draw ``curves.png`` from the log of a run: the loss, then the panels of scores.
+
+    Scores in scores have names with dots; those that a run does not have are left out."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -56,7 +56,7 @@ class NetworkTrainer:
     def __init__(
         self, course: Course, worker: Worker, fuse: bool = False, paced: bool = False
     ) -> None:
-        """``paced``: ``progress`` is set by who calls, not by the fraction of the steps."""
+        """With ``paced`` the caller sets ``progress``; else it is the fraction of the steps."""
         self.course, self.worker = course, worker
         self.options = options = course.options
         torch.manual_seed(options.seed)
@@ -106,7 +106,7 @@ class NetworkTrainer:
             mine.load_state_dict(network.state_dict())
 
     def is_finite(self) -> bool:
-        """Whether all weights are."""
+        """Whether all weights are finite."""
         return bool(torch.stack([p.detach().isfinite().all() for p in self._parameters]).all())
 
     def _gradients(self, batch: Any) -> Float[Tensor, ""]:
@@ -130,7 +130,7 @@ def schedule(step: int, progress: float, options: TrainingSchedule) -> float:
 
 
 def _on_device(network: nn.Module, device: torch.device) -> Any:
-    """With the layout that convolutions are fast in (which PyTorch's stubs do not know)."""
+    """Moves a network to a device, with channels last, which PyTorch's stubs do not know."""
     return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,22 +11,30 @@ from geogs_train.course import Worker
 from geogs_train.depth.depth_validation import DepthValidation
 from geogs_train.flow.flow_validation import SceneValidation
 from geogs_train.network_trainer import Course, NetworkTrainer
-from geogs_train.pace import EVERY, Clock, shared
 from geogs_train.training_checkpoint import load_checkpoint, save_checkpoint
 from geogs_train.training_options import TrainingRunOptions
 
 LOG = "log.jsonl"
 REPORT_EVERY = 50
 """Steps between lines of the log."""
+CLOCK_EVERY = 10
+"""Steps between looks at the clock; each waits for the device."""
 
 
-Progress = Callable[[str], None]
-"""Called with a line of text."""
+class Clock:
+    """Fraction of a run that is done, where its minutes are given; ``begun`` was done before."""
+
+    def __init__(self, minutes: float, begun: float, worker: Worker) -> None:
+        self._seconds, self._begun, self._worker = 60 * minutes, begun, worker
+        self._start = time.monotonic()
+
+    def progress(self) -> float:
+        """0 to 1, by the clock of the first worker."""
+        done = min((time.monotonic() - self._start) / self._seconds, 1.0)
+        return self._worker.shared(self._begun + (1 - self._begun) * done)
 
 
-def train(
-    course: Course, run: TrainingRunOptions, out: Path, worker: Worker, progress: Progress
-) -> None:
+def train(course: Course, run: TrainingRunOptions, out: Path, worker: Worker) -> None:
     """Train until the last step or the last minute.
 
     The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
@@ -46,13 +53,13 @@ def train(
     if run.resume:
         load_checkpoint(trainer, out)
     first = worker.rank == 0
-    validation = course.examination(run.validation_batches) if first else None
+    validation = course.validation(run.validation_batches) if first else None
     out.mkdir(parents=True, exist_ok=True)
     since, at = time.monotonic(), trainer.step
     clock = Clock(run.minutes, trainer.progress, worker) if run.paced and run.minutes else None
     try:
         while trainer.progress < 1:
-            if clock is not None and trainer.step % EVERY == 0:
+            if clock is not None and trainer.step % CLOCK_EVERY == 0:
                 trainer.progress = clock.progress()
             loss = trainer.advance()
             if trainer.step % REPORT_EVERY == 0:
@@ -64,34 +71,35 @@ def train(
                 if first:
                     entry = {"step": trainer.step, "loss": value, "rate": rate}
                     _log(out, {**entry, "minutes": (now - begin) / 60})
-                    progress(f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
-                             f"loss {value:.3f}  {rate:.1f} steps/s")  # fmt: skip
+                    _say(f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
+                         f"loss {value:.3f}  {rate:.1f} steps/s")  # fmt: skip
                 late = run.minutes is not None and now - begin > 60 * run.minutes
-                if clock is None and shared(late, worker):
+                if clock is None and worker.shared(late):
                     break
             if trainer.step % run.validate_every == 0 and validation is not None:
-                _save(trainer, validation, out, progress)
+                _save(trainer, validation, out)
                 since, at = time.monotonic(), trainer.step
     except KeyboardInterrupt:
-        progress("interrupted; writing what there is")
+        _say("interrupted; writing what there is")
     finally:
         course.close()
     if validation is not None:
-        _save(trainer, validation, out, progress)
+        _save(trainer, validation, out)
 
 
 def _save(
-    trainer: NetworkTrainer,
-    validation: SceneValidation | DepthValidation,
-    out: Path,
-    progress: Progress,
+    trainer: NetworkTrainer, validation: SceneValidation | DepthValidation, out: Path
 ) -> None:
     """Validate, and write the checkpoint and the weights."""
     scores: Any = validation.score(trainer.mean)
     _log(out, {"step": trainer.step, "scores": asdict(scores)})
-    progress(f"validation at step {trainer.step}: {scores.line()}")
+    _say(f"validation at step {trainer.step}: {scores.line()}")
     save_checkpoint(trainer, out)
     trainer.course.export(trainer.mean, out / trainer.course.weights, trainer.step, scores)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
 
 
 def _log(out: Path, entry: dict[str, Any]) -> None:

@@ -31,11 +31,11 @@ def test_its_path_is_half_a_metre_from_everything(location: Location) -> None:
 def test_thin_things_and_what_is_behind_them_are_in_view(location: Location) -> None:
     camera, (vertices, faces, *_) = location.camera(200, 150), scene_mesh(location.scene)
     image = np.zeros((150, 200, 3), np.uint8)
-    shares = []
+    fractions = []
     for T_wc in location.motion.path(np.array([0.0, 3.0, 6.0])):
         depth, _ = render_mesh(vertices, faces, camera, np.linalg.inv(T_wc))
         places = places_of(depth, image, camera, fit_planes(depth, 7, 0.003))
-        shares.append([places["thin"].mean(), places["behind thin"].mean()])
-    thin, behind = np.mean(shares, 0)
+        fractions.append([places["thin"].mean(), places["behind thin"].mean()])
+    thin, behind = np.mean(fractions, 0)
     assert thin > 0.05
     assert behind > 0.15

@@ -121,7 +121,7 @@ def test_bad_input(tmp_path: Path, raycaster: Raycaster) -> None:
     with pytest.raises(InputError, match="at least 1 frame"):
         write_sequence(tmp_path, 0)
     with pytest.raises(InputError, match="16 to"):
-        write_sequence(tmp_path, 1, 4, 4)
+        write_sequence(tmp_path, 1, 4, 4, raycaster=raycaster)
     with pytest.raises(InputError, match="jpg or png"):
         write_sequence(tmp_path, 1, image_format="bmp")
     assert not list(tmp_path.iterdir())

@@ -208,14 +208,11 @@ def test_texture_is_everywhere(raycaster: Raycaster, poses: np.ndarray) -> None:
     assert (view.image == 255).all(-1).mean() < 0.02
 
 
-def test_same_seed_same_image(room: Scene, raycaster: Raycaster, poses: np.ndarray) -> None:
+def test_same_seed_same_image(raycaster: Raycaster, poses: np.ndarray) -> None:
     again = Raycaster(make_room(0), threads=2).render(CAMERA, poses[0])
     view = raycaster.render(CAMERA, poses[0])
     for name in ("image", "depth", "normal", "solid"):
         np.testing.assert_array_equal(getattr(view, name), getattr(again, name))
-    other = make_room(1)
-    assert len(other) != len(room) or not np.allclose(other.solids.centre, room.solids.centre)
-    assert not np.allclose(other.size, room.size)
 
 
 def test_resolution_keeps_geometry(raycaster: Raycaster, poses: np.ndarray) -> None:
@@ -227,9 +224,8 @@ def test_resolution_keeps_geometry(raycaster: Raycaster, poses: np.ndarray) -> N
     assert math.isclose(small.cx, 39.5)
 
 
-def test_light_reaches_cells_as_if_every_solid_was_asked():
+def test_light_reaches_cells_as_if_every_solid_was_asked(room: Scene) -> None:
     """Solids that are left out because they are far from a ray would not have been in its way."""
-    room = make_room(0)
     s, rng = room.solids, np.random.default_rng(0)
     radius = np.linalg.norm(s.bounding_half, axis=1)
     solids = s.kind, s.half, s.rotation, s.centre, radius

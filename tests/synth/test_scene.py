@@ -91,6 +91,12 @@ def test_room_is_closed_and_of_the_right_size(raycaster: Raycaster, room: Scene)
     assert view.depth.max() < 7
 
 
+def test_rooms_of_other_seeds_differ() -> None:
+    first, other = (lit_room(seed).scene for seed in (0, 3))
+    assert len(other) != len(first) or not np.allclose(other.solids.centre, first.solids.centre)
+    assert not np.allclose(other.size, first.size)
+
+
 def test_path_keeps_clear_of_everything(room: Scene) -> None:
     for seed in range(3):
         poses = handheld_trajectory(room, 2 * FRAMES_PER_LAP, seed)

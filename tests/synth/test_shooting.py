@@ -172,16 +172,16 @@ def test_walkers_cross_and_the_mask_is_theirs(scene: Scene, raycaster: Raycaster
     path = room_motion("slow-handheld", scene).path
     busy = raycaster.with_bodies(crossing_walkers(path, 3.0, CAMERA, 0.3))
     shooting = Shooting(busy, LENS, path, Flaws())
-    shares = []
+    fractions = []
     for index in range(0, 90, 10):
         shot = shooting.shoot(index)
         empty = raycaster.render(LENS, shot.T_wc)
         assert (shot.truth.depth[shot.moving] < empty.depth[shot.moving]).all()
         np.testing.assert_array_equal(shot.truth.depth[~shot.moving], empty.depth[~shot.moving])
         np.testing.assert_array_equal(shot.moving, shot.truth.solid >= len(scene))
-        shares.append(shot.moving.mean())
-    assert 0.22 < max(shares) < 0.36
-    assert min(shares) < 0.1
+        fractions.append(shot.moving.mean())
+    assert 0.22 < max(fractions) < 0.36
+    assert min(fractions) < 0.1
 
 
 def test_walkers_walk(scene: Scene) -> None:

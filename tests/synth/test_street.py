@@ -98,11 +98,11 @@ def test_drive_is_forward_in_its_lane(street: Scene) -> None:
 
 def test_traffic_covers_its_share(raycaster: Raycaster, street: Scene, view: RenderedView) -> None:
     T_wc = drive(0).path(np.zeros(1))[0]
-    for share in (0.1, 0.3):
-        busy = raycaster.with_bodies(street_traffic(CAMERA, share))
+    for fraction in (0.1, 0.3):
+        busy = raycaster.with_bodies(street_traffic(CAMERA, fraction))
         seen = busy.render(CAMERA, T_wc)
         moving = seen.solid >= len(street)
-        assert moving.mean() == pytest.approx(share, rel=0.35)
+        assert moving.mean() == pytest.approx(fraction, rel=0.35)
         far = np.where(view.depth > 0, view.depth, np.inf)
         assert (seen.depth[moving] < far[moving]).all()
         np.testing.assert_array_equal(seen.depth[~moving], view.depth[~moving])

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from depth_tuples import TRAINING
-from geogs_train import pace
+from geogs_train import training_run
 from geogs_train.course import Worker
 from geogs_train.network_trainer import schedule
-from geogs_train.pace import Clock, shared
+from geogs_train.training_run import Clock
 
 CPU = Worker(torch.device("cpu"))
 
@@ -27,7 +27,7 @@ class FakeTime:
 @pytest.fixture
 def clock_time(monkeypatch) -> FakeTime:
     made = FakeTime()
-    monkeypatch.setattr(pace, "time", made)
+    monkeypatch.setattr(training_run, "time", made)
     return made
 
 
@@ -50,7 +50,7 @@ def test_a_resumed_run_goes_on_from_where_it_was(clock_time):
 
 
 def test_one_worker_shares_with_nobody():
-    assert shared(0.3, CPU) == 0.3
+    assert CPU.shared(0.3) == 0.3
 
 
 def test_the_learning_rate_ends_near_zero_whatever_the_step():

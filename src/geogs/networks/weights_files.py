@@ -1,6 +1,6 @@
-"""The weights files that can be used: where they are had and found, and whether they are intact.
+"""The weights files that can be used: where to get and find them, and whether they are intact.
 
-What is said of public files is what their own pages say; a checksum is known of the package's own.
+What is said of public files is from their own pages; checksums are those of the package's own.
 """
 
 import hashlib
@@ -17,7 +17,6 @@ PACKAGED = Path(__file__).parents[1] / "data" / "weights"
 """Weights that come with the package, and their ``SHA256SUMS``."""
 VARIABLE = "GEOGS_WEIGHTS"
 """Environment variable with a weights file, or a folder of them."""
-
 
 Purpose = Literal["own", "droid", "depth", "prior"]
 """A flow operator, the depth network, or a monocular prior."""
@@ -36,7 +35,7 @@ class KnownWeights:
     what: str
     """What it is, in a few words."""
     origin: str
-    """Where it is had."""
+    """Where to get it."""
     licence: str
 
 
@@ -44,49 +43,33 @@ _HUB = "https://huggingface.co/"
 
 CATALOGUE = (
     KnownWeights(
-        "flow.safetensors",
-        "own",
-        "flow for static scenes, trained by geogs",
-        COMES_ALONG,
-        "Apache-2.0",
+        "flow.safetensors", "own", "flow for static scenes, trained by geogs",
+        COMES_ALONG, "Apache-2.0",
     ),
     KnownWeights(
-        "droid.pth",
-        "droid",
-        "DROID-SLAM, TartanAir",
-        "https://github.com/princeton-vl/DROID-SLAM (README, droid.pth)",
-        "BSD-3-Clause",
+        "droid.pth", "droid", "DROID-SLAM, TartanAir",
+        "https://github.com/princeton-vl/DROID-SLAM (README, droid.pth)", "BSD-3-Clause",
     ),
     KnownWeights(
-        "depth.safetensors",
-        "depth",
-        "multi-view depth of still scenes, trained by geogs",
-        COMES_ALONG,
-        "Apache-2.0",
+        "depth.safetensors", "depth", "multi-view depth of still scenes, trained by geogs",
+        COMES_ALONG, "Apache-2.0",
     ),
     KnownWeights(
-        "depth-anything-v2-small.onnx",
-        "prior",
-        "Depth Anything V2 small: inverse depth",
-        _HUB + "onnx-community/depth-anything-v2-small (onnx/model.onnx)",
-        "Apache-2.0",
+        "depth-anything-v2-small.onnx", "prior", "Depth Anything V2 small: inverse depth",
+        _HUB + "onnx-community/depth-anything-v2-small (onnx/model.onnx)", "Apache-2.0",
     ),
     KnownWeights(
-        "metric3d-vit-small.onnx",
-        "prior",
-        "Metric3D v2 small: depth and normals",
+        "metric3d-vit-small.onnx", "prior", "Metric3D v2 small: depth and normals",
         _HUB + "onnx-community/metric3d-vit-small (onnx/model.onnx)",
         "CC0-1.0 by that page; BSD-2-Clause repository of the authors",
     ),
     KnownWeights(
-        "omnidata_normal_dpt_hybrid.pth",
-        "prior",
+        "omnidata_normal_dpt_hybrid.pth", "prior",
         "Omnidata DPT-hybrid: normals; a PyTorch checkpoint",
-        _HUB + "sashasax/omnidata_normal_dpt_hybrid_384",
-        "CC-BY-NC-4.0",
+        _HUB + "sashasax/omnidata_normal_dpt_hybrid_384", "CC-BY-NC-4.0",
     ),
-)
-"""In the order in which an operator takes what it finds."""
+)  # fmt: skip
+"""In the order of preference for each purpose."""
 
 
 def known_as(name: str) -> KnownWeights | None:
@@ -96,7 +79,7 @@ def known_as(name: str) -> KnownWeights | None:
 
 @dataclass(frozen=True)
 class Checksum:
-    """The SHA-256 of a file beside that which is published for its name."""
+    """The SHA-256 of a file and the one published for its name."""
 
     actual: str
     published: str
@@ -109,7 +92,7 @@ class Checksum:
 
     @property
     def verdict(self) -> str:
-        """In words."""
+        """The comparison in words."""
         if not self.published:
             return "no checksum is published, not verified"
         if self.is_wrong:

@@ -1,4 +1,4 @@
-"""Cameras and one model of their flaws, in two hands.
+"""Cameras and one model of their flaws, implemented twice.
 
 Light comes in row by row (rolling shutter) and over the exposure (blur), through a lens that bends
 (radial distortion) and darkens (vignetting); gains for exposure and white balance, a tone curve,

@@ -1,4 +1,4 @@
-"""Cameras in rooms: where their rays go and where points are in their images."""
+"""Batches of cameras: rays through pixels and projection of points."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,14 @@ from torch import Tensor
 from geogs_synth.draw import rotated
 
 MIN_Z = 0.01
-"""Metres before a camera from where on points have a place in its image."""
+"""Least depth in metres of points that have a projection."""
 ROUNDS = 8
 """Projections until the row that sees a point is known; each leaves a tenth of the error."""
 
 
 @dataclass(frozen=True)
 class CameraBatch:
-    """Cameras: v views in each of b rooms."""
+    """v views in each of b rooms."""
 
     T_cw: Float[Tensor, "b v 4 4"]
     """World to camera, OpenCV axes."""
@@ -27,8 +27,8 @@ class CameraBatch:
     height: int
     """Pixels."""
     sweep: Float[Tensor, "b v 6"] | None = None
-    """What a camera does while its rows are read, from the first to the last: rotation vector and
-    way (metres) in the frame of its middle row, which ``T_cw`` is of; None for all at once."""
+    """Motion of a camera from its first row to its last: rotation vector and translation (metres)
+    in the frame of its middle row, which ``T_cw`` is of; None where all rows are read at once."""
 
     @property
     def R_wc(self) -> Float[Tensor, "b v 3 3"]:
@@ -41,8 +41,8 @@ class CameraBatch:
         return -(self.R_wc @ self.T_cw[..., :3, 3:])[..., 0]
 
     def packed(self) -> Float[Tensor, "b v 24"]:
-        """What the kernels read: camera to world by rows, the intrinsics, what it does while its
-        rows are read, and the fraction of that from row to row."""
+        """What the kernels read: camera to world by rows, the intrinsics, the motion while rows are
+        read, and the fraction of that from row to row."""
         pose = torch.cat([self.R_wc, self.centre[..., None]], -1).flatten(-2)
         k = self.intrinsics[:, None].expand(-1, pose.shape[1], -1)
         sweep = torch.zeros_like(pose[..., :6]) if self.sweep is None else self.sweep
@@ -51,7 +51,7 @@ class CameraBatch:
         return torch.cat([pose, k, sweep, row], -1).float().contiguous()
 
     def as_rooms(self) -> "CameraBatch":
-        """Every view as that of a room of its own."""
+        """Each view alone in a room of its own."""
         sweep = None if self.sweep is None else self.sweep.flatten(0, 1)[:, None]
         intrinsics = self.intrinsics.repeat_interleave(self.T_cw.shape[1], 0)
         return CameraBatch(
@@ -63,10 +63,10 @@ class CameraBatch:
         return (y / max(self.height - 1, 1) - 0.5).clamp(-1, 1)[..., None]
 
     def swept(self, view: int) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 3"]]:
-        """Rotation vector and way of a view from its first row to its last."""
+        """Rotation vector and translation of a view from its first row to its last."""
         assert self.sweep is not None
-        rotation, way = self.sweep[:, view, None].split(3, -1)
-        return rotation, way
+        rotation, translation = self.sweep[:, view, None].split(3, -1)
+        return rotation, translation
 
 
 def rays(
@@ -77,9 +77,9 @@ def rays(
     d = torch.stack(torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), -1)
     centre = views.centre[:, view, None]
     if views.sweep is not None:
-        fraction, (rotation, way) = views.row_fraction(y), views.swept(view)
+        fraction, (rotation, translation) = views.row_fraction(y), views.swept(view)
         d = rotated(d, fraction * rotation)
-        centre = centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], fraction * way)
+        centre = centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], fraction * translation)
     direction = torch.einsum("bij,bmj->bmi", views.R_wc[:, view], d)
     return centre.expand_as(direction), direction
 
@@ -95,10 +95,11 @@ def project(
     middle = torch.einsum("bij,bmj->bmi", views.T_cw[:, view, :3, :3], ray)
     pixels, before = _pinhole(views, middle)
     if views.sweep is not None:
-        rotation, way = views.swept(view)
+        rotation, translation = views.swept(view)
         for _ in range(ROUNDS):
             fraction = views.row_fraction(pixels[..., 1])
-            pixels, before = _pinhole(views, rotated(middle - fraction * way, -fraction * rotation))
+            in_row = rotated(middle - fraction * translation, -fraction * rotation)
+            pixels, before = _pinhole(views, in_row)
     return pixels, before
 
 
@@ -109,8 +110,8 @@ def row_centre(
     centre = views.centre[:, view, None]
     if views.sweep is None:
         return centre.expand(*pixels.shape[:2], 3)
-    way = views.row_fraction(pixels[..., 1]) * views.swept(view)[1]
-    return centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], way)
+    translation = views.row_fraction(pixels[..., 1]) * views.swept(view)[1]
+    return centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], translation)
 
 
 def _pinhole(

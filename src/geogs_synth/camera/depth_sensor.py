@@ -31,7 +31,7 @@ class DepthSensor:
     def measure(
         self, depth: Float32[np.ndarray, "h w"], focal: float, seed: int, frame: int
     ) -> Float32[np.ndarray, "h w"]:
-        """What it measures of exact depth z in metres; 0 where nothing, as in the truth.
+        """Measured depth of exact depth z, in metres; 0 where there is none.
 
         ``focal`` in pixels. The same frame of the same seed has the same noise.
         """
@@ -42,7 +42,7 @@ class DepthSensor:
         seen = cv2.remap(
             depth, u + jitter[0], v + jitter[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
         )
-        inverse = np.where(seen > 0, 1 / np.where(seen > 0, seen, 1), 0)
+        inverse = _inverse(seen)
         noisy = inverse + self.deviation * rng.standard_normal(inverse.shape, np.float32)
         noisy = np.maximum(np.rint(noisy / self.step) * self.step, self.step)
         lost = rng.random(inverse.shape, np.float32)
@@ -52,6 +52,11 @@ class DepthSensor:
         return np.where(hole, 0, 1 / noisy).astype(np.float32)
 
 
+def _inverse(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Inverse depth, 0 where there is none."""
+    return np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0).astype(np.float32)
+
+
 def _steps(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
     """Pixels at a step of depth of more than 5 %."""
     return cv2.dilate(depth, _CLOSED) > 1.05 * cv2.erode(depth, _CLOSED)
@@ -59,7 +64,7 @@ def _steps(depth: Float32[np.ndarray, "h w"]) -> np.ndarray:
 
 def _slant(depth: Float32[np.ndarray, "h w"], focal: float) -> Float32[np.ndarray, "h w"]:
     """Angle between optical axis and normal, radians, from the change of inverse depth."""
-    d = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0).astype(np.float32)
+    d = _inverse(depth)
     across = cv2.Sobel(d, cv2.CV_32F, 1, 0, ksize=1) / 2
     down = cv2.Sobel(d, cv2.CV_32F, 0, 1, ksize=1) / 2
     tangent = focal * np.hypot(across, down) / np.maximum(d, np.float32(1e-6))

@@ -12,7 +12,7 @@ from geogs_synth.draw import Draw
 _MIDDLE = 0.2
 """Brightness of a clip before its exposure is off."""
 _KNEE = 0.6
-"""Brightness from where on highlights bend over instead of being cut off at once."""
+"""Brightness from which on highlights are compressed instead of clipped."""
 
 
 def develop(

@@ -40,7 +40,7 @@ class Sensor:
         return image if self._flaws.jpeg is None else _through_jpeg(image, self._flaws.jpeg)
 
     def gains(self, time: float) -> Float64[np.ndarray, "3"]:
-        """What the light of red, green and blue is multiplied with at ``time`` seconds."""
+        """Gains of red, green and blue at ``time`` seconds."""
         stops, balance = np.sin(2 * np.pi * time / _PERIODS + self._phases).mean(1)
         balance *= self._flaws.colour_drift
         gain = 2.0 ** (self._flaws.gain_drift * stops)

@@ -41,7 +41,7 @@ def compress(
 
 
 def _mix(matrix: Matrix, image: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Other colours; the numbers stay in the program, a tensor would have to be sent."""
+    """Linear transform of colours; plain numbers need not be sent to the device."""
     a, b, c = image.unbind(1)
     return torch.stack([r[0] * a + r[1] * b + r[2] * c for r in matrix], 1)
 

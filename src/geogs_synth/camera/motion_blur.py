@@ -1,4 +1,4 @@
-"""Blur of what moves while a camera looks: of everything where it moves itself, and of things."""
+"""Motion blur, by the camera's own motion and by that of objects."""
 
 from collections.abc import Sequence
 
@@ -48,8 +48,8 @@ def motion_while_open(
 ) -> Float[Tensor, "b v h w 2"]:
     """Pixels by which each point moves in the image while the shutter is open.
 
-    ``camera`` is what the camera does in this time (rotation vector, way, in its frame),
-    ``things`` what the points do, world frame.
+    ``camera`` is the motion of the camera in this time (rotation vector, translation, in its
+    frame), ``things`` that of the points, world frame.
     """
     h, w = depth.shape[-2:]
     fx, fy, cx, cy = views.intrinsics[:, :, None, None, None].unbind(1)

@@ -1,4 +1,4 @@
-"""A lens that is not the same from frame to frame: focused anew, and moved against the shake."""
+"""A lens that changes from frame to frame: focus breathing and optical stabilisation."""
 
 from dataclasses import replace
 
@@ -9,20 +9,18 @@ from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.radial_camera import RadialCamera
 
 _FOCUS_PERIODS = np.array([1.1, 2.3, 4.7])
-"""Seconds of the waves in which it is focused."""
+"""Periods in seconds of the waves in which it is focused."""
 _SHAKE_PERIODS = np.array([0.17, 0.31, 0.7])
-"""And moved: those of a hand."""
+"""Periods in seconds of a hand's shake, against which it is moved."""
 _STREAM = 0x1E5
 
 
 class MovingLens:
-    """Magnifies otherwise as it is focused (focus breathing), and is moved, or its image cropped
-    elsewhere, as it is stabilised; all in the plane of the sensor."""
+    """Changes its focal length as it is focused, and its principal point as it is stabilised."""
 
     def __init__(self, lens: RadialCamera, flaws: Flaws, seed: int = 0) -> None:
         self._lens, self._flaws = lens, flaws
-        phases = np.random.default_rng([seed, _STREAM]).uniform(0, 2 * np.pi, (3, 3))
-        self._phases = phases
+        self._phases = np.random.default_rng([seed, _STREAM]).uniform(0, 2 * np.pi, (3, 3))
 
     def at(self, time: float) -> RadialCamera:
         """The lens of a frame that is taken at ``time`` seconds."""

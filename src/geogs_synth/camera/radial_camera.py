@@ -1,4 +1,4 @@
-"""The rays of a camera's pixels, through a lens that bends straight lines or does not."""
+"""A pinhole camera with or without radial distortion, and the rays through its pixels."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,6 +32,11 @@ class RadialCamera:
                 f"k1 {self.k1:g} and k2 {self.k2:g} fold the image over itself; choose smaller "
                 f"ones."
             )
+
+    @staticmethod
+    def of(camera: "Camera | RadialCamera") -> "RadialCamera":
+        """A camera without distortion, if it is not one of these already."""
+        return camera if isinstance(camera, RadialCamera) else RadialCamera(camera)
 
     @property
     def is_distorted(self) -> bool:

@@ -1,4 +1,4 @@
-"""How imperfect the cameras are that take the clips."""
+"""Random flaws of the cameras that take the clips."""
 
 from dataclasses import dataclass
 

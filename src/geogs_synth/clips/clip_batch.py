@@ -7,8 +7,8 @@ from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch, pixel_grid, project, rays
 from geogs_synth.clips.dynamics import Dynamics
-from geogs_synth.raycast.caster import FlowTruth
-from geogs_synth.raycast.casters import caster_for
+from geogs_synth.raycast.caster_choice import caster_for
+from geogs_synth.raycast.rendered_rooms import FlowTruth
 from geogs_synth.scene.solids import SolidBatch
 
 
@@ -24,31 +24,20 @@ class ClipBatch:
     """z along the optical axis in metres, exact at the (integer) pixel centres."""
     normal: Float[Tensor, "b v 3 h w"]
     """Unit, camera frame, facing the camera, exact at the pixel centres."""
-    T_cw: Float[Tensor, "b v 4 4"]
-    """World to camera, OpenCV axes."""
-    intrinsics: Float[Tensor, "b 4"]
-    """fx fy cx cy in pixels, pixel centres at integers."""
+    solid: Int[Tensor, "b v h w"]
+    """Place of the solid that each pixel shows; -1 for the room itself."""
+    views: CameraBatch
     solids: SolidBatch
     """What stands in the rooms when the first view is taken; hides points from views."""
-    solid: Int[Tensor, "b v h w"]
-    """FloorPose of the solid that each pixel shows; -1 for the room itself."""
-    sweep: Float[Tensor, "b v 6"] | None = None
-    """What the cameras do while their rows are read, as in :class:`CameraBatch`."""
     dynamics: Dynamics | None = None
     """What is unusual; None where nothing is."""
-
-    @property
-    def views(self) -> CameraBatch:
-        """The cameras."""
-        height, width = self.depth.shape[-2:]
-        return CameraBatch(self.T_cw, self.intrinsics, width, height, self.sweep)
 
     def flow(self, first: int, second: int) -> FlowTruth:
         """Where the points that the view ``first`` sees are in the view ``second``."""
         points, solids = self.points(first), self.solids
         if self.dynamics is not None:
-            points = points + (second - first) * self.dynamics.ways_of(self.solid[:, first])
-            solids = solids.moved_by(self.dynamics.ways, second)
+            points = points + (second - first) * self.dynamics.velocity_of(self.solid[:, first])
+            solids = solids.moved_by(self.dynamics.velocity, second)
         return caster_for(points.device).flow(solids, self.views, points, second)
 
     def still_flow(self, points: Float[Tensor, "b h w 3"], second: int) -> Float[Tensor, "b h w 2"]:

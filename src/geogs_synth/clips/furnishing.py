@@ -1,6 +1,7 @@
-"""What stands where in random rooms."""
+"""Furniture and other things in random rooms, and where they stand."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,7 +26,7 @@ class Furnishing:
 
 @dataclass(frozen=True)
 class _Group:
-    """Places that are filled in the same way."""
+    """Places that hold pieces of one kind."""
 
     solids: SolidBatch
     per_material: int
@@ -46,7 +47,7 @@ def draw_furnishing(
     tables = pieces.tables(draw, size, 3)
     shelves = pieces.shelves(draw, size, 2)
     furniture = (cupboards, tables, shelves)
-    standing = [draw.uniform(0, 1, *placed[1].yaw.shape) < density for placed in furniture]
+    standing = [_drawn(draw, placed, density) for placed in furniture]
     floor = loose.floor(size)
     supports = [(cupboards, standing[0], 0), (tables, standing[1], 0)]
     supports += [(shelves, standing[2], k) for k in range(BOARDS)]
@@ -56,8 +57,7 @@ def draw_furnishing(
     )
     anywhere = torch.cat([floor.expand(-1, 6, -1), faces], 1)
 
-    def some(placed: StandingPiece) -> SolidBatch:
-        return _put(placed, draw.uniform(0, 1, *placed[1].yaw.shape) < density)
+    some = partial(_some, draw, density)
 
     def scattered(solids: SolidBatch, factor: float = 1.0) -> SolidBatch:
         return solids.without(draw.uniform(0, 1, *solids.kind.shape) > factor * density)
@@ -83,10 +83,7 @@ def draw_furnishing(
 def _thin_things(draw: Draw, size: Float[Tensor, "b 3"], most: float) -> tuple[_Group, ...]:
     """Railings, lattices, cables, bushes and more chairs: none in some rooms, many in others."""
     density = draw.uniform(0, most, len(size))[:, None]
-
-    def some(placed: StandingPiece) -> SolidBatch:
-        return _put(placed, draw.uniform(0, 1, *placed[1].yaw.shape) < density)
-
+    some = partial(_some, draw, density)
     cables = thin_things.cables(draw, size, 3)
     gone = draw.uniform(0, 1, len(size), 3) > density
     cables = cables.without(gone.repeat_interleave(thin_things.SEGMENTS, 1))
@@ -98,6 +95,16 @@ def _thin_things(draw: Draw, size: Float[Tensor, "b 3"], most: float) -> tuple[_
         _Group(some(pieces.chairs(draw, size, 3)), 6),
         _Group(some(pieces.tables(draw, size, 1)), 5),
     )
+
+
+def _drawn(draw: Draw, placed: StandingPiece, density: Float[Tensor, "b 1"]) -> Bool[Tensor, "b k"]:
+    """Which of the pieces are there, at random."""
+    return draw.uniform(0, 1, *placed[1].yaw.shape) < density
+
+
+def _some(draw: Draw, density: Float[Tensor, "b 1"], placed: StandingPiece) -> SolidBatch:
+    """The solids of the pieces that are there."""
+    return _put(placed, _drawn(draw, placed, density))
 
 
 def _put(placed: StandingPiece, there: Bool[Tensor, "b k"]) -> SolidBatch:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.draw import Draw
-from geogs_synth.scene.batch import chosen
+from geogs_synth.scene.batch import where
 from geogs_synth.scene.rooms import Lights
 
 MOST_LIGHTS = 3
@@ -17,11 +17,11 @@ def draw_lights(draw: Draw, size: Float[Tensor, "b 3"], views: int, change: floa
     first, second = _draw(draw, size), _draw(draw, size)
     moment = draw.integers(max(views - 1, 1), b) + 1
     later = draw.chance(change, b)[:, None] & (torch.arange(views) >= moment[:, None])
-    return chosen(later, second, first)
+    return where(later, second, first)
 
 
 def _draw(draw: Draw, size: Float[Tensor, "b 3"]) -> Lights:
-    """One state of the light: a single view."""
+    """The light of a single view."""
     b = len(size)
     n = (b, 1, MOST_LIGHTS)
     position = draw.uniform(0.05, 0.95, *n, 3)

@@ -1,4 +1,4 @@
-"""Things that stand on others, lean or hang: clutter, rows of books, wires, slabs turned anyhow."""
+"""Things that stand on others, lean or hang: clutter, rows of books, wires, rotated slabs."""
 
 import torch
 from jaxtyping import Float
@@ -30,7 +30,7 @@ def clutter(draw: Draw, supports: Tops, count: int) -> SolidBatch:
 
 
 def books(draw: Draw, supports: Tops, rows: int) -> StandingPiece:
-    """Rows of upright books, as high as each other to a degree, side by side."""
+    """Rows of upright books of similar heights."""
     n = (len(supports), rows)
     support = _choose(draw, supports, rows)
     thick = draw.log_uniform(0.008, 0.03, *n, _BOOKS)
@@ -46,7 +46,7 @@ def books(draw: Draw, supports: Tops, rows: int) -> StandingPiece:
 
 
 def wires(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
-    """Thin rods: upright, along a wall, or anyhow."""
+    """Thin rods: upright, along a wall, or of any direction."""
     n = (len(size), count)
     radius = draw.log_uniform(0.004, 0.025, *n)
     half = torch.stack([radius, radius, draw.log_uniform(0.15, 1.4, *n)], -1)
@@ -58,7 +58,7 @@ def wires(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
 
 
 def slabs(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
-    """Slabs, boxes and ellipsoids turned anyhow, in the air too."""
+    """Randomly rotated slabs, boxes and ellipsoids, in the air too."""
     n = (len(size), count)
     half = draw.log_uniform(0.05, 0.5, *n, 3)
     half[..., 2] = half[..., 2] * draw.log_uniform(0.03, 1.0, *n)

@@ -1,4 +1,4 @@
-"""What the surfaces of random rooms look like."""
+"""Appearance of the surfaces of random rooms."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs_synth.clips.furnishing import Furnishing
 from geogs_synth.draw import Draw
-from geogs_synth.scene.batch import concatenated, gathered
+from geogs_synth.scene.batch import concatenate, gather
 from geogs_synth.scene.rooms import Surfaces
 
 _PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
@@ -17,10 +17,12 @@ _PLAIN_SOLID = 0.35
 _SHOWS_IMAGE = (0.12, 0.12, 0.12, 0.12, 0.12, 0.04)
 """Fraction of them that show images rather than materials."""
 _SOLID_SHOWS_IMAGE = 0.35
+_PERIOD = (0.06, 0.7)
+"""Width in metres of a pattern that walls repeat."""
 
 
 def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int) -> Surfaces:
-    """Looks of the room's six faces and of two surfaces of each solid.
+    """Appearance of the room's six faces and of two surfaces of each solid.
 
     Of the ``textures`` in the bank the first ``materials`` are materials, the others images.
     """
@@ -43,7 +45,7 @@ def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int)
     owner = torch.stack([2 * layout.material, 2 * layout.material + 1], -1).flatten().repeat(b, 1)
     # The ends of most solids look like their sides.
     owner = torch.where(draw.chance(0.6, b, 2 * n), owner - owner % 2, owner)
-    return concatenated(gathered(walls, wall), gathered(solids, owner))
+    return concatenate(gather(walls, wall), gather(solids, owner))
 
 
 def _texture(
@@ -90,7 +92,7 @@ def _draw(
 
 
 def _matrix(scale: Float[Tensor, "b s"], angle: Float[Tensor, "b s"]) -> Float[Tensor, "b s 2 2"]:
-    """Turned and scaled; upside down, because rows of an image go down."""
+    """Rotation and scale; upside down, because rows of an image go down."""
     c, s = scale * angle.cos(), scale * angle.sin()
     return torch.stack([c, s, s, -c], -1).unflatten(-1, (2, 2))
 
@@ -115,4 +117,38 @@ def _show_pictures(
         detail=torch.where(picture, 0.0, surfaces.detail),
         glow=torch.where(picture, bright, surfaces.glow),
         mirror=torch.where(picture, glass, surfaces.mirror),
+    )
+
+
+def papered(draw: Draw, surfaces: Surfaces, which: Bool[Tensor, "b"]) -> Surfaces:
+    """The walls, and half of the floors, of these rooms repeat one image exactly, often."""
+    b = len(which)
+    half = torch.tensor([True] * 4 + [False, False]).expand(b, 6) & which[:, None]
+    floor = torch.tensor([False] * 4 + [True, False]).expand(b, 6)
+    chosen = half | (floor & (which & draw.chance(0.5, b))[:, None])
+    chosen = torch.nn.functional.pad(chosen, (0, surfaces.contrast.shape[1] - 6))
+    scale = surfaces.matrix[..., 0].norm(dim=-1)
+    wanted = 1 / draw.log_uniform(*_PERIOD, b, 1)
+    matrix = surfaces.matrix * (wanted / scale)[..., None, None]
+    contrast = draw.log_uniform(0.15, 1.2, b, 1).expand_as(scale)
+    return replace(
+        surfaces,
+        matrix=torch.where(chosen[..., None, None], matrix, surfaces.matrix),
+        contrast=torch.where(chosen, contrast, surfaces.contrast),
+        detail=torch.where(chosen, 0.0, surfaces.detail),
+    )
+
+
+def bared(draw: Draw, surfaces: Surfaces, which: Bool[Tensor, "b"]) -> Surfaces:
+    """All of the rooms' faces and most solids of these rooms are of one colour, or nearly."""
+    b, s = surfaces.contrast.shape
+    chosen = draw.chance(0.75, b, s)
+    chosen[:, :6] = draw.chance(0.95, b, 6)
+    chosen &= which[:, None]
+    faint = draw.chance(0.5, b, s) * draw.log_uniform(0.003, 0.04, b, s)
+    return replace(
+        surfaces,
+        contrast=torch.where(chosen, faint, surfaces.contrast),
+        detail=torch.where(chosen, 0.3 * faint, surfaces.detail),
+        mirror=torch.where(chosen, 0.0, surfaces.mirror),
     )

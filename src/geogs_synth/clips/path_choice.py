@@ -1,4 +1,4 @@
-"""Which of the candidate paths is filmed: the first that is clear of everything and sees enough."""
+"""Choice of a candidate path: the first that keeps clear of everything and sees enough."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.clips.paths import Paths
-from geogs_synth.raycast.casters import caster_for
+from geogs_synth.raycast.caster_choice import caster_for
 from geogs_synth.raycast.solid_distance import signed_distance, wall_distance
 from geogs_synth.scene.solids import SolidBatch
 
@@ -21,12 +21,12 @@ _FAN = (6, 5)
 _NEAREST, _MEAN_DEPTH = 0.25, (0.5, 6.0)
 """Metres."""
 _SKY = 12.0
-"""Metres from where on something is no part of a room and does not count as seen."""
+"""Metres beyond which something is no part of a room and does not count as seen."""
 
 
 @dataclass(frozen=True)
 class _Sight:
-    """What a few rays of every view of the candidates meet."""
+    """Hits of a few rays of every view of the candidates."""
 
     depth: Float[Tensor, "b k v r"]
     points: Float[Tensor, "b k v r 3"]
@@ -59,7 +59,7 @@ def choose_cameras(
 
 
 def too_near(solids: SolidBatch, views: CameraBatch) -> Bool[Tensor, "b n"]:
-    """Solids that leave one of the views too little room."""
+    """Solids that are too near to one of the views."""
     return (signed_distance(solids, views.centre) < 0.9 * _CLEARANCE).any(1)
 
 

@@ -1,7 +1,7 @@
-"""Candidate camera paths through random rooms; which of them is filmed is decided elsewhere."""
+"""Candidate camera paths through random rooms, of which ``path_choice`` takes one."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from jaxtyping import Float
@@ -27,7 +27,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class _Motion:
-    """What a kind of motion draws from."""
+    """Ranges that a kind of motion is drawn from."""
 
     length: tuple[float, float]
     """Metres between two views."""
@@ -36,7 +36,7 @@ class _Motion:
     hold: tuple[float, float]
     """Fraction of the rotation that keeps the same point in view."""
     along_axis: float = 0.0
-    """0 moves anyhow, 1 along the optical axis."""
+    """0 moves in any direction, 1 along the optical axis."""
 
 
 _KINDS = (
@@ -53,9 +53,9 @@ _KINDS = (
 class _PathSteps:
     """How each of k candidates moves away from its first pose."""
 
-    way: Float[Tensor, "b k 3"]
+    translation: Float[Tensor, "b k 3"]
     """Metres, world frame."""
-    spin: Float[Tensor, "b k 3"]
+    rotation: Float[Tensor, "b k 3"]
     """Rotation vector, camera frame."""
     hold: Float[Tensor, "b k"]
     """Fraction of the rotation that keeps the same point in view."""
@@ -77,13 +77,13 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     progress = torch.arange(v) / max(math.sqrt(v - 1), 1.0)
     shaken = (v > 2) * (progress[:, None] > 0)
     steps = progress[:, None] + draw.normal(0.12, b, k, v, 1) * shaken
-    centre = start[:, :, None] + steps * move.way[:, :, None]
+    centre = start[:, :, None] + steps * move.translation[:, :, None]
     if options.sway:
         aside = draw.normal(options.sway, b, k, v, 3) * shaken
-        centre = centre + aside * move.way.norm(dim=-1)[:, :, None, None]
+        centre = centre + aside * move.translation.norm(dim=-1)[:, :, None, None]
     seen = start + forward * draw.log_uniform(0.8, 4.0, b, k)[..., None]
     jitter = draw.normal(0.1, b, k, v, 3) * shaken
-    R = R0[:, :, None] @ rotation_matrix((steps + jitter) * move.spin[:, :, None])
+    R = R0[:, :, None] @ rotation_matrix((steps + jitter) * move.rotation[:, :, None])
     R = _keep_in_view(R, centre, seen, start, move.hold)
     return Paths(R, centre, draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
 
@@ -101,20 +101,19 @@ def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tenso
 def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _PathSteps:
     """All candidates of a room move in the same manner, so that none is taken less often."""
     b, k = forward.shape[:2]
-    kind = draw.choose(
-        (weights.hand_held, weights.medium, weights.wide, weights.rotation, weights.forward), b
-    )
+    kind = draw.choose(astuple(weights), b)
     rows = [[*m.length, m.rotation, *m.hold, m.along_axis] for m in _KINDS]
     numbers = torch.tensor(rows)[kind][:, None].expand(b, k, 6)
-    low, high, rotation, hold_low, hold_high, along = numbers.unbind(-1)
+    low, high, degrees, hold_low, hold_high, along = numbers.unbind(-1)
     length = low * (high / low) ** draw.uniform(0, 1, b, k)
     sign = (1 - 2 * draw.integers(2, b, k))[..., None]
     axis = forward * sign + draw.normal(0.15, b, k, 3)
-    way = torch.where(along[..., None] > 0, axis, draw.normal(1.0, b, k, 3))
-    way = torch.nn.functional.normalize(way, dim=-1) * length[..., None]
-    spin = draw.uniform(-1, 1, b, k, 3) * torch.tensor([1.0, 1.0, 0.5])
-    spin = spin * (rotation * math.pi / 180)[..., None]
-    return _PathSteps(way, spin, hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k))
+    direction = torch.where(along[..., None] > 0, axis, draw.normal(1.0, b, k, 3))
+    translation = torch.nn.functional.normalize(direction, dim=-1) * length[..., None]
+    rotation = draw.uniform(-1, 1, b, k, 3) * torch.tensor([1.0, 1.0, 0.5])
+    rotation = rotation * (degrees * math.pi / 180)[..., None]
+    hold = hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k)
+    return _PathSteps(translation, rotation, hold)
 
 
 def _keep_in_view(
@@ -135,7 +134,7 @@ def _keep_in_view(
 
 
 def looking(forward: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
-    """Camera to world for an upright camera that looks ahead like this."""
+    """Camera to world of an upright camera with this viewing direction."""
     up = torch.zeros_like(forward)
     up[..., 2] = 1
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs_synth.draw import Draw, about_z
-from geogs_synth.scene.batch import chosen
+from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids, upright
 
 BOARDS, LEAVES = 5, 7
@@ -36,7 +36,7 @@ StandingPiece = tuple[SolidBatch, FloorPose]
 def stand(
     draw: Draw, size: Float[Tensor, "b 3"], half: Float[Tensor, "b k 2"], at_wall: float
 ) -> FloorPose:
-    """Places on the floor: backs to a wall, or anywhere and turned anyhow."""
+    """Poses on the floor: backs to a wall, or anywhere with any yaw."""
     b, k = half.shape[:2]
     wall = draw.integers(4, b, k)
     along, across = _lengths(size, wall)
@@ -78,7 +78,7 @@ def cupboards(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPie
     round_ = draw.chance(0.12, *n)
     barrel = torch.stack([d, d * draw.uniform(0.5, 1.2, *n), h], -1)[..., None, :]
     cylinder = replace(piece, kind=torch.full_like(piece.kind, FRUSTUM), half=barrel)
-    piece = chosen(round_, cylinder, piece)
+    piece = where(round_, cylinder, piece)
     return piece, stand(draw, size, torch.stack([w, d], -1), 0.7)
 
 
@@ -176,7 +176,7 @@ def skirting(draw: Draw, size: Float[Tensor, "b 3"]) -> StandingPiece:
 
 
 def plants(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
-    """Flat ellipsoids turned anyhow above a pot."""
+    """Randomly rotated flat ellipsoids above a pot."""
     n = (len(size), count)
     radius, tall = draw.uniform(0.06, 0.18, *n), draw.uniform(0.06, 0.2, *n)
     pot = torch.stack([0.8 * radius, radius, tall], -1)[:, :, None]

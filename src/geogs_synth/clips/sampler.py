@@ -18,9 +18,9 @@ from geogs_synth.clips.path_choice import choose_cameras, too_near
 from geogs_synth.clips.paths import Paths, draw_paths
 from geogs_synth.clips.room_options import RoomOptions, only_scene
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.caster import RenderedRooms
-from geogs_synth.raycast.casters import caster_for
-from geogs_synth.scene.batch import moved
+from geogs_synth.raycast.caster_choice import caster_for
+from geogs_synth.raycast.rendered_rooms import RenderedRooms
+from geogs_synth.scene.batch import on_device
 from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, room_per_view
 from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
@@ -31,11 +31,10 @@ _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything random about a batch but the noise of its pixels; on the host."""
+    """Everything random of a batch except the noise of its pixels; on the host."""
 
     key: tuple[int, ...]
     """What the random numbers depend on."""
-
     rooms: Rooms
     paths: Paths
     flaws: RandomFlaws
@@ -77,7 +76,7 @@ class RoomSampler:
     def film(self, plan: Plan) -> ClipBatch:
         """The clips of a plan."""
         options, key = self.options, plan.key
-        plan = moved(plan, self.device)
+        plan = on_device(plan, self.device)
         size, solids = plan.rooms.size, plan.rooms.solids
         views = choose_cameras(plan.paths, size, solids, options.width, options.height)
         solids = solids.without(too_near(solids, views))
@@ -85,25 +84,25 @@ class RoomSampler:
         if dynamics is not None:
             solids = dynamics.out_of_the_way(solids, views)
             views = replace(views, sweep=dynamics.shake.sweep)
-        rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
+        rooms = replace(plan.rooms, solids=solids)
         if dynamics is None:
             rendering = caster_for(self.device).render(rooms, self.bank, views)
             light = rendering.colour
         else:
-            rendering = self._render_moving(rooms, views, dynamics.ways)
+            rendering = self._render_moving(rooms, views, dynamics.velocity)
             light = dynamics.blurred(rendering, views)
-        images = develop(Draw(self.device, *key), plan.flaws, light)
+        images = develop(Draw.keyed(self.device, *key), plan.flaws, light)
         return ClipBatch(
-            images, light, rendering.depth, rendering.normal, views.T_cw,
-            views.intrinsics, solids, rendering.solid, views.sweep, dynamics,
+            images, light, rendering.depth, rendering.normal, rendering.solid,
+            views, solids, dynamics,
         )  # fmt: skip
 
     def _render_moving(
-        self, rooms: Rooms, views: CameraBatch, ways: Float[Tensor, "b n 3"]
+        self, rooms: Rooms, views: CameraBatch, velocity: Float[Tensor, "b n 3"]
     ) -> RenderedRooms:
-        """What every view sees where solids move by ``ways`` (metres) from view to view."""
+        """What every view sees where solids move by ``velocity`` (metres per view)."""
         b, v = views.T_cw.shape[:2]
-        rooms = room_per_view(rooms, v, ways)
+        rooms = room_per_view(rooms, v, velocity)
         seen = caster_for(self.device).render(rooms, self.bank, views.as_rooms())
         return RenderedRooms(*(x.flatten(0, 1).unflatten(0, (b, v)) for x in vars(seen).values()))
 
@@ -117,7 +116,7 @@ def draw_plan(
     Drawn on the host: thousands of tiny steps, which a GPU would not do faster.
     """
     key = (seed, int(options.validation), step, rank)
-    draw = Draw(torch.device("cpu"), *key)
+    draw = Draw.keyed(torch.device("cpu"), *key)
     size = _draw_sizes(draw, batch)
     layout = draw_furnishing(draw, size, options.least_density, options.most_density, options.thin)
     surfaces = draw_surfaces(draw, layout, options.textures, materials)

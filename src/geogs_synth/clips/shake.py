@@ -1,4 +1,4 @@
-"""How cameras move while they look: what a rolling shutter and the exposure make of it."""
+"""How cameras move while an image is taken, by rolling shutter and over the exposure."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from geogs_synth.draw import Draw
 
 _ROTATION = (0.15, 2.5)
 """Degrees about each axis in the time in which all rows are read."""
-_WAY = (0.001, 0.02)
+_TRANSLATION = (0.001, 0.02)
 """Metres along each axis in this time, in rooms."""
 _DRIVE = (0.01, 0.06)
 """The same along the optical axis on a street."""
@@ -22,41 +22,42 @@ _OFTEN = 0.4
 
 @dataclass(frozen=True)
 class Shake:
-    """Motion of v cameras in each of b clips, in times that the reading of all rows takes."""
+    """Motion of v cameras in each of b clips; the unit of time is the readout of an image."""
 
     rate: Float[Tensor, "b v 6"]
-    """Rotation vector and way (metres), in the frame of the camera."""
+    """Rotation vector and translation (metres), in the frame of the camera."""
     rolling: Float[Tensor, "b"]
     """1 where rows are read one after the other, 0 where all at once."""
     exposure: Float[Tensor, "b v"]
-    """How long each row looks."""
+    """Exposure time of each row."""
     objects: Float[Tensor, "b"]
-    """Fraction of what things move by from view to view that passes in this time."""
+    """Readout over the time from view to view, by which objects move."""
 
     @property
     def sweep(self) -> Float[Tensor, "b v 6"]:
-        """What the cameras do from their first row to their last."""
+        """Motion of the cameras from their first row to their last."""
         return self.rate * self.rolling[:, None, None]
 
 
 def draw_shake(draw: Draw, kind: Int[Tensor, "b"], views: int) -> Shake:
-    """Shaken clips, some of the other new kinds, none of the usual ones."""
+    """Motion in shaken clips and in some of the kinds after it, none in usual ones."""
     b, n = len(kind), (len(kind), views)
     shaken = (kind == SHAKEN) | ((kind > SHAKEN) & draw.chance(_OFTEN, b))
     street = (kind == STREET)[:, None, None]
 
     def vary(size: Tensor) -> Tensor:
-        """Alike in the views of a clip, but not the same."""
+        """Similar in the views of a clip."""
         whole = 0.6 * draw.normal(1.0, b, 1, 3) + 0.8 * draw.normal(1.0, *n, 3)
         return size[:, None, None] * whole
 
     rotation = vary(draw.log_uniform(*_ROTATION, b) * (math.pi / 180))
-    way = vary(draw.log_uniform(*_WAY, b))
+    translation = vary(draw.log_uniform(*_TRANSLATION, b))
     ahead = draw.log_uniform(*_DRIVE, b)[:, None, None] * draw.uniform(0.8, 1.2, *n, 1)
-    ahead = torch.nn.functional.pad(ahead, (2, 0)) + 0.2 * way
-    # Who drives turns slowly.
+    ahead = torch.nn.functional.pad(ahead, (2, 0)) + 0.2 * translation
+    # Cars turn slowly.
     rotation = torch.where(street, 0.3 * rotation, rotation)
-    rate = torch.cat([rotation, torch.where(street, ahead, way)], -1) * shaken[:, None, None]
+    translation = torch.where(street, ahead, translation)
+    rate = torch.cat([rotation, translation], -1) * shaken[:, None, None]
     long = draw.log_uniform(0.1, 1.0, b, 1) * draw.uniform(0.7, 1.3, *n)
     return Shake(
         rate=rate,

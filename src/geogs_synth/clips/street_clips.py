@@ -20,9 +20,9 @@ from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
 from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, NONE, SolidBatch, Solids, upright
 
 SCALE = 0.2
-SIZE = (300.0, 300.0, 120.0)
+_SIZE = (300.0, 300.0, 120.0)
 """Size of the room that is the world, units."""
-MIDDLE = (150.0, 150.0, 0.0)
+_MIDDLE = (150.0, 150.0, 0.0)
 """A point of the road, which runs along x."""
 _HOUSES, _CARS, _TREES, _POSTS = 22, 12, 6, 12
 _SUN = 100.0
@@ -33,7 +33,7 @@ def draw_street(
     draw: Draw, options: RoomOptions, count: int, places: int, materials: int
 ) -> tuple[Rooms, Paths]:
     """``count`` streets with so many places for solids, and candidate paths along them."""
-    size = torch.tensor(SIZE).expand(count, 3).clone()
+    size = torch.tensor(_SIZE).expand(count, 3).clone()
     solids = _solids(draw, count, places)
     layout = Furnishing(solids, torch.arange(places), torch.zeros(places, dtype=torch.bool))
     surfaces = _surfaces(draw, draw_surfaces(draw, layout, options.textures, materials))
@@ -42,13 +42,17 @@ def draw_street(
 
 
 def _solids(draw: Draw, b: int, places: int) -> SolidBatch:
-    """In metres around the origin, then scaled."""
+    """Everything that stands on a street."""
     parts = [*_houses(draw, b), _cars(draw, b), _trees(draw, b), _posts(draw, b)]
     solids = Solids.join(parts)
     empty = places - solids.kind.shape[1]
     rest = upright(torch.full((b, empty), NONE), torch.zeros(b, empty, 3), torch.ones(b, empty, 3))
-    solids = Solids.join([solids, rest])
-    middle = torch.tensor(MIDDLE)
+    return placed_on_street(Solids.join([solids, rest]))
+
+
+def placed_on_street(solids: SolidBatch) -> SolidBatch:
+    """Solids that are given in metres around a point of the road."""
+    middle = torch.tensor(_MIDDLE)
     return replace(solids, centre=SCALE * solids.centre + middle, half=SCALE * solids.half)
 
 
@@ -64,10 +68,10 @@ def _houses(draw: Draw, b: int) -> list[SolidBatch]:
         front = line + draw.uniform(0, 1.5, *n) * draw.chance(0.4, *n)
         half = torch.stack([long, deep, tall], -1)
         centre = torch.stack([x, side * (front + deep), tall], -1)
-        rows.append(_boxes(half, centre, draw.chance(0.92, *n)))
+        rows.append(_some(BOX, draw.chance(0.92, *n), centre, half))
         kerb = torch.tensor([250.0, 1.6, 0.08]).expand(b, 1, 3)
         at = torch.stack([torch.zeros(b, 1), side * (line - 1.6), torch.full((b, 1), 0.08)], -1)
-        rows.append(_boxes(kerb, at, draw.chance(0.7, b, 1)))
+        rows.append(_some(BOX, draw.chance(0.7, b, 1), at, kerb))
     return rows
 
 
@@ -84,7 +88,7 @@ def _cars(draw: Draw, b: int) -> SolidBatch:
     top = half * torch.tensor([0.55, 0.9, 0.7])
     above = at + torch.nn.functional.pad((half + top)[..., 2:], (2, 0))
     there = draw.chance(0.5, *n)
-    return Solids.join([_boxes(half, at, there), _boxes(top, above, there)])
+    return Solids.join([_some(BOX, there, at, half), _some(BOX, there, above, top)])
 
 
 def _trees(draw: Draw, b: int) -> SolidBatch:
@@ -96,10 +100,7 @@ def _trees(draw: Draw, b: int) -> SolidBatch:
     top = torch.stack([x, y, 2 * stem + 0.8 * crown[..., 2]], -1)
     there = draw.chance(0.5, *n)
     trunk = torch.stack([radius, 0.8 * radius, stem], -1)
-    return Solids.join([
-        upright(torch.where(there, FRUSTUM, NONE), foot, trunk),
-        upright(torch.where(there, ELLIPSOID, NONE), top, crown),
-    ])  # fmt: skip
+    return Solids.join([_some(FRUSTUM, there, foot, trunk), _some(ELLIPSOID, there, top, crown)])
 
 
 def _posts(draw: Draw, b: int) -> SolidBatch:
@@ -108,12 +109,13 @@ def _posts(draw: Draw, b: int) -> SolidBatch:
     tall, radius = draw.log_uniform(0.4, 4.0, *n), draw.log_uniform(0.03, 0.15, *n)
     y = draw.uniform(4, 8, *n) * (1 - 2.0 * draw.integers(2, *n))
     at = torch.stack([draw.uniform(-8, 50, *n), y, tall], -1)
-    kind = torch.where(draw.chance(0.6, *n), FRUSTUM, NONE)
-    return upright(kind, at, torch.stack([radius, radius, tall], -1))
+    half = torch.stack([radius, radius, tall], -1)
+    return _some(FRUSTUM, draw.chance(0.6, *n), at, half)
 
 
-def _boxes(half: Tensor, centre: Tensor, there: Tensor) -> SolidBatch:
-    return upright(torch.where(there, BOX, NONE), centre, half)
+def _some(kind: int, there: Tensor, centre: Tensor, half: Tensor) -> SolidBatch:
+    """Upright solids of a kind, some of them not there."""
+    return upright(torch.where(there, kind, NONE), centre, half)
 
 
 def _surfaces(draw: Draw, surfaces: Surfaces) -> Surfaces:
@@ -153,7 +155,7 @@ def _lights(draw: Draw, b: int, views: int) -> Lights:
     round_, up = draw.uniform(-3.15, 3.15, b), draw.uniform(0.25, 1.3, b)
     way = torch.stack([round_.cos() * up.cos(), round_.sin() * up.cos(), up.sin()], -1)
     position = torch.zeros(b, MOST_LIGHTS, 3) + torch.tensor([0.0, 0.0, 50.0])
-    position[:, 0] = torch.tensor(MIDDLE) + _SUN * way
+    position[:, 0] = torch.tensor(_MIDDLE) + _SUN * way
     power = draw.chance(0.6, b) * draw.log_uniform(0.7, 5.0, b) * _SUN**2
     colour = torch.zeros(b, MOST_LIGHTS, 3)
     colour[:, 0] = power[:, None] * (1 + 0.1 * torch.tensor([1.0, 0.2, -1.0]))
@@ -168,7 +170,7 @@ def _paths(draw: Draw, options: RoomOptions, b: int) -> Paths:
     start = torch.stack([
         draw.uniform(-6, 6, b, k), draw.uniform(-3.5, 3.5, b, k), draw.uniform(1.1, 2.2, b, k)
     ], -1)  # fmt: skip
-    start = SCALE * start + torch.tensor(MIDDLE)
+    start = SCALE * start + torch.tensor(_MIDDLE)
     way = draw.choose((0.6, 0.25, 0.15), b)[:, None].expand(b, k)  # drives, walks, turns
     drives, turns = way == 0, way == 2
     yaw = torch.where(drives, draw.normal(0.06, b, k), draw.uniform(-3.15, 3.15, b, k))

@@ -9,10 +9,11 @@ from torch.nn import functional
 
 from geogs_synth.clips.pieces import FloorPose, Numbers, StandingPiece, boxes, stand
 from geogs_synth.draw import Draw
+from geogs_synth.scene.batch import where
 from geogs_synth.scene.solids import FRUSTUM, SolidBatch, Solids
 
 BALUSTERS, BARS, SEGMENTS, TWIGS = 12, 5, 5, 12
-"""Of a railing; of a lattice, each way; of a cable; of a bush."""
+"""Parts of a railing, of a lattice in each direction, of a cable, of a bush."""
 
 
 def railings(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
@@ -39,13 +40,9 @@ def lattices(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiec
         rows.append((p * w, 0 * w, tall, thin, deep, tall))
         rows.append((0 * w, 0 * w, tall + p * tall, w, deep, thin))
     piece = boxes(*rows)
-    lying = Solids(
-        piece.kind, piece.rotation, piece.centre[..., [0, 2, 1]], piece.half[..., [0, 2, 1]]
-    )
-    centre = torch.where(flat[..., None, None], lying.centre, piece.centre)
-    half = torch.where(flat[..., None, None], lying.half, piece.half)
+    lying = replace(piece, centre=piece.centre[..., [0, 2, 1]], half=piece.half[..., [0, 2, 1]])
     place = stand(draw, size, torch.stack([w, torch.where(flat, tall, deep)], -1), 0.2)
-    return replace(piece, centre=centre, half=half), _lifted(draw, size, place, tall)
+    return where(flat, lying, piece), _lifted(draw, size, place, tall)
 
 
 def cables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
@@ -66,7 +63,7 @@ def cables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
 
 
 def bushes(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
-    """Twigs turned anyhow, or leaves, or flat sticks, around a point above the floor."""
+    """Randomly rotated twigs, leaves or flat sticks around a point above the floor."""
     n = (len(size), count)
     reach = draw.log_uniform(0.08, 0.5, *n)[..., None]
     length = reach * draw.uniform(0.3, 1.0, *n, TWIGS)

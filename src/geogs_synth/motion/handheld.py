@@ -18,6 +18,7 @@ FRAMES_PER_SECOND = 30.0
 
 _KNOTS_PER_LAP = 9
 _MIN_CLEARANCE = 0.6
+_SHAKE_STREAM = 0x5A4
 _SHAKE_PERIOD = 7
 _SHAKE_METRES = 0.004
 _SHAKE_RADIANS = np.radians(0.3)
@@ -50,11 +51,11 @@ class HandheldPath:
         """Camera-to-world poses at numbers of frames, which need not be whole."""
         lap = frames / self._frames_per_lap
         T_wc = look_at(self.position(lap % 1.0), self.target(lap % 1.0))
-        return with_shake(T_wc, np.random.default_rng([self._seed, 0x5A4]), frames)
+        return with_shake(T_wc, self._seed, frames)
 
 
 def _clear_splines(scene: Scene, seed: int, frames_per_lap: int) -> tuple[CubicSpline, CubicSpline]:
-    """Those of the widest path that keeps its distance."""
+    """Position and look-at point of the widest path that keeps its distance."""
     whole = np.arange(4 * frames_per_lap) / (4 * frames_per_lap)
     for shrink in np.geomspace(1.0, 0.25, 16):
         position, target = _splines(scene, np.random.default_rng([seed, 0x7A1]), shrink)
@@ -101,15 +102,13 @@ def look_at(
 
 
 def with_shake(
-    T_wc: Float64[np.ndarray, "n 4 4"],
-    rng: np.random.Generator,
-    frames: Real[np.ndarray, "n"] | None = None,
+    T_wc: Float64[np.ndarray, "n 4 4"], seed: int, frames: Real[np.ndarray, "n"]
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Adds a smooth tremor: a cubic B-spline whose random coefficients act only locally.
 
-    ``frames`` are the times of the poses in frames, ``0, 1, 2, ...`` if not given.
+    ``frames`` are the times of the poses in frames.
     """
-    frames = np.arange(len(T_wc)) if frames is None else frames
+    rng = np.random.default_rng([seed, _SHAKE_STREAM])
     last = 1 + math.floor(frames.max(initial=0))
     count = last // _SHAKE_PERIOD + 4
     coefficients = np.clip(rng.standard_normal((count, 6)), -2.5, 2.5)

@@ -10,12 +10,17 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from geogs_synth.motion.handheld import FRAMES_PER_LAP, HandheldPath, look_at, with_shake
+from geogs_synth.motion.handheld import (
+    FRAMES_PER_LAP,
+    FRAMES_PER_SECOND,
+    HandheldPath,
+    look_at,
+    with_shake,
+)
 from geogs_synth.motion.motion_kinds import RoomMotionKind
 from geogs_synth.scene.bodies import Path
 from geogs_synth.scene.textured_scene import Scene
 
-_FRAMES_PER_SECOND = 30.0
 _SLOW = 4
 """The slow path takes so many times longer."""
 _ARM = 0.25
@@ -44,7 +49,7 @@ class Motion:
 
     path: Path
     """Camera to world at times in seconds."""
-    rate: float = _FRAMES_PER_SECOND
+    rate: float = FRAMES_PER_SECOND
     """Frames per second."""
     seconds: float = math.inf
     """How long it lasts."""
@@ -86,7 +91,7 @@ def _slow(scene: Scene, seed: int) -> HandheldPath:
 def _walking(scene: Scene, seed: int) -> Path:
     """Around the room, looking ahead and inwards, with the bob and sway of steps."""
     handheld = HandheldPath(scene, seed)
-    seconds_per_lap = _WALK_LAP * FRAMES_PER_LAP / _FRAMES_PER_SECOND
+    seconds_per_lap = _WALK_LAP * FRAMES_PER_LAP / FRAMES_PER_SECOND
     ahead = handheld.position.derivative()
 
     def path(times: np.ndarray) -> np.ndarray:
@@ -120,7 +125,7 @@ def _turning(scene: Scene, seed: int, degrees_per_second: float) -> Path:
         position = np.column_stack([axis + _ARM * outward, height])
         ahead = np.column_stack([np.cos(pitch)[:, None] * outward, np.sin(pitch)])
         T_wc = look_at(position, position + ahead)
-        return with_shake(T_wc, np.random.default_rng([seed, 0x5A4]), _FRAMES_PER_SECOND * times)
+        return with_shake(T_wc, seed, FRAMES_PER_SECOND * times)
 
     return path
 
@@ -203,7 +208,7 @@ def _still(scene: Scene, seed: int) -> Path:
 def _rotated(
     T_wc: Float64[np.ndarray, "n 4 4"], angles: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 4 4"]:
-    """Poses turned in the camera's frame by rotation vectors."""
-    turned = T_wc.copy()
-    turned[:, :3, :3] = T_wc[:, :3, :3] @ Rotation.from_rotvec(angles).as_matrix()
-    return turned
+    """Poses rotated in the camera's frame by rotation vectors."""
+    rotated = T_wc.copy()
+    rotated[:, :3, :3] = T_wc[:, :3, :3] @ Rotation.from_rotvec(angles).as_matrix()
+    return rotated

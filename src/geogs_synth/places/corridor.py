@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from geogs_synth.motion.handheld import look_at, with_shake
 from geogs_synth.motion.room_motions import Motion
-from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.builder import FACING_DOWN, FACING_Y, SceneBuilder
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures import patterns
 
@@ -50,17 +50,16 @@ def make_corridor(seed: int = 0, length: float = LENGTH) -> Scene:
     floor = surface(flat, (tile, tile), rng.uniform(0.55, 0.8))
     build.rectangle((*middle, 0), flat, floor, np.eye(3))
     ceiling = surface(flat, (0.6, 0.6), 0.95)
-    build.rectangle((*middle, _HEIGHT), flat, ceiling, np.diag([1.0, -1, -1]))
-    upright = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])  # local z to y, local y to z
+    build.rectangle((*middle, _HEIGHT), flat, ceiling, FACING_DOWN)
     for y, yaw in ((0.0, 0.0), (width, np.pi)):
         wall = build.at(length / 2, y, yaw=yaw)
         painted = surface((length, _HEIGHT), (panel, _HEIGHT / 2), 1.0)
-        wall.rectangle((0, 0, _HEIGHT / 2), (length, _HEIGHT), painted, upright)
+        wall.rectangle((0, 0, _HEIGHT / 2), (length, _HEIGHT), painted, FACING_Y)
         _furnish(wall, rng, length)
     for x, yaw in ((0.0, -np.pi / 2), (length, np.pi / 2)):
         end = build.at(x, width / 2, yaw=yaw)
         painted = surface((width, _HEIGHT), (panel, _HEIGHT / 2), 0.9)
-        end.rectangle((0, 0, _HEIGHT / 2), (width, _HEIGHT), painted, upright)
+        end.rectangle((0, 0, _HEIGHT / 2), (width, _HEIGHT), painted, FACING_Y)
         _door(end, rng, 0.0)
     glow = build.texture(np.full((8, 8, 3), 248, np.uint8))
     for x in np.arange(1.2, length, 2.4):
@@ -82,7 +81,7 @@ def walk(scene: Scene, seed: int = 0) -> Motion:
         position = np.column_stack([x, y, z])
         ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.full_like(x, -0.12)])
         T_wc = look_at(position, position + ahead)
-        return with_shake(T_wc, np.random.default_rng([seed, 0x5A4]), _RATE * times)
+        return with_shake(T_wc, seed, _RATE * times)
 
     return Motion(path, _RATE, WALK_METRES / _SPEED)
 

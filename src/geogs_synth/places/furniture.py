@@ -65,11 +65,12 @@ def _pick(rng: np.random.Generator, options: tuple[int, ...]) -> int:
 
 
 def four_legs(
-    build: SceneBuilder, width: float, depth: float, height: float, thickness: float, texture_: int
+    build: SceneBuilder, width: float, depth: float, height: float, thickness: float, texture: int
 ) -> None:
+    """Legs below the corners of a top."""
     for x in (-width / 2 + thickness, width / 2 - thickness):
         for y in (thickness, depth - thickness):
-            build.box((x, y, height / 2), (thickness, thickness, height), texture_)
+            build.box((x, y, height / 2), (thickness, thickness, height), texture)
 
 
 def _row_of_books(
@@ -247,12 +248,13 @@ def plant(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -
         direction[2] = math.sin(rise)
         tilt = np.array([0, math.sin(rise), math.cos(rise)])
         centre = np.array([0, 0, 0.4 + 0.025 * k]) + 0.17 * direction
-        rotation = yaw_rotation(yaw) @ _roll_about_y(-rise)
+        rotation = yaw_rotation(yaw) @ _roll_rotation(-rise)
         length = rng.uniform(0.12, 0.17) * (1.05 - 0.02 * tilt[1])
         build.ellipsoid(centre, (length, 0.055, 0.008), materials.leaf, rotation=rotation)
 
 
-def _roll_about_y(angle: float) -> np.ndarray:
+def _roll_rotation(angle: float) -> np.ndarray:
+    """Rotation about y."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
@@ -281,10 +283,7 @@ def pouf(build: SceneBuilder, rng: np.random.Generator, materials: Materials) ->
     build.ellipsoid((0, 0, 0.36), (radius, radius, 0.07), cloth)
 
 
-def picture(
-    build: SceneBuilder, centre: Pair, size: Pair,
-    canvas: int, frame: int,
-) -> None:  # fmt: skip
+def picture(build: SceneBuilder, centre: Pair, size: Pair, canvas: int, frame: int) -> None:
     """A framed picture on the wall, its centre at (x, z); it stands off the wall by 1.5 cm."""
     x, z = centre
     w, h = size

@@ -7,7 +7,7 @@ import numpy as np
 
 from geogs_synth.places import furniture
 from geogs_synth.places.furniture import Materials
-from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.builder import FACING_DOWN, FACING_Y, SceneBuilder
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.textures import artwork, patterns
 
@@ -61,12 +61,11 @@ def cover_surfaces(
 ) -> None:
     """Walls, floor, ceiling, beams and skirting."""
     h = size[2]
-    upright = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])  # local z to y, local y to z
     kinds = rng.permutation(4)
     for wall, kind in zip(walls, kinds, strict=True):
         image = wall_image(rng, int(kind), wall.width, h)
         paper = build.texture(image)
-        wall.build.rectangle((0, 0, h / 2), (wall.width, h), paper, upright)
+        wall.build.rectangle((0, 0, h / 2), (wall.width, h), paper, FACING_Y)
         skirting = (wall.width - 0.04, 0.02, 0.1)
         wall.build.box((0, 0.01, 0.05), skirting, materials.lacquer)
     add_ceiling_and_floor(build, rng, size, materials)
@@ -84,7 +83,7 @@ def add_ceiling_and_floor(
         floor = patterns.tiles(rng, shape, 11, ((186, 172, 150), (128, 104, 86)))
     build.rectangle((w / 2, d / 2, 0), (w, d), build.texture(floor), np.eye(3))
     ceiling = build.texture(patterns.plaster(rng, shape, (206, 200, 188)))
-    build.rectangle((w / 2, d / 2, h), (w, d), ceiling, np.diag([1.0, -1, -1]))
+    build.rectangle((w / 2, d / 2, h), (w, d), ceiling, FACING_DOWN)
     for x in np.linspace(0, w, 5)[1:-1]:
         build.box((x, d / 2, h - 0.06), (0.12, d, 0.12), materials.walnut)
 

@@ -6,14 +6,7 @@ import numpy as np
 
 from geogs.geometry.camera import Camera
 from geogs_synth.places.street import LANE, LENGTH, START, driven, heading, on_road
-from geogs_synth.places.vehicles import (
-    VAN_HEIGHT,
-    VAN_LENGTH,
-    VAN_WIDTH,
-    car,
-    draw_materials,
-    van,
-)
+from geogs_synth.places.vehicles import VAN_HEIGHT, VAN_LENGTH, VAN_WIDTH, car, draw_materials, van
 from geogs_synth.scene.bodies import Body, Path, upright_poses
 from geogs_synth.scene.builder import SceneBuilder
 from geogs_synth.scene.textured_scene import Scene

@@ -22,9 +22,9 @@ _PAIR_FROM = 0.16
 """Fraction of the image from which two walk side by side, so that they need not be too near."""
 _BOB, _STEP_RATE = 0.02, 1.8
 _KNOT_SECONDS = 0.5
-"""Walkers follow where the camera looks only as evened out over this time."""
+"""Walkers follow the camera's viewing direction smoothed over this time."""
 _AWAY = -100.0
-"""Height at which those wait who are not crossing: under the floor."""
+"""Height of figures that are not crossing: under the floor."""
 _STREAM = 0x9E0
 
 
@@ -41,7 +41,7 @@ def crossing_walkers(
         seconds: for which they are needed.
         camera: its intrinsics.
         coverage: fraction of the image, above 0 and at most 1/2.
-        seed: of their looks.
+        seed: of their appearance.
     """
     rng = np.random.default_rng([seed, _STREAM])
     times = np.arange(-2 * _KNOT_SECONDS, seconds + 3 * _KNOT_SECONDS, _KNOT_SECONDS)

@@ -5,11 +5,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.camera.camera_batch import CameraBatch, pixel_grid, project, rays, row_centre
-from geogs_synth.raycast.caster import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.raycast.rays import Hit, closest_hit, occluded
+from geogs_synth.raycast.rendered_rooms import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.raycast.room_shading import ambient_access, shade
 from geogs_synth.raycast.room_surface import surface_point
-from geogs_synth.scene.batch import only
+from geogs_synth.scene.batch import one_scene
 from geogs_synth.scene.rooms import Rooms
 from geogs_synth.scene.solids import SolidBatch
 from geogs_synth.textures.pyramids import TextureBank
@@ -28,7 +28,7 @@ class CpuCaster:
         b, v = views.T_cw.shape[:2]
         x, y = pixel_grid(views)
         seen = [
-            _look(only(rooms, room), bank, only(views, room), view, x[part], y[part])
+            _look(one_scene(rooms, room), bank, one_scene(views, room), view, x[part], y[part])
             for room in range(b)
             for view in range(v)
             for part in _chunks(len(x))

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
 from geogs_synth.camera.camera_batch import CameraBatch
-from geogs_synth.raycast.caster import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.raycast.cpu_caster import CpuCaster
 from geogs_synth.raycast.rays import Hit
+from geogs_synth.raycast.rendered_rooms import MARGIN, FlowTruth, RenderedRooms
 from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms, packed_solids
 from geogs_synth.scene.solids import SolidBatch
 from geogs_synth.textures.pyramids import TextureBank

@@ -1,5 +1,7 @@
-"""What pixels see of a scene and its shading, compiled; rays are o + t d with d_z = 1 in the camera
-frame, so that t is the depth."""
+"""Ray casting and shading of the pixels of a view, compiled.
+
+Rays are o + t d with d_z = 1 in the camera frame, so that t is the depth.
+"""
 
 import math
 from typing import NamedTuple
@@ -49,16 +51,10 @@ class Lighting(NamedTuple):
 def _hit_pixel(solids, i, x, y):
     """Depth and face at which the pixel ray (x, y, 1) meets solid i."""
     o, m = solids.origin[i], solids.matrix[i]
-    return hit(
-        solids.kind[i],
-        solids.half[i],
-        o[0],
-        o[1],
-        o[2],
-        m[0, 0] * x + m[0, 1] * y + m[0, 2],
-        m[1, 0] * x + m[1, 1] * y + m[1, 2],
-        m[2, 0] * x + m[2, 1] * y + m[2, 2],
-    )
+    dx = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+    dy = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+    dz = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+    return hit(solids.kind[i], solids.half[i], o[0], o[1], o[2], dx, dy, dz)
 
 
 @njit(**COMPILED)
@@ -225,7 +221,7 @@ def _around(solid, face, row, column, found):
 
 @njit(**COMPILED)
 def _gain(solids, lighting, i, world, normal, out):
-    """What the texture of solid i is multiplied with."""
+    """Factor on the texture of solid i."""
     if solids.emission[i] > 0.0:
         for k in range(3):
             out[k] = solids.emission[i]

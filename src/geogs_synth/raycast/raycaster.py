@@ -89,12 +89,12 @@ class Raycaster:
     Bodies move through it; they are lit as everything else, but cast no shadow.
     """
 
-    def __init__(self, scene: Scene, threads: int = 2, bodies: Sequence[Body] = ()) -> None:
+    def __init__(self, scene: Scene, threads: int = 2) -> None:
         self.scene = scene
         self._pool = ThreadPoolExecutor(threads)
         self._threads = threads
         self._lighting = self._compute_lighting()
-        self._use(bodies)
+        self._use(())
 
     def with_bodies(self, bodies: Sequence[Body]) -> "Raycaster":
         """The same scene with other bodies; what was prepared is shared."""
@@ -127,7 +127,7 @@ class Raycaster:
         Depth, normal and solid are those of the ray through the pixel's centre; the colour is the
         mean over the pixel. ``time`` in seconds places the bodies.
         """
-        lens = camera if isinstance(camera, RadialCamera) else RadialCamera(camera)
+        lens = RadialCamera.of(camera)
         placed = self._place(T_wc[None], np.array([time]))
         solids, bounds = placed.solids(0), placed.bounds(lens)[0]
         traced, (xs, ys) = _Traced.empty(lens.camera.height, lens.camera.width), lens.rays
@@ -147,17 +147,15 @@ class Raycaster:
 
     def render_rolling(
         self,
-        camera: Camera | RadialCamera,
+        lens: RadialCamera,
         T_wc: Float64[np.ndarray, "h 4 4"],
-        times: Float64[np.ndarray, "h"] | None = None,
+        times: Float64[np.ndarray, "h"],
     ) -> RenderedView:
         """What a camera sees whose row v is taken from the pose ``T_wc[v]`` at ``times[v]``.
 
         Row v is that of :meth:`render` at this pose and time.
         """
-        lens = camera if isinstance(camera, RadialCamera) else RadialCamera(camera)
         height, width = lens.camera.height, lens.camera.width
-        times = np.zeros(height) if times is None else times
         traced, (xs, ys) = _Traced.empty(height, width), lens.rays
 
         def work(first: int, last: int) -> None:
@@ -183,7 +181,7 @@ class Raycaster:
         list(self._pool.map(work, edges[:-1], edges[1:]))
         return self._view(traced)
 
-    def _view(self, traced: "_Traced") -> RenderedView:
+    def _view(self, traced: _Traced) -> RenderedView:
         depth, solid = traced.depth, traced.solid
         if self._sky is not None:
             solid[solid == self._sky] = -1
@@ -199,7 +197,7 @@ class Raycaster:
 
     def _place(
         self, T_wc: Float64[np.ndarray, "p 4 4"], times: Float64[np.ndarray, "p"]
-    ) -> "PlacedScene":
+    ) -> PlacedScene:
         """All solids as p cameras at p times see them."""
         s = self._all
         rotation, centre = s.solids.rotation[None], s.solids.centre[None]

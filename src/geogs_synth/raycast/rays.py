@@ -52,11 +52,11 @@ def _first(
     t, solid = end.double().clone(), torch.full(end.shape, -1)
     radius = solids.bounding_half.norm(dim=-1)
     numbers = (solids.half, solids.rotation, solids.centre, radius, origin, direction)
-    half, rotation, centre, around, start, way = (x.double().contiguous().numpy() for x in numbers)
+    half, rotation, centre, around, start, ray = (x.double().contiguous().numpy() for x in numbers)
     kind = solids.kind.contiguous().numpy()
     for k in range(len(t)):
         closest_hits(
-            kind[k], half[k], rotation[k], centre[k], around[k], start[k], way[k], t[k].numpy(),
+            kind[k], half[k], rotation[k], centre[k], around[k], start[k], ray[k], t[k].numpy(),
             solid[k].numpy(),
         )  # fmt: skip
     return Hit(t.to(origin), solid)

@@ -7,7 +7,7 @@ from torch import Tensor
 from geogs_synth.raycast.rays import closest_hit, occluded
 from geogs_synth.raycast.room_surface import SurfacePoint, surface_point
 from geogs_synth.raycast.solid_distance import signed_distance, wall_distance
-from geogs_synth.scene.batch import gathered
+from geogs_synth.scene.batch import gather
 from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
 from geogs_synth.textures.pyramids import TextureBank
 
@@ -50,7 +50,7 @@ def shade(
     ``direction`` is the ray's, ``footprint`` the width of a sample at the point in metres, across
     the ray, ``access`` what :func:`ambient_access` gives.
     """
-    surface = gathered(rooms.surfaces, point.surface)
+    surface = gather(rooms.surfaces, point.surface)
     towards = -torch.nn.functional.normalize(direction, dim=-1)
     cosine = (point.normal * towards).sum(-1).clamp(0.05, 1)
     albedo = _albedo(surface, bank, point.coordinates, footprint / cosine.sqrt(), sample)
@@ -93,7 +93,7 @@ def _reflected(
     """What mirroring points reflect towards unit directions; light there is without shadows."""
     hit = closest_hit(rooms.size, rooms.solids, start, direction)
     point = surface_point(rooms, hit, start, direction)
-    surface = gathered(rooms.surfaces, point.surface)
+    surface = gather(rooms.surfaces, point.surface)
     cosine = -(point.normal * direction).sum(-1).clamp(-1.0, -0.05)
     # A polished surface is not as sharp as a mirror.
     footprint = (2 * footprint + 0.004 * hit.t) / cosine.sqrt()

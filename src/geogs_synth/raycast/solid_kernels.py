@@ -104,11 +104,7 @@ def outward_normal(kind, half, face, px, py, pz):
     if kind == BOX or face >= 4:
         sign = 1.0 if face & 1 else -1.0
         axis = face >> 1
-        return (
-            sign if axis == 0 else 0.0,
-            sign if axis == 1 else 0.0,
-            sign if axis == 2 else 0.0,
-        )
+        return (sign if axis == 0 else 0.0, sign if axis == 1 else 0.0, sign if axis == 2 else 0.0)
     if kind == FRUSTUM:
         slope = 0.5 * (half[1] - half[0]) / half[2]
         nx, ny = px, py
@@ -138,16 +134,10 @@ def crossing(kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, reach
     oz = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
     if from_outside and _inside(kind, half, ox, oy, oz):
         return np.inf, 0
-    return hit(
-        kind,
-        half,
-        ox,
-        oy,
-        oz,
-        r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
-        r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
-        r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
-    )
+    lx = r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz
+    ly = r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz
+    lz = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
+    return hit(kind, half, ox, oy, oz, lx, ly, lz)
 
 
 @njit(**COMPILED)

@@ -1,4 +1,4 @@
-"""How much of the sky and of each light every cell of a room sees, compiled."""
+"""Visibility of the ambient light and of each light from every cell of a scene, compiled."""
 
 import numpy as np
 from numba import njit

@@ -5,7 +5,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool, Int, Shaped
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.gpu.transfer import to_device
@@ -13,47 +13,43 @@ from geogs.gpu.transfer import to_device
 Part = TypeVar("Part")
 
 
-def each(change: Callable[..., Tensor], first: Part, *others: Part) -> Part:
-    """What ``change`` makes of the tensors of one part, or of those that correspond in several."""
+def map_tensors(change: Callable[..., Tensor], first: Part, *others: Part) -> Part:
+    """Applies ``change`` to the tensors of one part, or to those that correspond in several."""
     values: list[Any] = []
     for field in fields(first):  # type: ignore[arg-type]
         own = [getattr(part, field.name) for part in (first, *others)]
         if isinstance(own[0], Tensor):
             values.append(change(*own))
         else:
-            values.append(each(change, *own) if is_dataclass(own[0]) else own[0])
+            values.append(map_tensors(change, *own) if is_dataclass(own[0]) else own[0])
     return type(first)(*values)
 
 
-def moved(part: Part, device: torch.device) -> Part:
+def on_device(part: Part, device: torch.device) -> Part:
     """The same on a device, without waiting for it."""
-    return each(lambda t: to_device(t.contiguous(), device), part)
+    return map_tensors(lambda t: to_device(t.contiguous(), device), part)
 
 
-def only(part: Part, scene: int) -> Part:
+def one_scene(part: Part, scene: int) -> Part:
     """One scene as a batch of its own."""
-    return each(lambda t: t[scene : scene + 1], part)
+    return map_tensors(lambda t: t[scene : scene + 1], part)
 
 
-def chosen(which: Bool[Tensor, "*b"], first: Part, second: Part) -> Part:
-    """The first where ``which`` says so, else the second."""
+def where(which: Bool[Tensor, "*b"], first: Part, second: Part) -> Part:
+    """The first where ``which``, else the second."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(which.reshape(*which.shape, *[1] * (a.ndim - which.ndim)), a, b)
 
-    return each(pick, first, second)
+    return map_tensors(pick, first, second)
 
 
-def gathered(part: Part, index: Int[Tensor, "b m"]) -> Part:
+def gather(part: Part, index: Int[Tensor, "b m"]) -> Part:
     """Some of what each scene has along the second axis."""
     rows = torch.arange(len(index), device=index.device)[:, None]
-    return each(lambda t: t[rows, index], part)
+    return map_tensors(lambda t: t[rows, index], part)
 
 
-def concatenated(first: Part, *others: Part) -> Part:
+def concatenate(first: Part, *others: Part) -> Part:
     """What each scene has along the second axis, one after the other."""
-
-    def join(*tensors: Shaped[Tensor, "b ..."]) -> Tensor:
-        return torch.cat(tensors, 1)
-
-    return each(join, first, *others)
+    return map_tensors(lambda *tensors: torch.cat(tensors, 1), first, *others)

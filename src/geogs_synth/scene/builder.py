@@ -15,6 +15,12 @@ Triple = Sequence[Number] | Float64[np.ndarray, "3"]
 Pair = tuple[Number, Number]
 
 
+FACING_Y = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
+"""Rotation of a rectangle that stands upright and faces along y."""
+FACING_DOWN = np.diag([1.0, -1, -1])
+"""Rotation of a rectangle that faces down."""
+
+
 def yaw_rotation(yaw: Number) -> Float64[np.ndarray, "3 3"]:
     """Rotation by ``yaw`` radians about z."""
     c, s = np.cos(yaw), np.sin(yaw)
@@ -86,13 +92,7 @@ class SceneBuilder:
         self._add(BOX, centre, half, [texture] * 6, rotation, 0.0)
 
     def frustum(
-        self,
-        base: Triple,
-        radii: Pair,
-        height: Number,
-        texture: int,
-        *,
-        emission: Number = 0.0,
+        self, base: Triple, radii: Pair, height: Number, texture: int, *, emission: Number = 0.0
     ) -> None:
         """An upright cone frustum on ``base``, the centre of its lower disc; radii below, above."""
         half = np.array([radii[0], radii[1], height / 2])

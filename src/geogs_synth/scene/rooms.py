@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs_synth.scene.batch import each, gathered
+from geogs_synth.scene.batch import gather, map_tensors
 from geogs_synth.scene.solids import NONE, SolidBatch
 
 MOST_SOLIDS = 128
-"""Places for solids in a room that kernels take."""
+"""Most places for solids in a room that the kernels take."""
 
 
 @dataclass(frozen=True)
@@ -98,16 +98,15 @@ class Rooms:
     lights: Lights
 
     def with_places(self, most: int) -> "Rooms":
-        """With at most so many places for solids: empty ones are taken away first, then the last.
-        As it is where there are no more."""
+        """With at most so many places for solids: empty ones are removed first, then the last."""
         kind = self.solids.kind
         if kind.shape[1] <= most:
             return self
         kept = (kind == NONE).long().sort(dim=1, stable=True).indices[:, :most]
         faces = torch.stack([2 * kept + 6, 2 * kept + 7], -1).flatten(1)
         walls = torch.arange(6, device=kind.device).expand(len(kind), 6)
-        surfaces = gathered(self.surfaces, torch.cat([walls, faces], 1))
-        return replace(self, solids=gathered(self.solids, kept), surfaces=surfaces)
+        surfaces = gather(self.surfaces, torch.cat([walls, faces], 1))
+        return replace(self, solids=gather(self.solids, kept), surfaces=surfaces)
 
 
 def packed_solids(solids: SolidBatch) -> Float[Tensor, "b n 16"]:
@@ -117,13 +116,13 @@ def packed_solids(solids: SolidBatch) -> Float[Tensor, "b n 16"]:
     return torch.cat([r.float() for r in rows], -1).contiguous()
 
 
-def room_per_view(rooms: Rooms, views: int, ways: Float[Tensor, "b n 3"]) -> Rooms:
-    """A room for each view, with what moves by ``ways`` from view to view where it is then."""
+def room_per_view(rooms: Rooms, views: int, velocity: Float[Tensor, "b n 3"]) -> Rooms:
+    """A room for each view, with what moves by ``velocity`` (metres per view) where it is then."""
 
     def repeat(tensor: Tensor) -> Tensor:
         return tensor.repeat_interleave(views, 0)
 
-    step = torch.arange(views, device=ways.device).repeat(len(ways))[:, None, None]
-    solids = each(repeat, rooms.solids).moved_by(repeat(ways), step)
-    lights = each(lambda t: t.flatten(0, 1)[:, None], rooms.lights)
-    return Rooms(repeat(rooms.size), solids, each(repeat, rooms.surfaces), lights)
+    step = torch.arange(views, device=velocity.device).repeat(len(velocity))[:, None, None]
+    solids = map_tensors(repeat, rooms.solids).moved_by(repeat(velocity), step)
+    lights = map_tensors(lambda t: t.flatten(0, 1)[:, None], rooms.lights)
+    return Rooms(repeat(rooms.size), solids, map_tensors(repeat, rooms.surfaces), lights)

@@ -53,10 +53,10 @@ class Solids(Generic[Array]):
         return replace(self, kind=torch.where(gone, NONE, self.kind))
 
     def moved_by(
-        self: "Solids[Tensor]", ways: Float[Tensor, "b n 3"], steps: int | Int[Tensor, "*m"]
+        self: "Solids[Tensor]", velocity: Float[Tensor, "b n 3"], views: int | Int[Tensor, "*m"]
     ) -> "Solids[Tensor]":
-        """What moves by ``ways`` per step, that many steps later."""
-        return replace(self, centre=self.centre + steps * ways)
+        """The same that many views later, of what moves by ``velocity`` from view to view."""
+        return replace(self, centre=self.centre + views * velocity)
 
     def flatten(self: "Solids[Tensor]") -> "Solids[Tensor]":
         """The p solids of each of k groups (b k p) one after the other."""
@@ -71,7 +71,7 @@ class Solids(Generic[Array]):
 
 
 SolidBatch = Solids[Tensor]
-"""Those of a batch of scenes."""
+"""Solids of a batch of scenes."""
 
 
 def upright(

@@ -84,19 +84,19 @@ def write_sequence(
     lens = RadialCamera(location.camera(width, height), flaws.k1, flaws.k2)
     folder = prepare_output_folder(folder)
     results = prepare_output_folder(folder / "results")
-    write_camera(folder / "cam_params.json", location, lens, flaws, moving)
-    write_trajectory(folder, location.motion, frames, image_format)
+    _write_camera(folder / "cam_params.json", location, lens, flaws, moving)
+    _write_trajectory(folder, location.motion, frames, image_format)
     write_mesh(folder / "mesh.ply", *scene_mesh(location.scene))
     bodies = location.bodies(lens.camera, frames / rate, moving) if moving else []
     raycaster = (raycaster or Raycaster(location.scene, threads)).with_bodies(bodies)
     shooting = Shooting(raycaster, lens, location.motion.path, flaws, rate, seed)
     quality = _JPEG_QUALITY if flaws.jpeg is None else flaws.jpeg
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
 
     def shoot(index: int) -> Shot:
         shot = shooting.shoot(index)
-        name = results / f"frame{index:06d}.{image_format}"
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
-        _write_image(name, cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), options)
+        bgr = cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR)
+        _write_image(results / f"frame{index:06d}.{image_format}", bgr, options)
         if depth:
             metres = shot.truth.depth
             if depth_sensor is not None:
@@ -146,20 +146,15 @@ def _encode(path: Path, camera: Camera, rate: float, shots: Iterator[Shot]) -> I
         container.mux(stream.encode())
 
 
-def write_camera(
+def _write_camera(
     path: Path, location: Location, lens: RadialCamera, flaws: Flaws, moving: float
 ) -> None:
     """Writes the intrinsics, with the distortion, for programs; the rest is for evaluation."""
-    camera = lens.camera
+    c = lens.camera
     intrinsics: dict[str, Any] = {
-        "w": camera.width,
-        "h": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
+        "w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
         "scale": location.depth_scale,
-    }
+    }  # fmt: skip
     if lens.is_distorted:
         intrinsics["distortion"] = [lens.k1, lens.k2, 0.0, 0.0]
     parameters: dict[str, Any] = {
@@ -168,15 +163,14 @@ def write_camera(
         "scene": location.name,
     }
     if flaws != Flaws() or moving or location.kind != "handheld":
-        parameters["motion"] = location.kind
-        parameters["fps"] = location.motion.rate
-        parameters["readout"] = flaws.readout
-        parameters["flaws"] = asdict(flaws)
-        parameters["moving"] = moving
+        parameters |= {
+            "motion": location.kind, "fps": location.motion.rate, "readout": flaws.readout,
+            "flaws": asdict(flaws), "moving": moving,
+        }  # fmt: skip
     write_text(path, json.dumps(parameters, indent=1) + "\n")
 
 
-def write_trajectory(folder: Path, motion: Motion, frames: int, image_format: str) -> None:
+def _write_trajectory(folder: Path, motion: Motion, frames: int, image_format: str) -> None:
     """Writes ``traj.txt``; where that does not tell the times, lists of TUM besides."""
     times = np.arange(frames) / motion.rate
     T_wc = motion.path(times)

@@ -14,9 +14,7 @@ _TOLERANCE = 4e-4
 """Largest distance in metres between a chord and the arc it replaces."""
 
 
-def scene_mesh(
-    scene: Scene,
-) -> tuple[Float64[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
+def scene_mesh(scene: Scene) -> tuple[Float64[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
     """Vertices (world, metres) and triangles, counter-clockwise from outside.
 
     Boxes are exact; round solids are inscribed and deviate by less than 1 mm. Surfaces hidden
@@ -86,7 +84,7 @@ class SeenSurface:
     """The surface points that depth maps of one camera have shown, one to a voxel."""
 
     def __init__(self, scene: Scene, camera: Camera | RadialCamera, voxel: float = 0.01) -> None:
-        x, y = (camera if isinstance(camera, RadialCamera) else RadialCamera(camera)).rays
+        x, y = RadialCamera.of(camera).rays
         self._rays = np.stack([x, y, np.ones_like(x)], -1)
         self._voxel = voxel
         # A cell of margin, since walls lie exactly on the border.

@@ -47,7 +47,7 @@ class Shooting:
         raycaster: Raycaster,
         lens: RadialCamera,
         path: Path,
-        flaws: Flaws | None = None,
+        flaws: Flaws,
         rate: float = 30.0,
         seed: int = 0,
     ) -> None:
@@ -55,13 +55,13 @@ class Shooting:
         self.lens = lens
         self._raycaster = raycaster
         self._path = path
-        self._flaws = flaws or Flaws()
+        self._flaws = flaws
         self._rate = rate
-        self._sensor = Sensor(self._flaws, lens.camera, seed)
-        self._moving_lens = MovingLens(lens, self._flaws, seed)
+        self._sensor = Sensor(flaws, lens.camera, seed)
+        self._moving_lens = MovingLens(lens, flaws, seed)
 
     def shoot(self, index: int) -> Shot:
-        """The frame of a number."""
+        """The frame with this number."""
         time = index / self._rate
         T_wc = self._path(np.array([time]))[0]
         truth = self._raycaster.render(self.lens, T_wc, time)
@@ -75,7 +75,7 @@ class Shooting:
     def sample_times(
         self, truth: RenderedView, T_wc: np.ndarray, time: float
     ) -> Float64[np.ndarray, "s"]:
-        """Times of the middle row at which its light is gathered; more of them where more moves."""
+        """Times of the middle row at which light is sampled; more where the image moves more."""
         exposure = self._flaws.exposure
         ends = time + exposure * np.array([-0.5, 0.5])
         motion = self._image_motion(truth, T_wc, time, ends) if exposure else 0.0
@@ -115,7 +115,7 @@ class Shooting:
         some = slice(step // 2, None, step)
         x, y = (axis[some, some].ravel() for axis in self.lens.rays)
         depth, solid = truth.depth[some, some].ravel(), truth.solid[some, some].ravel()
-        # The sky is as far as nothing else.
+        # The sky is farther than anything else.
         depth = np.where(depth > 0, depth, 1e4)
         points = np.stack([x, y, np.ones_like(x)], 1) * depth[:, None]
         world = points @ T_wc[:3, :3].T + T_wc[:3, 3]

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from geogs_synth.textures.patterns import fractal_noise, random_colour
+from geogs_synth.textures.patterns import finish, fractal_noise, random_colour
 
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 _LETTERS = "ABCDEFGHIKLMNOPRSTUVW"
@@ -33,7 +33,7 @@ def _print_grain(rng: np.random.Generator, image: np.ndarray) -> UInt8[np.ndarra
     h, w = image.shape[:2]
     grain = 0.04 * fractal_noise(rng, (h, w), (h / 3, w / 3), 2)
     grain += 0.05 * fractal_noise(rng, (h, w), (3, 3), 5, 0.7)
-    return np.clip(image * (1 + grain[..., None]), 4, 250).astype(np.uint8)
+    return finish(image * (1 + grain[..., None]))
 
 
 def poster(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -93,7 +93,7 @@ def outdoors(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarr
     crown = fractal_noise(rng, (4, w), (1, 4), 6, 0.6)[0] * 0.09 * h + 0.58 * h
     trees = np.array([88, 120, 62]) * (1 + 0.3 * leaves[..., None])
     image = np.where((np.arange(h)[:, None] > crown)[..., None], trees, image)
-    image = np.clip(image, 4, 250).astype(np.uint8)
+    image = finish(image)
     bar = max(3, w // 60)
     for k in range(4):
         x = round(k * (w - 1) / 3)
@@ -129,4 +129,4 @@ def book_spine(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.nda
 def page_edges(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """The cut edges of a block of paper."""
     lines = fractal_noise(rng, shape, (2, shape[1] / 3), 2)[..., None]
-    return np.clip(np.array([214, 204, 182]) * (1 + 0.09 * lines), 4, 250).astype(np.uint8)
+    return finish(np.array([214, 204, 182]) * (1 + 0.09 * lines))

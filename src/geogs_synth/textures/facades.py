@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from geogs_synth.textures import patterns
-from geogs_synth.textures.patterns import Colour, fractal_noise
+from geogs_synth.textures.patterns import Colour, finish, fractal_noise
 
 FACADE_TEXEL, ROAD_TEXEL = 0.022, 0.0125
 """Metres."""
@@ -54,7 +54,7 @@ def _opening(
         return
     reflection = fractal_noise(rng, shape, (3, 3), 5, 0.8)
     pane = np.array([0.9, 1.0, 1.15]) * glass * (1 + 0.35 * reflection[..., None])
-    image[top:bottom, left:right] = np.clip(pane, 4, 250).astype(np.uint8)
+    image[top:bottom, left:right] = finish(pane)
     frame = tuple(float(c) for c in rng.uniform(150, 240, 3))
     bar = max(2, round(0.06 / FACADE_TEXEL))
     cv2.rectangle(image, (left, top), (right - 1, bottom - 1), frame, 2 * bar)
@@ -79,7 +79,7 @@ def road(rng: np.random.Generator, length: float, width: float) -> UInt8[np.ndar
     for edge in (round(0.13 * shape[0]), round(0.87 * shape[0])):
         paint[edge - line // 2 : edge + line // 2 + 1] = 1
     alpha = (paint * np.clip(worn, 0, 1))[..., None]
-    return np.clip(image * (1 - alpha) + 225 * alpha, 4, 250).astype(np.uint8)
+    return finish(image * (1 - alpha) + 225 * alpha)
 
 
 def sky(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
@@ -92,4 +92,4 @@ def sky(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     alpha = np.clip(1.2 * clouds - 0.3, 0, 0.85) * np.clip(latitude / 8, 0, 1)[..., None]
     image = np.broadcast_to(image, (h, w, 3)) * (1 - alpha) + 246 * alpha
     image = np.where(latitude[..., None] < -0.5, np.array([150, 152, 146.0]), image)
-    return np.clip(image, 4, 250).astype(np.uint8)
+    return finish(image)

@@ -69,7 +69,8 @@ def _tint(
     return np.asarray(colour, np.float32) * (1 + contrast * value[..., None])
 
 
-def _finish(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def finish(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Colours in 0..255 as a texture of 8 bits, neither black nor white."""
     return np.clip(image, 4, 250).astype(np.uint8)
 
 
@@ -86,7 +87,7 @@ def plaster(
     image = image * (1 - worn) + worn * _tint(speckle, (150, 138, 122), 0.12)
     for _ in range(6):
         _crack(rng, image)
-    return _finish(image)
+    return finish(image)
 
 
 def _crack(rng: np.random.Generator, image: Float32[np.ndarray, "h w 3"]) -> None:
@@ -119,7 +120,7 @@ def brick(
     grain = fractal_noise(rng, shape, (rows * 2, rows * 4), 5, 0.8)
     bricks = _tint(grain, colour, 0.11) * tone[row, column] + hue[row, column]
     mortar = _tint(fractal_noise(rng, shape, (rows * 4, rows * 6), 4, 0.9), (172, 165, 152), 0.07)
-    return _finish(mask * bricks + (1 - mask) * mortar)
+    return finish(mask * bricks + (1 - mask) * mortar)
 
 
 def wallpaper(
@@ -136,7 +137,7 @@ def wallpaper(
             x = (c + 0.5 * (r % 2)) * pitch + rng.normal(0, 0.05 * pitch)
             _flower(rng, image, x, (r + 0.3) * pitch, pitch * rng.uniform(0.2, 0.32), flower_colour)
     image *= 1 + 0.06 * fractal_noise(rng, shape, (3, 4), 8, 0.8)[..., None]
-    return _finish(image)
+    return finish(image)
 
 
 def _flower(
@@ -167,7 +168,7 @@ def wood(
     rings = np.sin(2 * math.pi * (9 * y + 0.9 * warp))
     fibres = fractal_noise(rng, shape, (shape[0] / 8, 4), 4, 0.8)
     broad = fractal_noise(rng, shape, (3, 2), 5)
-    return _finish(_tint(0.5 * rings + 0.6 * fibres + 0.5 * broad, colour, 0.14))
+    return finish(_tint(0.5 * rings + 0.6 * fibres + 0.5 * broad, colour, 0.14))
 
 
 def planks(
@@ -186,7 +187,7 @@ def planks(
         image[top : top + 2] *= 0.45
         for cut in cuts:
             image[top:bottom, cut : cut + 2] *= 0.45
-    return _finish(image)
+    return finish(image)
 
 
 def tiles(
@@ -205,7 +206,7 @@ def tiles(
     fx, fy = x - column * size, y - row * size
     edge = np.minimum(np.minimum(fx, size - fx), np.minimum(fy, size - fy))
     joint = np.clip(1.5 - edge / (0.012 * size), 0, 1)[..., None]
-    return _finish(image * (1 - joint) + joint * np.array([168, 162, 150], np.float32))
+    return finish(image * (1 - joint) + joint * np.array([168, 162, 150], np.float32))
 
 
 def panels(
@@ -225,7 +226,7 @@ def panels(
     fx, fy = x - column * cell[1], y - row * cell[0]
     edge = np.minimum(np.minimum(fx, cell[1] - fx), np.minimum(fy, cell[0] - fy))
     joint = 1 - contrast * np.clip(2 - edge, 0, 1)
-    return _finish(np.asarray(colour, np.float32) * (tone[row, column] * joint)[..., None])
+    return finish(np.asarray(colour, np.float32) * (tone[row, column] * joint)[..., None])
 
 
 def fabric(
@@ -243,7 +244,7 @@ def fabric(
             image[inside] = 0.55 * image[inside] + 0.45 * np.asarray(stripe, np.float32)
     slub = fractal_noise(rng, shape, (24, 24), 4, 0.9)
     creases = fractal_noise(rng, shape, (2, 2), 6, 0.6)
-    return _finish(image * (1 + 0.07 * threads + 0.08 * slub + 0.08 * creases)[..., None])
+    return finish(image * (1 + 0.07 * threads + 0.08 * slub + 0.08 * creases)[..., None])
 
 
 def rug(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -269,7 +270,7 @@ def rug(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "
         cv2.ellipse(image, (w // 2, h // 2), axes, 0, 0, 360, shade, -1, cv2.LINE_AA)
     pile = fractal_noise(rng, shape, (h / 4, w / 4), 2)
     worn = fractal_noise(rng, shape, (3, 4), 6, 0.7)
-    return _finish(image * (1 + 0.09 * pile + 0.10 * worn)[..., None])
+    return finish(image * (1 + 0.09 * pile + 0.10 * worn)[..., None])
 
 
 def ceramic(
@@ -286,4 +287,4 @@ def ceramic(
         centre = (int(rng.uniform(0, w)), int(rng.uniform(0, h)))
         shade = random_colour(rng, (0.2, 0.7), (0.2, 0.95))
         cv2.circle(image, centre, int(rng.uniform(0.012, 0.04) * h), shade, -1, cv2.LINE_AA)
-    return _finish(image)
+    return finish(image)

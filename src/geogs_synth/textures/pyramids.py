@@ -37,10 +37,7 @@ class TextureBank:
         return TextureBank((red | green << 8 | blue << 16).contiguous(), images.shape[1], materials)
 
     def sample(
-        self,
-        texture: Int[Tensor, "*n"],
-        position: Float[Tensor, "*n 2"],
-        level: Int[Tensor, "*n"],
+        self, texture: Int[Tensor, "*n"], position: Float[Tensor, "*n 2"], level: Int[Tensor, "*n"]
     ) -> Float[Tensor, "*n 3"]:
         """Bilinear colour in 0..1; positions in repeats of the texture, level 0 is the finest."""
         side = (self.size >> level)[..., None]

@@ -1,6 +1,6 @@
 """Clips of random rooms that stay on the device: more keyframes a second than can be rendered."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Float16, UInt8
@@ -38,14 +38,14 @@ class StoredClips:
             (clips.images * 255).round().to(torch.uint8),
             clips.depth,
             clips.normal.half(),
-            clips.T_cw,
-            clips.intrinsics,
+            clips.views.T_cw,
+            clips.views.intrinsics,
             coarse.quantile(levels, -1).movedim(0, -1),
         )
 
     def tensors(self) -> list[Tensor]:
         """In the order of the fields."""
-        return [getattr(self, f.name) for f in fields(self)]
+        return [*vars(self).values()]
 
 
 class ClipPool:

@@ -1,4 +1,4 @@
-"""The few numbers that make the depth network's deviations and confidences hold."""
+"""Calibration of the deviations and confidences of the depth network."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,12 +8,12 @@ from geogs.depth.network.depth_calibration import TOLERANCE, DepthCalibration, r
 from geogs_train.depth.depth_scores import DepthErrors
 
 BELIEVED = 0.5
-"""Probability of an outlier below which a pixel's deviation is asked to hold."""
+"""Probability of an outlier below which a pixel's deviation is calibrated."""
 _STEPS = 50
 
 
 def calibrated(pixels: DepthErrors) -> DepthCalibration:
-    """Fitted to pixels of rooms that the network was not trained on.
+    """Calibration fitted to pixels of rooms that the network was not trained on.
 
     Scales are multiplied so that as many errors lie within two deviations as of a Laplace
     distribution; the chance to be right is fitted by logistic regression.

@@ -16,7 +16,7 @@ from geogs_train.depth.confidence_fit import calibrated
 from geogs_train.depth.depth_loss import depth_loss
 from geogs_train.depth.depth_options import DepthTraining
 from geogs_train.depth.depth_scores import DepthErrors, DepthScores
-from geogs_train.depth.depth_tuples import Chance, DepthBatch, draw_tuples
+from geogs_train.depth.depth_tuples import DepthBatch, draw_tuples
 from geogs_train.depth.depth_validation import DepthValidation
 from geogs_train.trained_weights import write_weights
 
@@ -64,25 +64,24 @@ class DepthCourse:
     def batch(self, step: int, progress: float) -> DepthBatch:
         """The size of the images, by the fraction of the run that is done, and the number of
         neighbours are those of all workers."""
-        options, device = self.options, self.worker.device
+        options = self.options
         small = progress < options.small
         if not small:
             self._pools[True].empty()
         clips = self._pools[small].at(step // options.pool.refresh)
-        shared = Draw(torch.device("cpu"), options.seed, step)
+        shared = Draw.keyed(torch.device("cpu"), options.seed, step)
         least, most = options.tuples.least_neighbours, options.tuples.most_neighbours
         count = least + int(shared.integers(most - least + 1, 1))
-        seed = hash((options.seed, step, self.worker.rank)) % 2**62
-        chance = Chance(torch.Generator(device).manual_seed(seed))
+        draw = Draw(self.worker.generator(options.seed, step))
         size = options.small_batch if small else options.batch
-        batch = draw_tuples(clips, size, count, options.tuples, chance)
+        batch = draw_tuples(clips, size, count, options.tuples, draw)
         return replace(batch, progress=progress)
 
     def loss(self, network: DepthNetwork, batch: DepthBatch) -> Float[Tensor, ""]:
         """Nothing random."""
         return depth_loss(network(batch.views), batch, self.options.loss)
 
-    def examination(self, batches: int) -> DepthValidation:
+    def validation(self, batches: int) -> DepthValidation:
         """The validation set."""
         found = DepthValidation(self.options, self.worker.device, batches)
         count = min(batches, CALIBRATION_BATCHES)
@@ -98,7 +97,7 @@ class DepthCourse:
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
         """Write weights as they are shipped; calibrated on rooms that neither training nor
         validation show."""
-        assert self._held_out is not None  # by the examination
+        assert self._held_out is not None  # made with the validation set
         calibration = calibrated(DepthErrors.join(self._held_out.errors(network)))
         write_weights(network, path, step, scores=scores, calibration=calibration)
 

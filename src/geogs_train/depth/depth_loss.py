@@ -1,4 +1,4 @@
-"""What the depth network is trained by: depth, its deviation, normals, their concentration.
+"""The loss of the depth network: depth, its deviation, normals, their concentration.
 
 All of it is unit-free: depths are compared in their logarithms. Deviations, outliers and
 concentrations learn from the likelihood of errors that are detached, so that hard pixels are not
@@ -25,7 +25,7 @@ CELL_SPREAD = 0.05
 NEAR_EDGE = 4
 """Pixels around a pixel within which another depth makes it one of an edge."""
 CHOICE = 0.15
-"""Steps between planes over which the right one of the depths tried at 1/2 is not told apart."""
+"""Temperature of the targets for the depths tried at 1/2, in steps between planes."""
 SCALES = 4
 """Scales of differences, each twice as far apart."""
 
@@ -86,11 +86,9 @@ def surfaces_of_cells(
 
 
 def from_either(
-    found: Float[Tensor, "b h w"],
-    nearest: Float[Tensor, "b h w"],
-    farthest: Float[Tensor, "b h w"],
+    found: Float[Tensor, "b h w"], nearest: Float[Tensor, "b h w"], farthest: Float[Tensor, "b h w"]
 ) -> Float[Tensor, "b h w"]:
-    """Distance from the surface that is closer: a mean of two would be no depth at all."""
+    """Distance from the closer of two surfaces, between which there is no depth."""
     return torch.minimum((found - nearest).abs(), (found - farthest).abs())
 
 
@@ -150,7 +148,7 @@ def plane_loss(
 def _log_likelihood(
     log: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d"], depth: Float[Tensor, "b h w"]
 ) -> tuple[Float[Tensor, "b h w"], Bool[Tensor, "b h w"]]:
-    """Between the logarithms of the planes before and after a depth; where it is among them."""
+    """Log-likelihood of depths, interpolated between planes; and where they lie among them."""
     planes = log_planes.shape[1]
     step = plane_step(log_planes)[:, None, None]
     place = ((depth - log_planes[:, :1, None]) / step).nan_to_num(-1.0)
@@ -180,5 +178,5 @@ def outlier_laplace(error: Tensor, log_scale: Tensor, outlier: Tensor, log_range
 
 
 def _mean(values: Tensor, chosen: Tensor) -> Float[Tensor, ""]:
-    """Over what is chosen; 0 of nothing."""
+    """Mean of the chosen values; 0 where none is."""
     return torch.where(chosen, values, 0.0).sum() / chosen.sum().clamp_min(1)

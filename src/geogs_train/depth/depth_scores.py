@@ -1,6 +1,6 @@
-"""How good depths and normals are on textured, faint and bare surfaces, and whether they know."""
+"""Scores of depths and normals on textured, faint and bare surfaces, and their calibration."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 import torch
 from jaxtyping import Float, UInt8
@@ -66,7 +66,7 @@ class DepthScores:
     bare_absolute: float
     bare_within_5: float
     bare_normal: float
-    scale: float = field(default=1.0)
+    scale: float
     """Mean over the believed pixels of absolute error over Laplace scale: 1 if calibrated."""
 
     def line(self) -> str:

@@ -1,4 +1,4 @@
-"""Samples from a pool of clips: a keyframe, neighbours, and what is wrong with what is known."""
+"""Samples from a pool of clips: a keyframe and neighbours, with errors such as a tracker's."""
 
 import math
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from torch import Tensor
 from geogs.depth.network.search_range import RATIO
 from geogs.depth.network.stereo_views import StereoViews
 from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs_synth.draw import Draw
 from geogs_train.depth.clip_pool import StoredClips
 from geogs_train.depth.depth_options import TupleOptions
 
@@ -22,7 +23,7 @@ class DepthBatch:
     """Samples with their truth."""
 
     views: StereoViews
-    """What is known, disturbed; lengths in metres."""
+    """The network's input, with errors; lengths in metres."""
     depth: Float[Tensor, "b h w"]
     """Depth of the keyframe, metres."""
     normal: Float[Tensor, "b 3 h w"]
@@ -33,55 +34,30 @@ class DepthBatch:
     """Fraction of the run that is done."""
 
 
-class Chance:
-    """Random tensors of a generator on its device."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self._generator = generator
-        self.device = generator.device
-
-    def uniform(self, *shape: int) -> Float[Tensor, "..."]:
-        """In [0, 1)."""
-        return torch.rand(*shape, generator=self._generator, device=self.device)
-
-    def normal(self, *shape: int) -> Float[Tensor, "..."]:
-        """Normal numbers of deviation 1."""
-        return torch.randn(*shape, generator=self._generator, device=self.device)
-
-    def log_uniform(self, bounds: tuple[float, ...], *shape: int) -> Float[Tensor, "..."]:
-        """Between two positive bounds."""
-        low, high = (math.log(x) for x in bounds)
-        return (low + (high - low) * self.uniform(*shape)).exp()
-
-    def integers(self, end: int, *shape: int) -> Int[Tensor, "..."]:
-        """0 to end - 1."""
-        return torch.randint(end, shape, generator=self._generator, device=self.device)
-
-
 def draw_tuples(
-    clips: StoredClips, count: int, neighbours: int, options: TupleOptions, chance: Chance
+    clips: StoredClips, count: int, neighbours: int, options: TupleOptions, draw: Draw
 ) -> DepthBatch:
     """``count`` keyframes with ``neighbours`` each, drawn and disturbed."""
     total, views = clips.depth.shape[:2]
-    clip, view = chance.integers(total, count), chance.integers(views, count)
-    others = choose_neighbours(clips, clip, view, neighbours, options, chance)
+    clip, view = draw.integers(total, count), draw.integers(views, count)
+    others = choose_neighbours(clips, clip, view, neighbours, options, draw)
     T = clips.T_cw[clip]
-    own = T[torch.arange(count, device=chance.device), view]
+    own = T[torch.arange(count, device=draw.device), view]
     relative = T.gather(1, others[..., None, None].expand(-1, -1, 4, 4)) @ se3_inverse(own)[:, None]
     # Some neighbours show another room, some are not there.
-    strange = chance.uniform(count, neighbours) < options.dud
-    shown = torch.where(strange, chance.integers(total, count, neighbours), clip[:, None])
-    valid = chance.uniform(count, neighbours) >= options.missing
+    strange = draw.chance(options.dud, count, neighbours)
+    shown = torch.where(strange, draw.integers(total, count, neighbours), clip[:, None])
+    valid = ~draw.chance(options.missing, count, neighbours)
     valid[:, 0] = True
     low, typical, high = clips.quantiles[clip, view].unbind(-1)
-    near, far, typical = known_range(low, typical, high, options, chance)
-    relative = disturbed_poses(relative, options, chance)
+    near, far, typical = known_range(low, typical, high, options, draw)
+    relative = disturbed_poses(relative, options, draw)
     lens = clips.intrinsics[clip]
-    wrong = (chance.uniform(count) < options.disturbed) * options.focal
-    factor = 1 + wrong * (2 * chance.uniform(count) - 1)
+    wrong = draw.chance(options.disturbed, count) * options.focal
+    factor = 1 + wrong * (2 * draw.uniform(0, 1, count) - 1)
     lens = torch.cat([lens[:, :2] * factor[:, None], lens[:, 2:]], 1)
     images = torch.cat([clips.images[clip, view][:, None], clips.images[shown, others]], 1)
-    images = relit(images.float() / 255, options.photometric, chance)
+    images = relit(images.float() / 255, options.photometric, draw)
     known = StereoViews(
         images[:, 0],
         images[:, 1:],
@@ -103,7 +79,7 @@ def choose_neighbours(
     view: Int[Tensor, "b"],
     count: int,
     options: TupleOptions,
-    chance: Chance,
+    draw: Draw,
 ) -> Int[Tensor, "b k"]:
     """Views of the same clips: good ones first, in any order, then those nearest to good."""
     T = clips.T_cw[clip]
@@ -115,7 +91,7 @@ def choose_neighbours(
     short = (options.least_baseline / ratio).log().clamp_min(0)
     long = (ratio / options.most_baseline).log().clamp_min(0)
     turned = (cosine.clamp(-1, 1).arccos() / MOST_TURN - 1).clamp_min(0)
-    misfit = short + long + turned + 0.3 * chance.uniform(*ratio.shape)
+    misfit = short + long + turned + 0.3 * draw.uniform(0, 1, *ratio.shape)
     misfit[rows, view] = torch.inf
     if count >= misfit.shape[1]:
         raise ValueError(f"A clip of {misfit.shape[1]} views has no {count} neighbours.")
@@ -127,45 +103,52 @@ def known_range(
     typical: Float[Tensor, "b"],
     high: Float[Tensor, "b"],
     options: TupleOptions,
-    chance: Chance,
+    draw: Draw,
 ) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"], Float[Tensor, "b"]]:
     """Nearest, farthest and median depth as a tracker would know them; about half the depths
     beyond the quantiles are left out at worst."""
     n = len(low)
-    near = 0.5 * low / chance.log_uniform(options.range_error, n)
-    far = 2.0 * high * chance.log_uniform(options.range_error, n)
+    near = 0.5 * low / _log_uniform(draw, options.range_error, n)
+    far = 2.0 * high * _log_uniform(draw, options.range_error, n)
     widen = (RATIO[0] / (far / near)).clamp_min(1).sqrt()
     narrow = ((far / near) / RATIO[1]).clamp_min(1)
     near, far = near / widen * narrow.sqrt(), far * widen / narrow.sqrt()
-    return near, far, typical * chance.log_uniform(options.typical_error, n)
+    return near, far, typical * _log_uniform(draw, options.typical_error, n)
 
 
 def disturbed_poses(
-    T: Float[Tensor, "b k 4 4"], options: TupleOptions, chance: Chance
+    T: Float[Tensor, "b k 4 4"], options: TupleOptions, draw: Draw
 ) -> Float[Tensor, "b k 4 4"]:
-    """Poses that are off by what a tracker's are; in a fraction of the samples."""
+    """Poses with errors such as a tracker's, in a fraction of the samples."""
     b, k = T.shape[:2]
-    wrong = (chance.uniform(b, 1, 1) < options.disturbed).float()
-    rotation = torch.deg2rad(chance.log_uniform(options.rotation, b, 1, 1)) * chance.normal(b, k, 3)
+    wrong = draw.chance(options.disturbed, b, 1, 1).float()
+    degrees = _log_uniform(draw, options.rotation, b, 1, 1)
+    rotation = torch.deg2rad(degrees) * draw.normal(1.0, b, k, 3)
     baseline = T[..., :3, 3].norm(dim=-1, keepdim=True)
-    shift = chance.log_uniform(options.translation, b, 1, 1) * baseline * chance.normal(b, k, 3)
+    shift = _log_uniform(draw, options.translation, b, 1, 1) * baseline * draw.normal(1.0, b, k, 3)
     # About the neighbour's own centre: a rotation alone leaves the baseline as it is.
     return se3_exp(wrong * torch.cat([shift, rotation], -1)).to(T) @ T
 
 
 def relit(
-    images: Float[Tensor, "b v 3 h w"], strength: float, chance: Chance
+    images: Float[Tensor, "b v 3 h w"], strength: float, draw: Draw
 ) -> Float[Tensor, "b v 3 h w"]:
-    """Images under other exposure, white balance and tone, each a little different, with noise."""
+    """Images with random exposure, white balance and tone, each a little different, and noise."""
     b, v = images.shape[:2]
 
     def vary(deviation: float, *channels: int) -> Float[Tensor, "b v c 1 1"]:
-        numbers = deviation * strength * chance.normal(b, v, *channels)
+        numbers = deviation * strength * draw.normal(1.0, b, v, *channels)
         return numbers.exp().reshape(b, v, -1, 1, 1)
 
     bright = images.clamp_min(1e-3) ** vary(0.15, 1) * vary(0.15, 1) * vary(0.04, 3)
-    noise = 0.02 * strength * chance.uniform(b, v, 1, 1, 1).square() * chance.normal(*images.shape)
-    return (bright + noise).clamp(0, 1)
+    deviation = 0.02 * strength * draw.uniform(0, 1, b, v, 1, 1, 1).square()
+    return (bright + deviation * draw.normal(1.0, *images.shape)).clamp(0, 1)
+
+
+def _log_uniform(draw: Draw, bounds: tuple[float, ...], *shape: int) -> Float[Tensor, "..."]:
+    """As ``Draw.log_uniform``, but rounded otherwise: networks were trained with these numbers."""
+    low, high = (math.log(x) for x in bounds)
+    return (low + (high - low) * draw.uniform(0, 1, *shape)).exp()
 
 
 def has_truth(batch: DepthBatch) -> Bool[Tensor, "b h w"]:

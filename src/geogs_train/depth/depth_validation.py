@@ -9,15 +9,16 @@ from torch import Tensor
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.stereo_views import DepthPrediction
 from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.draw import Draw
 from geogs_synth.textures.pyramids import TextureBank
 from geogs_train.depth.clip_pool import StoredClips
 from geogs_train.depth.depth_options import DepthTraining
 from geogs_train.depth.depth_scores import DepthErrors, DepthScores, summarise, texture_kind
-from geogs_train.depth.depth_tuples import Chance, DepthBatch, draw_tuples
+from geogs_train.depth.depth_tuples import DepthBatch, draw_tuples
 
 SEED = 3141
 EVERY = 3
-"""Every so many-th pixel across and down is looked at."""
+"""Step between the pixels that are scored, across and down."""
 
 
 class DepthValidation:
@@ -34,7 +35,7 @@ class DepthValidation:
         """``bank`` may be that of another set."""
         rooms = RoomSampler(replace(options.rooms, validation=True), device, seed, bank)
         self.options, self.bank = options, rooms.bank
-        chance = Chance(torch.Generator(device).manual_seed(seed))
+        draw = Draw(torch.Generator(device).manual_seed(seed))
         self.batches: list[DepthBatch] = []
         self.kinds: list[UInt8[Tensor, "b h w"]] = []
         tuples = options.tuples
@@ -43,14 +44,14 @@ class DepthValidation:
             clips = rooms.sample(number, options.pool.rooms)
             count = tuples.least_neighbours + number % span
             stored = StoredClips.of(clips)
-            batch = draw_tuples(stored, options.batch, count, tuples, chance)
+            batch = draw_tuples(stored, options.batch, count, tuples, draw)
             clip, view = batch.place.unbind(1)
             self.batches.append(batch)
             self.kinds.append(texture_kind(clips.light[clip, view]))
 
     @torch.no_grad()
     def errors(self, network: DepthNetwork) -> list[DepthErrors]:
-        """Scores of a network, batch by batch."""
+        """Errors of a network, batch by batch."""
         network.eval()
         found = (network(b.views) for b in self.batches)
         parts = [

@@ -63,8 +63,7 @@ class FlowCourse:
         """Every ordered pair of neighbouring views, from disturbed starts; all that is random is
         drawn here, the same whenever the step is asked for."""
         clips = self.rooms.film(self._plans.plan(step))
-        generator = torch.Generator(self.worker.device)
-        generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
+        generator = self.worker.generator(self.options.seed, step)
         with torch.no_grad():
             return flow_batch(clips, StartOptions(far=self.options.far), generator)
 
@@ -73,7 +72,7 @@ class FlowCourse:
         found = run_network(network, batch, self.options.iterations)
         return flow_loss(*found, batch, self.options)
 
-    def examination(self, batches: int) -> SceneValidation:
+    def validation(self, batches: int) -> SceneValidation:
         """The validation set."""
         return SceneValidation(self.options, self.worker.device, batches)
 

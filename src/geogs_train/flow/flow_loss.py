@@ -1,4 +1,4 @@
-"""What the flow network says of a batch, and what it is trained to say."""
+"""Estimates of the flow network for a batch, and the loss that it is trained by."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from geogs_train.flow.flow_options import FlowTraining
 from geogs_train.flow.flow_pairs import FlowBatch
 
 MAX_ERROR = 100.0
-"""Errors beyond so many pixels count as such; nothing is learned from how far lost a cell is."""
+"""Errors in pixels are clamped here: how far a lost cell is off teaches nothing."""
 
 
 def run_network(
@@ -61,7 +61,7 @@ def descriptor_loss(features: FlowFeatures, batch: FlowBatch) -> Float[Tensor, "
     A window is read as logits over its 49 places; the truth is shared by the four around it.
     Cells that the second view does not see, and levels whose window misses the truth, do not count.
     Sum over the levels of the mean over the cells. It makes descriptors tell places apart within
-    the first hundreds of steps, which the flow's error alone takes thousands for.
+    the first hundreds of steps; the flow's error alone takes thousands.
     """
     windows = correlation_windows(features.source, features.pyramid, batch.edges, batch.probe)
     windows = windows.unflatten(-1, (-1, WINDOW)).log_softmax(-1)

@@ -17,9 +17,7 @@ class FlowTraining(TrainingSchedule):
     """Clips per step and device."""
     rooms: RoomOptions = field(
         default_factory=lambda: RoomOptions(
-            width=416,
-            height=288,
-            scenes=SceneWeights(0.5, 0.12, 0.08, 0.08, 0.04, 0.18),
+            width=416, height=288, scenes=SceneWeights(0.5, 0.12, 0.08, 0.08, 0.04, 0.18)
         )
     )
     """What the clips show; every ordered pair of neighbouring views is an edge."""

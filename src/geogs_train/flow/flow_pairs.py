@@ -1,4 +1,4 @@
-"""Clips of rooms as what the flow network learns from: images, edges, truth, starts."""
+"""Training batches of the flow network, made of clips: images, edges, true flow, starts."""
 
 import math
 from dataclasses import dataclass
@@ -76,7 +76,7 @@ def flow_batch(clips: ClipBatch, options: StartOptions, generator: torch.Generat
 
 
 def _offsets(like: Float[Tensor, "e p 2"], generator: torch.Generator) -> Float[Tensor, "e p 2"]:
-    """Offsets of any direction, their lengths spread evenly over the scales of the windows."""
+    """Offsets of any direction with log-uniform lengths."""
     u = torch.rand(*like.shape, generator=generator, device=like.device)
     low, high = math.log(PROBE[0]), math.log(PROBE[1])
     length, angle = (low + (high - low) * u[..., 0]).exp(), 2 * math.pi * u[..., 1]
@@ -96,16 +96,16 @@ def _starts(
 ) -> Tensor:
     largest, truth = None, _at_cells(truth)
     if clips.dynamics is not None:
-        # What poses and depths say knows of no motion but the camera's.
+        # A tracker's poses and depths predict the camera's motion only.
         truth = clips.still_flow(_at_cells(clips.points(pair[0])), pair[1])
-        largest = torch.full_like(clips.intrinsics[:, 0], options.largest)
+        largest = torch.full_like(clips.views.intrinsics[:, 0], options.largest)
         largest = torch.where(clips.dynamics.kind == PAPERED, REPEATING, largest)
     depth = _at_cells(clips.depth[:, pair[0]])
     cells = cell_pixels(depth.shape[1], depth.shape[2], depth).reshape(*depth.shape[1:], 2)
-    intrinsics = clips.intrinsics.float()
+    intrinsics = clips.views.intrinsics.float()
     f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]
     rays = torch.cat([(cells - c) / f, torch.ones_like(depth)[..., None]], -1)
-    T_cw = clips.T_cw.float()
+    T_cw = clips.views.T_cw.float()
     T_ji = T_cw[:, pair[1]] @ se3_inverse(T_cw[:, pair[0]])
     return disturbed_starts(
         truth, depth, rays, T_ji, intrinsics, cells, options, generator, largest

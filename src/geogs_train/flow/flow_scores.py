@@ -1,4 +1,4 @@
-"""How good a flow is: error, fraction of outliers, and whether it knows how good it is."""
+"""Scores of flow: error, fraction of outliers, calibration of the predicted deviations."""
 
 from dataclasses import asdict, dataclass
 
@@ -62,10 +62,8 @@ class CellErrors:
 
 def summarise(parts: list[CellErrors]) -> FlowScores:
     """Scores over all cells of several batches."""
-    error, deviation, motion, textured, dense = (
-        torch.cat([getattr(p, name) for p in parts])
-        for name in ("error", "deviation", "motion", "textured", "dense")
-    )
+    rows = zip(*(vars(part).values() for part in parts), strict=True)
+    error, deviation, motion, textured, dense = map(torch.cat, rows)
     length = error.norm(dim=-1)
     inside = (error.abs() < 2 * deviation).float().mean(-1)
     large = motion > LARGE_MOTION
@@ -85,14 +83,13 @@ def summarise(parts: list[CellErrors]) -> FlowScores:
 
 
 def has_texture(images: Float[Tensor, "n 3 h w"]) -> Bool[Tensor, "n h w"]:
-    """Where the structure tensor over 9 x 9 pixels has no small eigenvalue, as the tracker asks."""
+    """Where the structure tensor over 9 x 9 pixels has no small eigenvalue: the tracker's test."""
     weights = images.new_tensor([0.299, 0.587, 0.114]) * 255
     grey = (images * weights[:, None, None]).sum(1, keepdim=True)
     kernel = images.new_tensor([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8
     padded = functional.pad(grey, (1, 1, 1, 1), mode="replicate")
     gx, gy = (functional.conv2d(padded, k[None, None]) for k in (kernel, kernel.mT))
-    box = [functional.avg_pool2d(p, 9, 1, 4)[:, 0] for p in (gx * gx, gy * gy, gx * gy)]
-    xx, yy, xy = box
+    xx, yy, xy = (functional.avg_pool2d(p, 9, 1, 4)[:, 0] for p in (gx * gx, gy * gy, gx * gy))
     smaller = (xx + yy) / 2 - (((xx - yy) / 2) ** 2 + xy * xy).sqrt()
     return smaller > MIN_STRUCTURE
 

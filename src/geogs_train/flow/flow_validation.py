@@ -23,7 +23,7 @@ class SceneScores:
 
     usual: FlowScores
     others: dict[str, FlowScores]
-    """By the names of :class:`SceneWeights`."""
+    """Scores by the names of :class:`SceneWeights`."""
 
     def line(self) -> str:
         """On a line for each kind."""
@@ -34,7 +34,7 @@ class SceneScores:
 class SceneValidation:
     """One validation set for each kind of scene; the usual one is always there."""
 
-    def __init__(self, options: FlowTraining, device: torch.device, batches: int = 8) -> None:
+    def __init__(self, options: FlowTraining, device: torch.device, batches: int) -> None:
         self._usual = Validation(options, device, batches)
         weights, few = options.rooms.scenes, max(1, batches // 2)
         self._others = {

@@ -100,10 +100,10 @@ def test_light_is_finite_and_shadows_are_dark():
 def test_flow_is_the_reprojection_of_depth(clips):
     truth = clips.flow(0, 1)
     v, u = 20, 33
-    fx, fy, cx, cy = clips.intrinsics.double().T
+    fx, fy, cx, cy = clips.views.intrinsics.double().T
     z = clips.depth[:, 0, v, u].double()
     p = torch.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, torch.ones_like(z)], -1)
-    T = clips.T_cw.double()
+    T = clips.views.T_cw.double()
     q = torch.einsum("bij,bj->bi", T[:, 1] @ torch.linalg.inv(T[:, 0]), p)
     expected = torch.stack([fx * q[:, 0] / q[:, 2] + cx, fy * q[:, 1] / q[:, 2] + cy], -1)
     front = truth.valid[:, v, u]
@@ -129,23 +129,23 @@ def test_flow_there_and_back(clips):
 def test_same_numbers_give_the_same_clips(sampler):
     first, again = sampler.sample(3, 2), sampler.sample(3, 2)
     assert (first.images == again.images).all()
-    assert (first.T_cw == again.T_cw).all()
+    assert (first.views.T_cw == again.views.T_cw).all()
     for other in (sampler.sample(4, 2), sampler.sample(3, 2, rank=1)):
-        assert (first.T_cw != other.T_cw).any()
+        assert (first.views.T_cw != other.views.T_cw).any()
 
 
 def test_validation_has_other_rooms_and_textures(sampler):
     options = replace(OPTIONS, validation=True)
     other = RoomSampler(options, "cpu")
     assert (other.bank.texels != sampler.bank.texels).float().mean() > 0.5
-    assert (other.sample(3, 2).T_cw != sampler.sample(3, 2).T_cw).any()
+    assert (other.sample(3, 2).views.T_cw != sampler.sample(3, 2).views.T_cw).any()
 
 
 def test_statistics_of_the_clips(clips):
     truth = clips.flow(0, 1)
-    share = truth.visible.float().mean((1, 2))
-    assert share.mean() > 0.5
-    assert share.median() < 0.97
+    fraction = truth.visible.float().mean((1, 2))
+    assert fraction.mean() > 0.5
+    assert fraction.median() < 0.97
     y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     motion = (truth.pixels - torch.stack([x, y], -1)).norm(dim=-1)[truth.visible] * 512 / 64
     assert motion.quantile(0.1) < 25
@@ -180,7 +180,7 @@ def test_paths_of_many_views(sampler):
 
 
 def test_draws_follow_their_shares():
-    draw = Draw(torch.device("cpu"), 1)
+    draw = Draw.keyed(torch.device("cpu"), 1)
     counts = torch.bincount(draw.choose((1.0, 2.0, 1.0), 4000)) / 4000
     torch.testing.assert_close(counts, torch.tensor([0.25, 0.5, 0.25]), rtol=0, atol=0.04)
     R = draw.rotation(10)
@@ -197,7 +197,7 @@ def test_compression_keeps_what_it_does_not_round():
 
 
 def test_pictures_without_flaws_are_those_of_the_light():
-    draw = Draw(torch.device("cpu"), 0)
+    draw = Draw.keyed(torch.device("cpu"), 0)
     flaws = draw_flaws(draw, 2, 2, disturbance=0.0)
     light = torch.rand(2, 2, 3, 24, 32, generator=torch.Generator().manual_seed(1))
     image = develop(draw, flaws, light)
@@ -213,8 +213,8 @@ def test_wall_distance():
 
 
 def test_normals_are_those_of_the_depth_and_face_the_camera(clips):
-    x = (torch.arange(64.0) - clips.intrinsics[:, 2:3]) / clips.intrinsics[:, :1]
-    y = (torch.arange(48.0) - clips.intrinsics[:, 3:]) / clips.intrinsics[:, 1:2]
+    x = (torch.arange(64.0) - clips.views.intrinsics[:, 2:3]) / clips.views.intrinsics[:, :1]
+    y = (torch.arange(48.0) - clips.views.intrinsics[:, 3:]) / clips.views.intrinsics[:, 1:2]
     ray = torch.stack(torch.broadcast_tensors(x[:, None], y[:, :, None], torch.ones(1)), 1)
     assert ((clips.normal * ray[:, None]).sum(2) < 1e-4).float().mean() > 0.999
     assert torch.allclose(clips.normal.norm(dim=2), torch.ones(()), atol=1e-5)

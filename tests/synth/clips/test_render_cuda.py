@@ -18,7 +18,7 @@ from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
 from geogs_synth.raycast.cpu_caster import CpuCaster
 from geogs_synth.raycast.cuda_caster import SOURCE, CudaCaster
-from geogs_synth.scene.batch import moved
+from geogs_synth.scene.batch import on_device
 from geogs_synth.scene.rooms import MOST_SOLIDS, Rooms
 from random_rooms import small_bank
 
@@ -43,14 +43,14 @@ def furnished(device: torch.device) -> tuple[Rooms, CameraBatch]:
     options = RoomOptions(
         width=width, height=height, least_density=0.7, most_density=0.9, candidates=8
     )
-    draw = Draw(torch.device("cpu"), 3)
+    draw = Draw.keyed(torch.device("cpu"), 3)
     size = draw.uniform(3.0, 6.0, 2 if large else 1, 3)
     layout = draw_furnishing(draw, size, options.least_density, options.most_density)
     surfaces = draw_surfaces(draw, layout, 2, 1)
     lights = draw_lights(draw, size, 2, 1.0)
     views = choose_cameras(draw_paths(draw, options, size), size, layout.solids, width, height)
     solids = layout.solids.without(too_near(layout.solids, views))
-    return moved(Rooms(size, solids, surfaces, lights), device), moved(views, device)
+    return on_device(Rooms(size, solids, surfaces, lights), device), on_device(views, device)
 
 
 def sweep_of(views: CameraBatch) -> torch.Tensor:
@@ -78,8 +78,8 @@ def test_renders_like_the_reference(device):
     views = replace(views, sweep=sweep_of(views))
     bank = small_bank()
     bank = replace(bank, texels=bank.texels.to(device))
-    fast = moved(CudaCaster().render(rooms, bank, views), HOST)
-    slow = CpuCaster().render(moved(rooms, HOST), small_bank(), moved(views, HOST))
+    fast = on_device(CudaCaster().render(rooms, bank, views), HOST)
+    slow = CpuCaster().render(on_device(rooms, HOST), small_bank(), on_device(views, HOST))
     # Rays that graze an edge, or whose texture level is between two, may fall on either side.
     wrong = (fast.depth - slow.depth).abs() > 1e-4 * slow.depth
     assert wrong.float().mean() < 2e-3
@@ -97,8 +97,8 @@ def test_hits_like_the_reference(device):
     b = len(rooms.size)
     direction = torch.randn(b, 500, 3, generator=g).to(device)
     origin = (0.5 * rooms.size[:, None]).expand_as(direction)
-    fast = moved(CudaCaster().first_hit(rooms.size, rooms.solids, origin, direction), HOST)
-    rooms = moved(rooms, HOST)
+    fast = on_device(CudaCaster().first_hit(rooms.size, rooms.solids, origin, direction), HOST)
+    rooms = on_device(rooms, HOST)
     slow = CpuCaster().first_hit(rooms.size, rooms.solids, origin.cpu(), direction.cpu())
     assert (fast.solid != slow.solid).float().mean() < 5e-3
     same = fast.solid == slow.solid
@@ -110,8 +110,8 @@ def test_flows_like_the_reference(device):
     b = len(views.T_cw)
     views = replace(views, sweep=sweep_of(views))
     points = seen_points(views, 1 + torch.rand(b, views.height, views.width, device=device))
-    fast = moved(CudaCaster().flow(rooms.solids, views, points, 1), HOST)
-    slow = CpuCaster().flow(moved(rooms.solids, HOST), moved(views, HOST), points.cpu(), 1)
+    fast = on_device(CudaCaster().flow(rooms.solids, views, points, 1), HOST)
+    slow = CpuCaster().flow(on_device(rooms.solids, HOST), on_device(views, HOST), points.cpu(), 1)
     torch.testing.assert_close(fast.pixels, slow.pixels, rtol=1e-4, atol=1e-2)
     assert (fast.valid == slow.valid).all()
     assert (fast.visible != slow.visible).float().mean() < 2e-3

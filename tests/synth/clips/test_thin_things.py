@@ -18,7 +18,7 @@ OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidat
 
 
 def draw() -> Draw:
-    return Draw(torch.device("cpu"), 5)
+    return Draw.keyed(torch.device("cpu"), 5)
 
 
 def test_gaps_of_railings_are_wider_than_their_balusters():

@@ -49,11 +49,11 @@ def test_usual_rooms_are_what_they_were_before_there_were_others():
 
 
 def test_kinds_come_as_often_as_asked_for():
-    shares = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
-    kind = Draw(CPU, 1).choose(astuple(shares), 4000)
-    share = torch.bincount(kind, minlength=len(SCENE_KINDS)) / 4000
-    assert share.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
-    assert Draw(CPU, 1).choose(astuple(only_scene("street")), 5).tolist() == [STREET] * 5
+    weights = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
+    kind = Draw.keyed(CPU, 1).choose(astuple(weights), 4000)
+    fraction = torch.bincount(kind, minlength=len(SCENE_KINDS)) / 4000
+    assert fraction.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
+    assert Draw.keyed(CPU, 1).choose(astuple(only_scene("street")), 5).tolist() == [STREET] * 5
 
 
 def test_points_are_where_the_row_that_sees_them_says():
@@ -116,7 +116,7 @@ def test_people_move_and_their_flow_is_their_own(sampler):
     clips = film(sampler, "people", 4)
     assert clips.dynamics is not None
     truth, still = clips.flow(0, 1), clips.still_flow(clips.points(0), 1)
-    moving = clips.dynamics.ways_of(clips.solid[:, 0]).norm(dim=-1) > 0
+    moving = clips.dynamics.velocity_of(clips.solid[:, 0]).norm(dim=-1) > 0
     apart = (truth.pixels - still).norm(dim=-1)
     assert 0.005 < moving.float().mean() < 0.7
     assert apart[~moving].max() < 1e-3
@@ -136,7 +136,7 @@ def test_a_street_has_a_sky_that_stays_where_it_is_and_ground_below(sampler):
     assert 0.03 < far.float().mean() < 0.8
     low = depth[:, 40:]
     assert (low < 60).float().mean() > 0.6
-    shift = (clips.T_cw[:, 1, :3, 3] - clips.T_cw[:, 0, :3, 3]).norm(dim=-1)
+    shift = (clips.views.T_cw[:, 1, :3, 3] - clips.views.T_cw[:, 0, :3, 3]).norm(dim=-1)
     assert shift.max() < 300
     assert clips.images.isfinite().all()
     assert clips.images.std() > 0.05
@@ -158,7 +158,7 @@ def test_papered_walls_start_from_the_right_one(sampler):
 
 def test_only_shaken_clips_are_read_row_by_row():
     kind = torch.tensor([0, 1] * 200)
-    shake = draw_shake(Draw(CPU, 5), kind, 2)
+    shake = draw_shake(Draw.keyed(CPU, 5), kind, 2)
     assert (shake.sweep[kind == 0] == 0).all()
     assert (shake.exposure[kind == 0] == 0).all()
     rolling = shake.sweep[kind == 1].abs().amax((1, 2)) > 0

@@ -12,15 +12,15 @@ from geogs_train.depth.depth_scores import DepthErrors
 N = 60_000
 
 
-def drawn(factor: float, share: float = 0.0, seed: int = 0) -> DepthErrors:
+def drawn(factor: float, fraction: float = 0.0, seed: int = 0) -> DepthErrors:
     """Laplace errors whose scales are ``factor`` times what is said; some are outliers."""
     rng = torch.Generator().manual_seed(seed)
     scale = 0.002 * (30 * torch.rand(N, generator=rng)).clamp_min(0.5)
     uniform = torch.rand(N, generator=rng).clamp(1e-6, 1 - 1e-6) - 0.5
     error = -factor * scale * uniform.sign() * torch.log1p(-2 * uniform.abs())
-    wild = torch.rand(N, generator=rng) < share
+    wild = torch.rand(N, generator=rng) < fraction
     error = torch.where(wild, 2 * torch.rand(N, generator=rng) - 1, error)
-    said = torch.full((N,), max(share, 1e-4))
+    said = torch.full((N,), max(fraction, 1e-4))
     return DepthErrors(
         error, 2**0.5 * scale, said, torch.zeros(N), torch.zeros(N, dtype=torch.uint8)
     )

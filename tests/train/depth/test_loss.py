@@ -149,8 +149,8 @@ def test_the_cross_entropy_of_planes_equals_a_loop():
         place = (float(values[i, j]) + 1) / 0.5
         below = min(int(place), 3)
         log = logits[0, :, i, j].log_softmax(0)
-        share = place - below
-        total.append(-(1 - share) * float(log[below]) - share * float(log[below + 1]))
+        fraction = place - below
+        total.append(-(1 - fraction) * float(log[below]) - fraction * float(log[below + 1]))
     found = plane_loss(logits, planes, truth, torch.ones(1, 8, 8, dtype=torch.bool))
     assert float(found) == pytest.approx(sum(total) / 3, rel=1e-5)
 

@@ -6,19 +6,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-from depth_tuples import TRAINING, use_fast_rooms
+from depth_tuples import TRAINING
 from geogs.depth.network.plane_views import cell_rays
 from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.draw import Draw
 from geogs_train.course import Worker
 from geogs_train.depth.clip_pool import ClipPool, StoredClips
 from geogs_train.depth.depth_options import TupleOptions
-from geogs_train.depth.depth_tuples import Chance, disturbed_poses, draw_tuples, known_range, relit
+from geogs_train.depth.depth_tuples import disturbed_poses, draw_tuples, known_range, relit
+from random_rooms import use_fast_rooms
 
 EXACT = TupleOptions(dud=0.0, missing=0.0, disturbed=0.0, photometric=0.0)
 
 
-def chance(seed: int = 0) -> Chance:
-    return Chance(torch.Generator().manual_seed(seed))
+def draw(seed: int = 0) -> Draw:
+    return Draw(torch.Generator().manual_seed(seed))
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,7 @@ def stored() -> StoredClips:
 
 
 def test_true_depth_takes_pixels_to_where_neighbours_show_the_same(stored):
-    batch = draw_tuples(stored, 24, 3, EXACT, chance())
+    batch = draw_tuples(stored, 24, 3, EXACT, draw())
     height, width = batch.depth.shape[-2:]
     rays = cell_rays(batch.views.intrinsics, height, width, 1)
 
@@ -56,7 +58,7 @@ def test_true_depth_takes_pixels_to_where_neighbours_show_the_same(stored):
 
 
 def test_neighbours_are_others_of_the_same_clip_with_a_useful_baseline(stored):
-    batch = draw_tuples(stored, 64, 3, EXACT, chance(1))
+    batch = draw_tuples(stored, 64, 3, EXACT, draw(1))
     baseline = batch.views.T_nk[..., :3, 3].norm(dim=-1)
     assert baseline.min() > 0
     median = stored.quantiles[batch.place[:, 0], batch.place[:, 1], 1]
@@ -69,7 +71,7 @@ def test_neighbours_are_others_of_the_same_clip_with_a_useful_baseline(stored):
 
 def test_the_range_holds_most_depths_and_its_ratio_is_bounded(stored):
     low, typical, high = stored.quantiles[0].unbind(-1)
-    near, far, middle = known_range(low, typical, high, TupleOptions(), chance(2))
+    near, far, middle = known_range(low, typical, high, TupleOptions(), draw(2))
     assert ((far / near) >= 6 - 1e-3).all()
     assert ((far / near) <= 60 + 1e-2).all()
     assert (near < 0.9 * low).float().mean() > 0.7
@@ -82,7 +84,7 @@ def test_poses_are_off_by_what_is_asked_for():
     T = torch.eye(4).repeat(400, 3, 1, 1)
     T[..., 0, 3] = 0.2
     options = TupleOptions(disturbed=0.5, rotation=(0.2, 0.2), translation=(0.02, 0.02))
-    wrong = disturbed_poses(T, options, chance(3))
+    wrong = disturbed_poses(T, options, draw(3))
     moved = (wrong - T).abs().amax((1, 2, 3)) > 0
     assert 0.4 < moved.float().mean() < 0.6
     off = wrong[moved][..., :3, 3] - T[moved][..., :3, 3]
@@ -95,8 +97,8 @@ def test_poses_are_off_by_what_is_asked_for():
 
 def test_light_changes_view_by_view():
     images = torch.full((40, 3, 3, 8, 8), 0.5)
-    torch.testing.assert_close(relit(images, 0.0, chance()), images)
-    changed = relit(images, 1.0, chance()).mean((2, 3, 4))
+    torch.testing.assert_close(relit(images, 0.0, draw()), images)
+    changed = relit(images, 1.0, draw()).mean((2, 3, 4))
     assert 0.05 < float(changed.std()) < 0.15
     assert float((changed[:, 0] - changed[:, 1]).abs().mean()) > 0.03
 

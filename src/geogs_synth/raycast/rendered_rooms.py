@@ -1,4 +1,4 @@
-"""What casters of rays at batches of rooms find, on the CPU and by CUDA."""
+"""Results of casting rays at batches of rooms, on the CPU and by CUDA."""
 
 from dataclasses import dataclass
 
