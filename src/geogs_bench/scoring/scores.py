@@ -3,8 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import evaluate_photoconsistency
@@ -42,27 +40,15 @@ def scored(record: Record, scene: BenchmarkScene, result: ResultFolder) -> Recor
         return replace(record, places=places)
     if record.provenance.command in ("run", "update"):
         stages = score_slam(scene, result, seed)
-        _draw_last(stages, result)
+        draw(stages, result)
         return replace(record, stages=tuple(stage.score for stage in stages))
     judge = judge_of(scene, result, seed)
     if judge is None:
         return replace(record, photo=score_photo(scene, result))
     stages = score_posed(judge, result)
-    _draw_last(stages, result)
+    draw(stages, result)
     curve = score_snapshots(judge, result)
     return replace(record, stages=tuple(stage.score for stage in stages), curve=curve)
-
-
-def _draw_last(stages: list[StageErrors], result: ResultFolder) -> None:
-    """Pictures of the final stage, seen from its own cameras."""
-    if not stages:
-        return
-    last = stages[-1]
-    if last.trajectory is not None:
-        draw(last, result, last.trajectory.aligned)
-        return
-    poses = result.poses()
-    draw(last, result, np.eye(4)[None] if poses is None else poses.T_wc)
 
 
 def score_posed(judge: Judge, result: ResultFolder) -> list[StageErrors]:

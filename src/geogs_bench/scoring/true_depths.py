@@ -19,11 +19,9 @@ from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.types import Frame, Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
-from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.data.true_poses import SAME_TIME, read_true_poses
 from geogs_bench.results.result_folder import ResultFolder
 
-SAME_TIME = 0.005
-"""Seconds between an image and its pose."""
 _SENSOR_REACH = 5.0
 """Metres beyond which a sensor's depth is not believed."""
 _OUTDOORS = ("driving",)
