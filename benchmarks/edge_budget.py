@@ -41,7 +41,7 @@ from geogs_bench.scoring.true_depths import TrueView
 
 KINDS = ("all", "open", "edge", "thin", "behind thin")
 WINDOW, TOLERANCE = 7, 0.003
-"""Of the planes of true depths, as in ``geogs bench edges``."""
+"""Window and tolerance of the planes of true depths, as in ``geogs bench edges``."""
 RASTER = 8
 """Pixels from one true point to the next, of those that say between which depths to search."""
 

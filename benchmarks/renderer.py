@@ -57,7 +57,7 @@ def reference_milliseconds(disks: DiskParameters, pose: torch.Tensor, camera: Ca
 
 
 def autograd_pass(disks: DiskParameters, pose: torch.Tensor, camera: Camera) -> None:
-    """As training does it: render, a loss, backward."""
+    """A pass as in training: render, a loss, backward."""
     leaves = DiskParameters(*(p.detach().requires_grad_() for p in disks))
     out = render(leaves, camera, pose, backend="cpu")
     (out.depth.sum() + out.normal.sum() + out.alpha.sum() + out.distortion.sum()).backward()

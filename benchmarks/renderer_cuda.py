@@ -64,7 +64,7 @@ class Timing:
     host: float
     """Median time until the calls have returned."""
     one_thread: float
-    """As device, with the backward pass run by the calling thread instead of one of PyTorch's."""
+    """The same with the backward pass run by the calling thread instead of one of PyTorch's."""
     kernels: float
     """Sum over the kernels, from the profiler, without the gaps between them."""
 

@@ -49,7 +49,7 @@ class Work:
     operations: float = 0.0
     is_double: bool = False
     instructions: float = 0.0
-    """Of warps, in its inner loops; 0 where they were not counted."""
+    """Warp instructions in its inner loops; 0 where they were not counted."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Rates:
     """Operations; a multiply-add is two."""
     double: float
     instructions: float
-    """Of warps: one multiply-add of 32 lanes each."""
+    """Warp instructions: one multiply-add of 32 lanes each."""
 
 
 def least_work(c: Counts) -> dict[str, Work]:
@@ -116,7 +116,7 @@ def multiply_add(dtype: torch.dtype, blocks: int, rounds: int, device: torch.dev
 
 
 def measure_rates() -> Rates:
-    """Of the current GPU."""
+    """Rates of the current GPU."""
     device = torch.device("cuda")
     source = torch.zeros(2**28, device=device)  # 1 GiB
     target = torch.empty_like(source)

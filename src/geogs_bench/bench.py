@@ -16,7 +16,7 @@ from geogs_bench.results.record import Record
 from geogs_bench.runners.runner import Runner
 
 _FRAMES, _WIDTH, _HEIGHT = 280, 640, 480
-"""As long as the path takes to come back to its start."""
+"""Frames, in which the path comes back to its start, and their size."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Benched:
     output: Path
     """Folder of the results."""
     records: list[Record]
-    """Those of earlier calls in the same folder included."""
+    """All in the folder, earlier calls' included."""
 
 
 def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:

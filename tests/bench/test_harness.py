@@ -30,6 +30,12 @@ def benchmark(scenes: list[BenchmarkScene], **changes) -> Benchmark:
     return Benchmark(**values | changes)
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch) -> None:
+    """Scores come without their pictures, which take longer than they do."""
+    monkeypatch.setattr("geogs_bench.scoring.scores.draw", lambda *_: None)
+
+
 @pytest.fixture
 def scenes(tmp_path) -> list[BenchmarkScene]:
     return [write_truth(tmp_path / "data" / name, name) for name in ("attic", "cellar", "hall")]

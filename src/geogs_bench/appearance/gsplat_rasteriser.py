@@ -65,7 +65,7 @@ class GsplatRasteriser:
         background: Float[Tensor, "3"] | None,
         with_normals: bool,
     ) -> Rendering:
-        """As :class:`geogs_bench.appearance.rasteriser.Rasteriser` says."""
+        """Colours and, if wanted, normals: see :class:`~.rasteriser.Rasteriser`."""
         projection = self._project(disks, camera, T_cw)
         visible = (projection.radii > 0).all(-1)
         directions = disks.means + T_cw[:3, 3] @ T_cw[:3, :3]
@@ -95,7 +95,7 @@ class GsplatRasteriser:
     def median_disks(
         self, disks: AppearanceDisks, camera: Camera, T_cw: Float[Tensor, "4 4"]
     ) -> MedianDisks:
-        """As :class:`geogs_bench.appearance.rasteriser.Rasteriser` says.
+        """The median disk of each pixel: see :class:`~.rasteriser.Rasteriser`.
 
         gsplat's median is the last channel's value of the median disk, so that each disk is
         painted with its own number, from 1 on. Float32 holds these up to 2^24 disks.

@@ -29,7 +29,7 @@ class Cell:
     moving: float = 0.0
     """Share of the image that moves."""
     seed: int = 0
-    """Of the place and of the path."""
+    """Seed of the place and of the path."""
 
     @property
     def place(self) -> MotionKind:

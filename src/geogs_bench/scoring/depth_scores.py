@@ -27,7 +27,7 @@ NEAR, FAR = 0.02, 0.05
 _EXACT_WINDOW, _SENSOR_WINDOW = 7, 21
 """Pixels of the planes whose normals are compared."""
 _EXACT_TOLERANCE, _SENSOR_TOLERANCE = 0.003, 0.006
-"""Of these planes, as parts of the depth."""
+"""Deviation from these planes, as a part of the depth."""
 
 
 @dataclass(frozen=True)

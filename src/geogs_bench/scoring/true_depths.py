@@ -33,7 +33,7 @@ class TrueView:
     """A frame whose depth is known."""
 
     index: int
-    """Of the frame in the sequence."""
+    """Number of the frame in the sequence."""
     timestamp: float
     image: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]
@@ -46,7 +46,7 @@ class TrueDepths:
 
     views: list[TrueView]
     camera: Camera
-    """As far as the data set tells it; else the result's."""
+    """Camera of the data set where it says one; else of the result."""
     is_exact: bool
     """Whether it was rendered; else a sensor measured it."""
 
@@ -149,7 +149,7 @@ def _is_outdoors(folder: Path) -> bool:
 
 
 def _moving(folder: Path, frame: Frame) -> np.ndarray | bool:
-    """Where ``geogs synth`` shows something that moves, which is in no map."""
+    """Pixels where ``geogs synth`` shows something that moves, which is in no map."""
     mask = decoded(folder / "results" / f"moving{frame.index:06d}.png", cv2.IMREAD_GRAYSCALE)
     if mask.picture is None:
         return False
