@@ -128,14 +128,14 @@ def test_a_wrong_setting_is_found_before_anything_runs(room, tmp_path, setting, 
 OPTIONS_OF_ABLATIONS = """
 import json, sys
 from pathlib import Path
-from geogs_bench.plan import Wishes, find_scenes, make_jobs
+from geogs_bench.plan import Selection, find_scenes, make_jobs
 from geogs_bench.catalogue.registry import find_benchmark
 from geogs_bench.runners.runner import Runner
 
 for name in sys.argv[2:]:
     benchmark = find_benchmark(name)
     scenes = find_scenes(benchmark, Path(sys.argv[1]))
-    jobs = make_jobs(benchmark, scenes, Path("out"), Wishes())
+    jobs = make_jobs(benchmark, scenes, Path("out"), Selection())
     settings = [Runner().settings(job.task) for job in jobs]
     print(name, len(jobs), len({json.dumps(s, default=str) for s in settings}))
 """

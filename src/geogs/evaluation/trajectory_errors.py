@@ -178,9 +178,9 @@ def _similarity(
     estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"], with_scale: bool
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
     """Least-squares similarity or rigid motion of ``estimate`` onto ``reference``; its scale."""
-    points = (torch.from_numpy(np.ascontiguousarray(x, np.float64)) for x in (estimate, reference))
+    x, y = (torch.from_numpy(np.ascontiguousarray(p, np.float64)) for p in (estimate, reference))
     try:
-        scale, R, t = umeyama(*points, with_scale=with_scale)
+        scale, R, t = umeyama(x, y, with_scale)
     except GeogsError as reason:
         raise InputError(f"The trajectories cannot be aligned: {reason}") from None
     T = np.eye(4)
