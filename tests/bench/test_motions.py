@@ -156,7 +156,7 @@ def test_the_camera_does_not_turn_with_a_truck_ahead(tmp_path: Path) -> None:
     the camera goes straight on, and is some 4 degrees off after these frames."""
     street, output = tmp_path / "street", tmp_path / "out"
     write_sequence(
-        street, 16, 496, 150, 11, motion="driving", flaws=camera_flaws("clean"), moving=0.15,
+        street, 10, 496, 150, 11, motion="driving", flaws=camera_flaws("clean"), moving=0.15,
         depth=False,
     )  # fmt: skip
     track_to_folder(RunSettings((street,), device="cpu"), output)

@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from geogs.evaluation.pages.run_pictures import depth_colours
-from geogs.io.writers.atomic import atomic_file
+from geogs.evaluation.pages.run_pictures import depth_colours, save_picture
 from geogs_bench.results.record import Place
 from geogs_bench.scoring.depth_scores import ComparedView
 
@@ -37,9 +35,7 @@ def draw_depths(path: Path, views: Sequence[ComparedView], most: int = 5) -> Non
         OutputError: the file cannot be written.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
-    picture = np.concatenate([_row(views[k]) for k in chosen])
-    with atomic_file(path) as stream:
-        stream.write(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+    save_picture(path, np.concatenate([_row(views[k]) for k in chosen]))
 
 
 def _row(compared: ComparedView) -> UInt8[np.ndarray, "h w2 3"]:

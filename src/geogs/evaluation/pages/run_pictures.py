@@ -34,7 +34,7 @@ def draw_path(path: Path, trajectory: Trajectory) -> None:
         path_panel(points[:, [0, vertical]], ~trajectory.tracked, name, upwards)
         for name, upwards, vertical in names
     ]
-    _save(path, np.hstack(panels))
+    save_picture(path, np.hstack(panels))
 
 
 def path_panel(
@@ -110,7 +110,7 @@ def draw_keyframes(
     for column, title in enumerate(("image", "depth", "normals")):
         _write(picture, title, (column * (_CELL + _GAP) + 4, 19), 0.5)
     _depth_bar(picture[:, width + 10 :], float(low), float(high))
-    _save(path, picture)
+    save_picture(path, picture)
 
 
 def depth_colours(
@@ -194,8 +194,8 @@ def _write(
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
 
 
-def _save(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a picture as PNG, completely or not at all."""
+def save_picture(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write a picture (RGB) as PNG, completely or not at all."""
     data = cv2.imencode(".png", picture[..., ::-1])[1]
     with atomic_file(path) as stream:
         stream.write(data.tobytes())
