@@ -104,7 +104,7 @@ def evaluate_reconstruction(
     accuracy = to_truth(points)
     completeness = SurfaceDistance(reconstruction)(reference)
     scores = surface_scores(accuracy, completeness, threshold, shift)
-    return SurfaceErrors(scores, points, accuracy, reference, completeness)
+    return SurfaceErrors(scores, points, accuracy)
 
 
 def _reference_samples(
