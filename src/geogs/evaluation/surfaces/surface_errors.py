@@ -35,7 +35,7 @@ S_co = TypeVar("S_co", bound=SurfaceScores, covariant=True)
 
 @dataclass(frozen=True)
 class SurfaceErrors(Generic[S_co]):
-    """Scores, and how far points of the reconstruction are from the truth, in its unit and frame."""
+    """Scores, and errors of the reconstruction's points, in the unit and the frame of the truth."""
 
     scores: S_co
     reconstruction_points: Float[np.ndarray, "n 3"]
