@@ -31,14 +31,14 @@ def room(small_room, tmp_path_factory) -> Path:
 def test_a_benchmark_runs_scores_and_resumes(room, tmp_path, capsys):
     output = tmp_path / "out"
     settings = [word for text in TINY for word in ("--set", text)]
-    call = ["bench", "rooms", str(room), "--known-poses", "--budgets", "4", "-o", str(output),
+    call = ["bench", "rooms", str(room), "--known-poses", "--budgets", "1", "-o", str(output),
             "--device", "cpu", *settings]  # fmt: skip
     code, done = cli.main(call), capsys.readouterr()
     assert code == 0, done.err
-    assert "rooms-known-poses: den 4s" in done.err
+    assert "rooms-known-poses: den 1s" in done.err
     assert "Acc (cm)" in done.out
     (record,) = json.loads((output / "results.json").read_text())
-    assert record["variant"] == "4s"
+    assert record["variant"] == "1s"
     assert record["error"] is None
     assert record["provenance"]["device"] == "cpu"
     assert record["cost"]["frames"] == 5
@@ -47,10 +47,10 @@ def test_a_benchmark_runs_scores_and_resumes(room, tmp_path, capsys):
     (stage,) = record["stages"]
     assert {s["weighting"] for s in stage["surfaces"]} == {"vertices", "area"}
     assert all(0 < s["accuracy"] < 30 for s in stage["surfaces"])
-    assert (output / "den" / "4s" / "report" / "bench_surface.png").is_file()
+    assert (output / "den" / "1s" / "report" / "bench_surface.png").is_file()
     page = (output / "report" / "index.html").read_text()
-    assert "../den/4s/report/bench_surface.png" in page
-    assert "| den, 4s |" in (output / "results.md").read_text()
+    assert "../den/1s/report/bench_surface.png" in page
+    assert "| den, 1s |" in (output / "results.md").read_text()
     assert cli.main(call) == 0
     assert "done before" in capsys.readouterr().err
 
