@@ -21,7 +21,7 @@ _FRAMES, _WIDTH, _HEIGHT = 280, 640, 480
 
 @dataclass(frozen=True)
 class BenchResult:
-    """What a benchmark came to."""
+    """The records of a benchmark and where they are."""
 
     benchmark: Benchmark
     output: Path

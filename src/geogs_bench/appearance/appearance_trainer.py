@@ -25,7 +25,7 @@ OnTime = Callable[[float, AppearanceDisks], None]
 
 @dataclass(frozen=True)
 class AppearanceResult:
-    """What training came to."""
+    """The trained disks, and what their training took."""
 
     disks: AppearanceDisks
     iterations: int

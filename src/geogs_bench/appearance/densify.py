@@ -1,4 +1,4 @@
-"""Adaptive density control: where the image pulls at disks, they are doubled or split.
+"""Adaptive density control: disks with large image gradients are doubled or split.
 
 The rules of 3D Gaussian splatting (Kerbl et al. 2023, Sec. 5.2) on the image gradients of 2DGS.
 """
@@ -16,7 +16,7 @@ from geogs_bench.appearance.appearance_disks import AppearanceDisks
 
 
 class GradientStatistics:
-    """How strongly the images have pulled at each disk since the last refinement."""
+    """Mean image gradient of each disk since the last refinement."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self._sum = torch.zeros(count, device=device)
@@ -52,10 +52,10 @@ def refine(
     Returns the rows that stay as they are, and the new disks.
     """
     disks = disks.map(lambda tensor: tensor.detach())
-    pulled = gradient > config.grow_gradient
+    is_steep = gradient > config.grow_gradient
     small = disks.scales.amax(1) <= config.grow_scale * scene_scale
-    split = pulled & ~small
-    doubles = disks.map(lambda tensor: tensor[pulled & small])
+    split = is_steep & ~small
+    doubles = disks.map(lambda tensor: tensor[is_steep & small])
     halves = split_disks(disks.map(lambda tensor: tensor[split]), config.split_shrink, generator)
     added = doubles.joined(halves)
     kept = torch.nonzero(~split & ~_useless(disks, step, scene_scale, config))[:, 0]

@@ -77,13 +77,13 @@ def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
     save_figure(figure, path)
 
 
-def plot_reliability(path: Path, told: Reliability) -> None:
-    """Reliability diagram: parts of the frames that lie as near as foretold, for all such parts."""
+def plot_reliability(path: Path, reliability: Reliability) -> None:
+    """Reliability diagram: observed over predicted fractions of the frames."""
     figure = new_figure(5.2, 4.6)
     plot = figure.add_subplot(1, 1, 1)
-    foretold = np.linspace(0, 1, 201)
+    predicted = np.linspace(0, 1, 201)
     plot.plot([0, 1], [0, 1], color=_TRUTH, ls="--", lw=1, label="as foretold")
-    plot.plot(foretold, told.observed(foretold), color=_ESTIMATE, lw=2, label="observed")
+    plot.plot(predicted, reliability.observed(predicted), color=_ESTIMATE, lw=2, label="observed")
     plot.text(0.03, 0.8, "above the line: errors smaller than said", color=_TRUTH)
     plot.text(0.97, 0.2, "below: larger", color=_TRUTH, ha="right")
     plot.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")

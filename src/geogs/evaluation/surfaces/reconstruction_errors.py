@@ -82,8 +82,8 @@ def evaluate_reconstruction(
     it; and culling acts on samples, not on whole triangles.
     :mod:`geogs.evaluation.surfaces.toolbox` has the scripts' own ways.
 
-    ``truth`` answers accuracy; ``truth_points``, where given (say, only what the camera saw),
-    completeness. With ``visibility`` the samples of the truth are limited to what the camera saw
+    Accuracy is measured against ``truth``, completeness on ``truth_points`` where given (say, only
+    what the camera saw). With ``visibility`` the samples of the truth are limited to what the camera saw
     (and, with ``cull_reconstruction``, those of the reconstruction to the region it saw). With
     ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
     """
