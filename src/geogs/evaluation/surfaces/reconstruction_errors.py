@@ -83,9 +83,9 @@ def evaluate_reconstruction(
     :mod:`geogs.evaluation.surfaces.toolbox` has the scripts' own ways.
 
     Accuracy is measured against ``truth``, completeness on ``truth_points`` where given (say, only
-    what the camera saw). With ``visibility`` the samples of the truth are limited to what the camera saw
-    (and, with ``cull_reconstruction``, those of the reconstruction to the region it saw). With
-    ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
+    what the camera saw). With ``visibility`` the samples of the truth are limited to what the
+    camera saw (and, with ``cull_reconstruction``, those of the reconstruction to the region it
+    saw). With ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
     """
     rng = np.random.default_rng(seed)
     if not reconstruction.is_mesh or not reconstruction.areas.sum() > 0:
