@@ -1,12 +1,11 @@
 """Self-calibration: error of the focal length, and what it costs the trajectory.
 
-    python benchmarks/calibration.py NAME=FOLDER_OR_NPZ... [--frames 300] [--field-of-view 60]
+    python benchmarks/calibration.py NAME=FOLDER... [--frames 300] [--field-of-view 60]
         [--starts 0,100,200] [--device cpu] [--no-tracking] [--offset 0.025]
 
-FOLDER is in Replica or 7-Scenes layout. An NPZ holds the same ready made: JPEG images one after the
-other (data, sizes), camera (fx, fy, cx, cy, width, height) and T_wc. The known focal length and
-poses are read for the printed errors only; the search begins at the field of view given, with the
-principal point in the middle. --starts estimates from those frames on, as if the video began there;
+FOLDER is in Replica or 7-Scenes layout. The known focal length and poses are read for the printed
+errors only; the search begins at the field of view given, with the principal point in the middle.
+--starts estimates from those frames on, as if the video began there;
 the trajectories are tracked, and adjusted as a whole, from frame 0 with the known focal length and
 with the one estimated there. --offset is for poses of another camera: how many metres to the right
 of it the one stands that took the images (7-Scenes: 0.025).
@@ -15,10 +14,9 @@ of it the one stands that took the images (7-Scenes: 0.025).
 import argparse
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
@@ -44,16 +42,6 @@ class Sequence:
 
 def load(path: Path, count: int) -> Sequence:
     """The first frames of a sequence."""
-    if path.suffix == ".npz":
-        z = np.load(path)
-        fx, fy, cx, cy, w, h = z["camera"].tolist()
-        ends = np.cumsum(z["sizes"])[:count]
-        images = [
-            np.ascontiguousarray(cv2.imdecode(z_data, cv2.IMREAD_COLOR)[..., ::-1])
-            for z_data in np.split(z["data"][: ends[-1]], ends[:-1])
-        ]
-        frames = [Frame(k, k / 30, image) for k, image in enumerate(images)]
-        return Sequence(Camera(fx, fy, cx, cy, int(w), int(h)), frames, z["T_wc"][:count])
     source = open_source(path, InputConfig(stop=count))
     if (path / "traj.txt").is_file():
         T_wc = np.loadtxt(path / "traj.txt").reshape(-1, 4, 4)
@@ -65,7 +53,7 @@ def load(path: Path, count: int) -> Sequence:
 
 def guess(camera: Camera, degrees: float) -> Camera:
     """Square pixels, the principal point in the middle, a field of view along the longer side."""
-    focal = max(camera.width, camera.height) / 2 / math.tan(math.radians(degrees / 2))
+    focal = camera.long_edge / 2 / math.tan(math.radians(degrees / 2))
     centre = (camera.width - 1) / 2, (camera.height - 1) / 2
     return Camera(focal, focal, *centre, camera.width, camera.height)
 
@@ -122,7 +110,7 @@ def main() -> None:
                 row += ["-", "-", "-"]
             else:
                 exact = ate(sequence, sequence.camera, options.device)
-                auto = ate(sequence, replace(found.camera), options.device)
+                auto = ate(sequence, found.camera, options.device)
                 row += [f"{exact:.2f} cm", f"{auto:.2f} cm", f"{auto / exact:.2f}"]
             print("| " + " | ".join(map(str, row)) + " |", flush=True)
 

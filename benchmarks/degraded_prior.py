@@ -43,7 +43,7 @@ class PriorErrors:
 PLAUSIBLE = PriorErrors()
 """About as good as public networks are indoors: 7 % off after the best scale, normals 8 degrees."""
 PATCHY = PriorErrors(wrong_share=0.12)
-"""As plausible, but wrong by a factor of two and more in an eighth of the image."""
+"""Equally plausible, but wrong by a factor of two and more in an eighth of the image."""
 BAD = PriorErrors(warp=0.2, noise=0.05, wrong_share=0.35)
 """Wrong by a factor of two and more in a third of the image, elsewhere in every image."""
 

@@ -38,7 +38,7 @@ STEP = 6
 AROUND = 4
 """Keyframes before and after one from which its neighbours are chosen."""
 NOISE = 1.5
-"""Of the images, grey levels."""
+"""Noise of the images, grey levels."""
 SHIFT, TURN = 0.001, 0.02
 """Deviation of the positions along each axis, metres, and of the rotations, degrees."""
 FLAT = 0.8
@@ -118,7 +118,7 @@ def shoot(
 
 
 def neighbours_of(keyframes: Sequence[Keyframe], index: int, render: Camera) -> list[int]:
-    """As the mapper chooses them."""
+    """The neighbours that the mapper would choose."""
     typical = float(np.median(keyframes[index].depth))
     views = [k.view for k in keyframes]
     return select_sweep_neighbours(views[index], views, typical, render)

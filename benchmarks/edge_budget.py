@@ -36,12 +36,12 @@ from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
-from geogs_bench.scoring.depth_scores import JudgedView, judge_view, place_scores
+from geogs_bench.scoring.depth_scores import ComparedView, compare_view, place_scores
 from geogs_bench.scoring.true_depths import TrueView
 
 KINDS = ("all", "open", "edge", "thin", "behind thin")
 WINDOW, TOLERANCE = 7, 0.003
-"""Of the planes of true depths, as in ``geogs bench edges``."""
+"""Window and tolerance of the planes of true depths, as in ``geogs bench edges``."""
 RASTER = 8
 """Pixels from one true point to the next, of those that say between which depths to search."""
 
@@ -54,7 +54,7 @@ class Keyframes:
     """The keyframes of a sequence at their true poses, and how their depths are judged."""
 
     camera: Camera
-    judged: list[JudgedView]
+    judged: list[ComparedView]
     poses: list[Tensor]
     """World to camera, metres."""
     points: Float64[np.ndarray, "n 3"]
@@ -75,7 +75,7 @@ class Keyframes:
             if depth is None:
                 raise InputError(f"{sequence} has no depth images.")
             view, T_wc = TrueView(f.index, f.timestamp, f.image, depth), truth.T_wc[f.index]
-            judged.append(judge_view(view, depth, (camera, camera), WINDOW, TOLERANCE))
+            judged.append(compare_view(view, depth, (camera, camera), WINDOW, TOLERANCE))
             poses.append(torch.from_numpy(np.linalg.inv(T_wc)))
             there = (rays * depth[::RASTER, ::RASTER, None])[depth[::RASTER, ::RASTER] > 0]
             points.append(there @ T_wc[:3, :3].T + T_wc[:3, 3])

@@ -45,7 +45,7 @@ GEOGS = (sys.executable, "-m", "geogs.cli.main")
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 STAND_IN = (sys.executable, str(TESTS / "fleet" / "fake_child.py"))
 STEPS = 15
-"""Of a source of `kills`, of 0.2 s each."""
+"""Steps of a source of `kills`, of 0.2 s each."""
 FRAMES_A_SECOND = 30.0
 _NEAREST = 0.2
 """Metres from a vertex to a point that was seen, at most, for it to be judged."""
@@ -263,7 +263,7 @@ def accuracy(vertices: np.ndarray, T: np.ndarray, points: np.ndarray, normals: n
 
 
 def path_errors(output: Path, given: list[range], truth: np.ndarray) -> TrajectoryErrors:
-    """Of a result whose frames are those of the parts, one part after the other."""
+    """Errors of a result whose frames are those of the parts, one part after the other."""
     result = geogs.load_result(output)
     videos = json.loads((output / "summary.json").read_text()).get("videos")
     starts = [v["first_time"] for v in videos] if videos else [0.0]

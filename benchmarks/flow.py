@@ -89,7 +89,7 @@ def on_device(batch: FlowBatch, device: torch.device) -> FlowBatch:
 
 @torch.no_grad()
 def own_errors(network: FlowNetwork, batch: FlowBatch, iterations: int) -> CellErrors:
-    """Of the network, on the device of the batch."""
+    """Errors of the network, on the device of the batch."""
     _, estimates, dense = run_network(network, batch, iterations)
     last = estimates[-1]
     parts = cell_errors(batch, last.pixels, last.error.variance().sqrt(), dense)
@@ -97,7 +97,7 @@ def own_errors(network: FlowNetwork, batch: FlowBatch, iterations: int) -> CellE
 
 
 def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
-    """Of the operator without a network, on the CPU; edges come as pairs of both directions."""
+    """Errors of the classical operator, on the CPU; edges come as pairs of both directions."""
     batch = on_device(batch, torch.device("cpu"))
     height, width = batch.images.shape[-2:]
     grid = SampleGrid(Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=width, height=height))

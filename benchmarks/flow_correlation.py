@@ -35,7 +35,7 @@ from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
 from geogs_train.flow.starts import StartOptions
 
 EDGES = 6
-"""Of a keyframe's cell in the tracker's window, about."""
+"""Edges of a keyframe's cell in the tracker's window, about."""
 LARGEST = 2.0
 """Pixels by which a start of the tracker is off."""
 CUT = 4.0
@@ -105,7 +105,7 @@ def errors(network, batch: FlowBatch, iterations: int) -> dict[str, torch.Tensor
 
 
 def classical_matches(grid: SampleGrid, batch: FlowBatch) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of the operator without a network, from the same starts."""
+    """Matches and weights of the classical operator, from the same starts."""
     operator = ClassicalFlow(grid)
     images = (batch.images.permute(0, 2, 3, 1).cpu().numpy() * 255).round().astype(np.uint8)
     encoded = [operator.encode(np.ascontiguousarray(i)) for i in images]
@@ -157,7 +157,7 @@ def factor(z: torch.Tensor, edges: int) -> str:
 
 
 def correlation(a: torch.Tensor, b: torch.Tensor, dy: int, dx: int) -> float:
-    """Of a with b some rows and columns away, over the cells where both are known."""
+    """Correlation of a with b some rows and columns away, over the cells where both are known."""
     h, w = a.shape[2:4]
     if abs(dy) >= h or abs(dx) >= w:
         return float("nan")

@@ -28,7 +28,6 @@ import torch
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import FLOOR
 from geogs.geometry.lie import se3_inverse
-from geogs.geometry.umeyama import umeyama
 from geogs.loop import global_bundle as settings
 from geogs.loop.global_bundle import global_bundle, global_pairs
 from geogs.tracking.tracker import Tracker, lone_tracker
@@ -36,14 +35,13 @@ from geogs.world.segments import TrackState
 from geogs_synth.sequence.location import centred_camera
 from planted_walk import CAMERA, drift, planted_tracker
 from suite import Suite
+from tracking import align
 
 
 def error_cm(tracker: Tracker, truth: torch.Tensor) -> float:
     """RMS distance of the camera centres after a similarity."""
-    x = se3_inverse(tracker.keyframes.poses(tracker.keyframes.ids))[:, :3, 3]
-    y = se3_inverse(truth)[:, :3, 3]
-    scale, R, t = umeyama(x, y)
-    return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    poses = (tracker.keyframes.poses(tracker.keyframes.ids), truth)
+    return align(*(se3_inverse(T)[:, :3, 3].numpy() for T in poses))[0]
 
 
 def peak() -> float:

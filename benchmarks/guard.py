@@ -33,10 +33,10 @@ RECORD = Path(__file__).with_name("guard.json")
 LIMIT = 1.3
 """Times what a stage cost from which on it fails."""
 LEAST = 0.03
-"""Of the cost of all stages, below which one is not judged: the clock says little of it."""
+"""Part of the cost of all stages below which one is not judged: the clock says little of it."""
 FRAMES, WIDTH, HEIGHT = 40, 256, 192
 STEPS = 150
-"""Of the map's training."""
+"""Steps of the map's training."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Costs:
 
     @property
     def total(self) -> float:
-        """Of all stages."""
+        """Cost of all stages."""
         return sum(self.stages.values())
 
 

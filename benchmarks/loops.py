@@ -35,6 +35,7 @@ from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
+from geogs.world.loops import ImageFeatures
 from tracking import Sequence, load
 
 OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 5.0, 0.1
@@ -145,92 +146,109 @@ def prepare(
     return store, operator, Truth(T_cw, torch.from_numpy(depth), overlap, scale)
 
 
+class Checks:
+    """The checks of candidate loops one by one: what each accepts, and whether that is right."""
+
+    def __init__(self, store: KeyframeSet, operator: ClassicalFlow, truth: Truth) -> None:
+        self.store, self.operator, self.truth = store, operator, truth
+        self.clock = Clock()
+        self.features: dict[int, ImageFeatures] = {}
+        self.accepted: Counter[str] = Counter()
+        self.right: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self.flow: list[tuple[float, ...]] = []
+        """Whether right, matched, residual and contradiction of each pair that flow has seen."""
+        self.scale_errors: list[float] = []
+        self._verifier = TwoViewVerifier(store.grid.camera)
+
+    def closed(self, i: int, k: int) -> set[str]:
+        """Check a pair; the checks that rightly accept it."""
+        store, truth = self.store, self.truth
+        found = set[str]()
+
+        def count(name: str, is_right: bool) -> None:
+            self.accepted[name] += 1
+            self.right[name] += is_right
+            found.update([name] if is_right else [])
+
+        bare = [FeatureView(self.features[n]) for n in (i, k)]
+        plain = self.clock("essential", lambda: self._verifier.verify(*bare))
+        if plain.accepted:
+            true = truth.T_cw[k] @ se3_inverse(truth.T_cw[i])
+            turn = torch.rad2deg(so3_log(plain.T_ji[:3, :3] @ true[:3, :3].mT).norm())
+            count("essential", bool(turn < DEGREES))
+        known = ((store[n].inverse_depth, store[n].information, self.features[n]) for n in (i, k))
+        views = [FeatureView.of(store.grid, *parts) for parts in known]
+        view = self.clock("pnp", lambda: self._verifier.verify(*views))
+        if not view.accepted:
+            self.refused[" ".join(w for w in view.reason.split() if not w[0].isdigit())] += 1
+            return found
+        is_right = truth.right(i, k, view.T_ji)
+        count("pnp", is_right)
+        scale = view.scale or 1.0
+        if is_right and view.scale:
+            self.scale_errors.append(abs(np.log(scale * truth.scale[i] / truth.scale[k])))
+        pair = store[i], store[k]
+        check = self.clock(
+            "flow", lambda: dense_check(store.grid, self.operator, *pair, view.T_ji, scale)
+        )
+        if check.T_ji is not None:
+            is_right = truth.right(i, k, check.T_ji)
+            self.flow.append((is_right, check.matched, check.residual, check.contradiction))
+            if check.accepted:
+                count("pnp + flow", is_right)
+        return found
+
+
 def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """Retrieval, then verification of all that it returned, with and without depth."""
-    clock, index = Clock(), AppearanceIndex()
-    verifier, features = TwoViewVerifier(store.grid.camera), {}
-    precision, recall, best = [], [], []
-    judged: list[tuple[float, ...]] = []
-    counts = {name: np.zeros(4, int) for name in ("essential", "pnp", "pnp + flow")}
-    scale_error: list[float] = []
-    reasons: Counter[str] = Counter()
-    queries = alike = 0
+    checks, index = Checks(store, operator, truth), AppearanceIndex()
+    clock, features = checks.clock, checks.features
+    precision, recall, first = [], [], []
+    closed: Counter[str] = Counter()
+    closed_alike: Counter[str] = Counter()
+    alike = 0
     for k in store.ids:
         features[k] = clock("extract", lambda k=k: orb_features(store[k].image))
         old = [i for i in store.ids if i < k - gap]
         exclude = set(store.ids) - set(old)
         found = clock("query", lambda k=k, e=exclude: index.query(features[k], e))
         clock("add", lambda k=k: index.add(k, features[k]))
+        closing = set().union(*(checks.closed(c.keyframe, k) for c in found))
         wanted = [i for i in old if truth.overlap[i, k] > OVERLAP]
-        if wanted:
-            queries += 1
-            similar = any(truth.turn(i, k) < SIMILAR for i in wanted)
-            alike += similar
-            hits = [c.keyframe in wanted for c in found]
-            precision.append(np.mean(hits) if hits else 0.0)
-            recall.append(any(hits))
-            best.append(bool(hits) and hits[0])
-        closed = dict.fromkeys(counts, False)
-        for c in found:
-            i = c.keyframe
-            views = [
-                FeatureView.of(
-                    store.grid, store[n].inverse_depth, store[n].information, features[n]
-                )
-                for n in (i, k)
-            ]
-            bare = [FeatureView(v.features) for v in views]
-            plain = clock("essential", lambda v=bare: verifier.verify(*v))
-            if plain.accepted:
-                true = truth.T_cw[k] @ se3_inverse(truth.T_cw[i])
-                turn = torch.rad2deg(so3_log(plain.T_ji[:3, :3] @ true[:3, :3].mT).norm())
-                counts["essential"][:2] += [1, turn < DEGREES]
-                closed["essential"] |= bool(turn < DEGREES)
-            view = clock("pnp", lambda v=views: verifier.verify(*v))
-            if not view.accepted:
-                reasons[" ".join(w for w in view.reason.split() if not w[0].isdigit())] += 1
-                continue
-            ok = truth.right(i, k, view.T_ji)
-            counts["pnp"][:2] += [1, ok]
-            closed["pnp"] |= ok
-            if ok and view.scale:
-                scale_error.append(abs(np.log(view.scale * truth.scale[i] / truth.scale[k])))
-            check = clock(
-                "flow",
-                lambda i=i, k=k, v=view: dense_check(
-                    store.grid, operator, store[i], store[k], v.T_ji, v.scale or 1.0
-                ),
-            )
-            if check.T_ji is not None:
-                ok = truth.right(i, k, check.T_ji)
-                judged.append((ok, check.matched, check.residual, check.contradiction))
-            if check.accepted:
-                ok = truth.right(i, k, check.T_ji)
-                counts["pnp + flow"][:2] += [1, ok]
-                closed["pnp + flow"] |= ok
-        for name in counts:
-            counts[name][2] += closed[name] and bool(wanted)
-            counts[name][3] += closed[name] and bool(wanted) and similar
+        if not wanted:
+            continue
+        similar = any(truth.turn(i, k) < SIMILAR for i in wanted)
+        alike += similar
+        hits = [c.keyframe in wanted for c in found]
+        precision.append(np.mean(hits) if hits else 0.0)
+        recall.append(any(hits))
+        first.append(bool(hits) and hits[0])
+        closed.update(closing)
+        closed_alike.update(closing if similar else ())
+    queries = len(recall)
     print(
         f"  retrieval: {queries} keyframes see an old place; precision@5 {np.mean(precision):.2f}, "
-        f"recall@5 {np.mean(recall):.2f}, first right {np.mean(best):.2f}"
+        f"recall@5 {np.mean(recall):.2f}, first right {np.mean(first):.2f}"
     )
-    for name, (accepted, right, closed_at, of_alike) in counts.items():
+    for name in ("essential", "pnp", "pnp + flow"):
+        accepted, right = checks.accepted[name], checks.right[name]
         print(
             f"  {name}: {accepted} accepted, precision {right / max(accepted, 1):.3f}, "
-            f"recall {closed_at / max(queries, 1):.2f} of these keyframes, "
-            f"{of_alike / max(alike, 1):.2f} of the {alike} that see it from a similar direction"
+            f"recall {closed[name] / max(queries, 1):.2f} of these keyframes, "
+            f"{closed_alike[name] / max(alike, 1):.2f} of the {alike} that see it from a similar "
+            "direction"
         )
-    print(f"  refused: {dict(reasons.most_common())}")
-    for ok in (1, 0):
-        rows = np.array([j[1:] for j in judged if j[0] == ok])
+    print(f"  refused: {dict(checks.refused.most_common())}")
+    for is_right in (True, False):
+        rows = np.array([values for ok, *values in checks.flow if ok == is_right])
         if len(rows):
             low, middle, high = np.percentile(rows, [5, 50, 95], axis=0).round(2).tolist()
             print(
-                f"  flow (matched, residual, contradiction) {'right' if ok else 'wrong'}: "
+                f"  flow (matched, residual, contradiction) {'right' if is_right else 'wrong'}: "
                 f"{len(rows)}, 5 % {low}, 50 % {middle}, 95 % {high}"
             )
-    print(f"  scale by features: median error {100 * np.median(scale_error):.1f} %")
+    print(f"  scale by features: median error {100 * np.median(checks.scale_errors):.1f} %")
     print(f"  CPU ms: {clock.report()}")
 
 

@@ -8,7 +8,6 @@ autograd, the fused launch as called and replayed from a CUDA graph; then the ti
 """
 
 import argparse
-import statistics
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from geogs.geometry.lie import se3_exp
 from geogs.losses.cuda import ViewTable, WindowLosses
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import MIN_ALPHA, ViewConstants
+from gpu_times import kernel_milliseconds, median_milliseconds
 from oracles.multi_view_reference import multi_view_loss
 from oracles.single_view_reference import single_view_loss
 
@@ -101,21 +101,6 @@ class Window:
         return lambda: losses.launch(batch, pairs, *self.maps, *results[1:], results[0]), results
 
 
-def median_ms(step: Step, repeat: int) -> float:
-    """Median milliseconds of a step on the device, after a warm-up."""
-    for _ in range(3):
-        step()
-    times = []
-    for _ in range(repeat):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        step()
-        end.record()
-        end.synchronize()
-        times.append(start.elapsed_time(end))
-    return statistics.median(times)
-
-
 def captured(step: Step) -> Step:
     """Replay of a step as a CUDA graph."""
     step()
@@ -124,19 +109,6 @@ def captured(step: Step) -> Step:
     with torch.cuda.graph(graph):
         step()
     return graph.replay
-
-
-def kernel_times(step: Step) -> list[tuple[str, float]]:
-    """Milliseconds of each kernel in one step."""
-    steps, activity = 10, torch.profiler.ProfilerActivity
-    step()
-    torch.cuda.synchronize()
-    with torch.profiler.profile(activities=[activity.CPU, activity.CUDA]) as profile:
-        for _ in range(steps):
-            step()
-        torch.cuda.synchronize()
-    rows = [(e.key, e.self_device_time_total / 1000 / steps) for e in profile.key_averages()]
-    return sorted([r for r in rows if r[1] > 0], key=lambda r: -r[1])
 
 
 def main() -> None:
@@ -159,15 +131,19 @@ def main() -> None:
         step()
         for a, b in zip(results, window.plain(config), strict=True):
             assert float((a - b).norm() / b.norm().clamp(min=1e-12)) < 1e-2, name
-        plain = median_ms(lambda c=config: window.plain(c), max(repeat // 5, 3))
-        fused, replayed = median_ms(step, repeat), median_ms(captured(step), repeat)
+        plain = median_milliseconds(lambda c=config: window.plain(c), max(repeat // 5, 3))
+        fused = median_milliseconds(step, repeat)
+        replayed = median_milliseconds(captured(step), repeat)
         print(
             f"| {name} | {plain:.2f} | {fused:.3f} | {replayed:.3f} | {plain / replayed:.0f} |",
             flush=True,
         )
     for name, config in cases.items():
         print(f"\nKernels, {name} (ms):")
-        for kernel, time in kernel_times(window.fused(config)[0]):
+        step = window.fused(config)[0]
+        step()
+        torch.cuda.synchronize()
+        for kernel, time in kernel_milliseconds(step, 10).items():
             print(f"  {time:7.4f}  {kernel}")
 
 

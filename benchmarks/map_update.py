@@ -226,7 +226,7 @@ class Judge:
         return umeyama(se3_inverse(T_cw)[:, :3, 3], se3_inverse(self.walk.truth)[:, :3, 3])
 
     def ate(self, T_cw: Tensor) -> float:
-        """Of the keyframes, cm."""
+        """ATE of the keyframes, cm."""
         s, R, t = self.alignment(T_cw)
         left = s * se3_inverse(T_cw)[:, :3, 3] @ R.T + t - se3_inverse(self.walk.truth)[:, :3, 3]
         return 100 * float(left.square().sum(1).mean().sqrt())
@@ -277,7 +277,7 @@ class Judge:
 
 
 def normals(mapper: Mapper) -> Tensor:
-    """Of the disks."""
+    """Normals of the disks."""
     return quaternion_to_matrix(mapper.table.disks.parameters.quaternion.detach().double())[:, :, 2]
 
 

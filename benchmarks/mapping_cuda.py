@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import numpy as np
 import torch
 from torch import Tensor
-from torch.profiler import ProfilerActivity, profile
 
 from geogs.config import LossAblation, LossConfig, MappingConfig
 from geogs.depth.depth_view import DenseDepth
@@ -45,6 +44,7 @@ from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
+from gpu_times import kernel_milliseconds
 from oracles.multi_view_reference import multi_view_loss
 from oracles.single_view_reference import single_view_loss
 
@@ -250,15 +250,6 @@ def time_in_turns(fused: Fused, plain: Plain, steps: int, rounds: int) -> tuple[
     return a, b
 
 
-def kernel_times(train: Callable[[int], None], steps: int) -> dict[str, float]:
-    """Milliseconds of each kernel and copy in a step, the longest first."""
-    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
-        train(steps)
-        torch.cuda.synchronize()
-    times = {e.key: e.self_device_time_total / 1e3 / steps for e in profiler.key_averages()}
-    return dict(sorted(((k, t) for k, t in times.items() if t > 0), key=lambda kt: -kt[1]))
-
-
 def parts_of(kernels: dict[str, float]) -> dict[str, float]:
     """The kernels' times by what they are for."""
     parts = dict.fromkeys(("rendering", "losses", "rendering, backward", "Adam", "copies"), 0.0)
@@ -291,7 +282,10 @@ def measure(name: str, window: Window, steps: int, rounds: int) -> dict:
     memory = {"fused": fused_memory, "plain": plain_memory}
     difference, cosine = agreement(fused, plain)
     a, b = time_in_turns(fused, plain, steps, rounds)
-    kernels = {"fused": kernel_times(fused.train, 10), "plain": kernel_times(plain.train, 3)}
+    kernels = {
+        "fused": kernel_milliseconds(lambda: fused.train(1), 10),
+        "plain": kernel_milliseconds(lambda: plain.train(1), 3),
+    }
     return {
         "losses": name, "loss_difference": difference, "gradient_cosine": cosine,
         "ok": difference < 1e-4 and cosine > 0.999, "fused_ms": a, "plain_ms": b, "ratio": b / a,
@@ -342,7 +336,7 @@ def main() -> None:
     if not torch.cuda.is_available():
         raise SystemExit("This benchmark needs a GPU.")
     # The profiler sees the kernels of graphs that were captured after its first start.
-    kernel_times(lambda _: torch.cuda.synchronize(), 1)
+    kernel_milliseconds(torch.cuda.synchronize, 1)
     window = Window.make(args.views, args.disks, args.width, args.height, torch.device("cuda"))
     rows = [measure(name, window, args.steps, args.rounds) for name in CONFIGS]
     print(

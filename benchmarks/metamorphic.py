@@ -36,7 +36,7 @@ class Shape:
     poses: dict[int, np.ndarray]
     """Camera to world, by the frame of the sequence as it is, where it was tracked."""
     disks: np.ndarray
-    """Their centres (n, 3)."""
+    """Centres (n, 3)."""
 
     def mirrored(self) -> "Shape":
         """Left and right exchanged."""
@@ -116,7 +116,7 @@ def shape_of(frames: Sequence[Frame], camera: Camera, config: Config) -> Shape:
 
 
 def distances(shape: Shape, as_it_is: Shape) -> tuple[float, float]:
-    """Of the path (RMS) and of the disks (median), after a similarity, of the extent of each.
+    """Distances of path (RMS) and disks (median) after a similarity, as parts of their extents.
 
     Disks are measured to the nearest of the other map; infinite where there is too little.
     """

@@ -23,7 +23,6 @@ import torch
 from degraded_prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior, with_bare_walls
 from geogs.config import Config, MappingConfig, PriorConfig
 from geogs.geometry.camera import Camera
-from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.monocular_prior import DepthKind, MonocularPrior
 from geogs.slam import Slam
@@ -34,6 +33,7 @@ from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
+from tracking import align
 
 PRIORS = {"none": None, "good": PLAUSIBLE, "patchy": PATCHY, "bad": BAD}
 
@@ -86,13 +86,11 @@ def score(tracker: Tracker, walk: Walk) -> Score:
     keyframes = [tracker.keyframes[k] for k in tracker.segment.ids]
     centres = np.stack([torch.linalg.inv(k.T_cw)[:3, 3].numpy() for k in keyframes])
     truth = walk.T_wc[[k.frame_index for k in keyframes], :3, 3]
-    x, y = torch.from_numpy(centres), torch.from_numpy(truth)
-    scale, R, t = umeyama(x, y)
-    ate = 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    ate, scale = align(centres, truth)
     errors, bare = [], []
     for k in keyframes[1:-1]:
         depth = walk.views[k.frame_index].depth[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE]
-        errors.append(np.abs(float(scale) / k.inverse_depth.numpy() / depth - 1).ravel())
+        errors.append(np.abs(scale / k.inverse_depth.numpy() / depth.ravel() - 1))
         grey = cv2.cvtColor(k.image, cv2.COLOR_RGB2GRAY)
         bare.append(cell_structure(grey).smaller < MIN_STRUCTURE)
     error, where = np.concatenate(errors), np.concatenate(bare)
@@ -121,9 +119,8 @@ def map_score(slam: Slam, walk: Walk) -> MapScore:
     """Errors of a finished map."""
     keyframes = slam.segments.main.keyframes
     states = [keyframes[k] for k in keyframes.ids]
-    x = torch.stack([torch.linalg.inv(s.T_cw)[:3, 3] for s in states])
-    y = torch.from_numpy(walk.T_wc[[s.frame_index for s in states], :3, 3])
-    scale = float(umeyama(x, y)[0])
+    centres = np.stack([torch.linalg.inv(s.T_cw)[:3, 3].numpy() for s in states])
+    _, scale = align(centres, walk.T_wc[[s.frame_index for s in states], :3, 3])
     errors, angles, bare = [], [], []
     for seen in slam.renders():
         view = walk.views[keyframes[seen.keyframe_id].frame_index]

@@ -1,18 +1,14 @@
-"""Times the CPU renderer, forward and backward, against its specification and the prototype.
+"""Times the CPU renderer, forward and backward, against its specification.
 
     python benchmarks/renderer.py [--threads 2] [--repeats 15]
 
-Contestants alternate within one process; medians are printed, and ratios are medians of the ratios
-of neighbouring runs. The specification is timed on a few image rows and scaled to the image: its
-time is proportional to the pixels. The prototype's row appears where ../shared/prototypes exists.
+Contestants alternate within one process; medians are printed. The specification is timed on a few
+image rows and scaled to the image: its time is proportional to the pixels.
 """
 
 import argparse
-import importlib
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,7 +18,6 @@ from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
 from geogs.splat.render import render
 from geogs.world.disks import DiskParameters
 
-PROTOTYPES = Path(__file__).parents[2] / "shared" / "prototypes"
 CASES = [(20_000, 320, 240), (20_000, 640, 480), (50_000, 640, 480)]
 REFERENCE_ROWS = 2
 
@@ -40,29 +35,6 @@ def room(n: int, camera: Camera) -> tuple[DiskParameters, np.ndarray]:
     scale = (0.75 * spacing * z).log()[:, None] + 0.25 * torch.randn(n, 2, generator=g)
     logit = torch.rand(n, generator=g) * 3 - 0.4
     return DiskParameters(position, quaternion, scale, logit), np.eye(4)
-
-
-class Prototype:
-    """The prototype renderer and its scene."""
-
-    def __init__(self, threads: int) -> None:
-        sys.path.insert(0, str(PROTOTYPES))
-        self.scene = importlib.import_module("scene")
-        self.renderer = importlib.import_module("numba_rt2").Numba(threads)
-
-    def disks(self, n: int, width: int, height: int) -> tuple[DiskParameters, np.ndarray, Camera]:
-        """Its scene in our parameters; its pixel centres lie at halves."""
-        self.arrays = self.scene.make_scene(n, width, height)
-        position, quaternion, scale, opacity, pose, K = self.arrays
-        fields = (position, quaternion, np.log(scale), np.log(opacity / (1 - opacity)))
-        fx, fy = float(K[0, 0]), float(K[1, 1])
-        camera = Camera(fx, fy, float(K[0, 2]) - 0.5, float(K[1, 2]) - 0.5, width, height)
-        return DiskParameters(*map(torch.from_numpy, fields)), pose.astype(np.float64), camera
-
-    def run(self, width: int, height: int, weights: np.ndarray) -> None:
-        """One forward and backward pass."""
-        self.renderer.forward(*self.arrays, width, height)
-        self.renderer.backward(weights)
 
 
 def milliseconds(function: Callable[[], object]) -> float:
@@ -85,20 +57,17 @@ def reference_milliseconds(disks: DiskParameters, pose: torch.Tensor, camera: Ca
 
 
 def autograd_pass(disks: DiskParameters, pose: torch.Tensor, camera: Camera) -> None:
-    """As training does it: render, a loss, backward."""
+    """A pass as in training: render, a loss, backward."""
     leaves = DiskParameters(*(p.detach().requires_grad_() for p in disks))
     out = render(leaves, camera, pose, backend="cpu")
     (out.depth.sum() + out.normal.sum() + out.alpha.sum() + out.distortion.sum()).backward()
 
 
-def measure(case: tuple[int, int, int], prototype: Prototype | None, args: argparse.Namespace):
+def measure(case: tuple[int, int, int], threads: int, repeats: int) -> None:
     """Print one case's row."""
     n, width, height = case
-    if prototype:
-        disks, pose, camera = prototype.disks(n, width, height)
-    else:
-        camera = Camera(0.65 * width, 0.65 * width, width / 2, height / 2, width, height)
-        disks, pose = room(n, camera)
+    camera = Camera(0.65 * width, 0.65 * width, width / 2, height / 2, width, height)
+    disks, pose = room(n, camera)
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(6, height, width)).astype(np.float32)
     normal = np.ascontiguousarray(weights[1:4].transpose(1, 2, 0))
@@ -109,26 +78,20 @@ def measure(case: tuple[int, int, int], prototype: Prototype | None, args: argpa
 
     def forward() -> None:
         nonlocal trace
-        trace = rasterize_forward(arrays, camera, T_cw, 0.05, args.threads)[1]
+        trace = rasterize_forward(arrays, camera, T_cw, 0.05, threads)[1]
 
     def backward() -> None:
-        rasterize_backward(trace, *gradients, args.threads)
+        rasterize_backward(trace, *gradients, threads)
 
     rows = []
-    for k in range(args.repeats + 2):
-        theirs = (
-            milliseconds(lambda: prototype.run(width, height, weights)) if prototype else np.nan
-        )
-        row = (theirs, milliseconds(forward), milliseconds(backward))
+    for k in range(repeats + 2):
+        row = milliseconds(forward), milliseconds(backward)
         whole = milliseconds(lambda: autograd_pass(disks, torch_pose, camera))
         if k >= 2:
             rows.append((*row, whole))
-    theirs, ahead, back, whole = np.array(rows).T
+    ahead, back, whole = np.array(rows).T
     line = f"{n:6d} disks {width}x{height}: forward {np.median(ahead):6.1f} ms, "
     line += f"backward {np.median(back):6.1f} ms, through autograd {np.median(whole):6.1f} ms"
-    if prototype:
-        ratio = np.median((ahead + back) / theirs)
-        line += f"; prototype {np.median(theirs):6.1f} ms, ratio {ratio:.2f}"
     if width * height <= 320 * 240:
         slow = reference_milliseconds(disks, torch_pose, camera)
         line += f"; reference {slow / 1e3:.0f} s, {slow / np.median(ahead + back):.0f} times slower"
@@ -141,9 +104,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=15)
     args = parser.parse_args()
-    prototype = Prototype(args.threads) if PROTOTYPES.is_dir() else None
     for case in CASES:
-        measure(case, prototype, args)
+        measure(case, args.threads, args.repeats)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from geogs.geometry.lie import matrix_to_quaternion, se3_inverse
 from geogs.splat.render import render
 from geogs.splat.vjp import render_vjp
 from geogs.world.disks import DiskParameters
+from gpu_times import kernel_milliseconds
 
 CASES = [(100_000, 1200, 680), (30_000, 616, 344), (1_000_000, 1200, 680)]
 NEAR = 0.05
@@ -63,9 +64,9 @@ class Timing:
     host: float
     """Median time until the calls have returned."""
     one_thread: float
-    """As device, with the backward pass run by the calling thread instead of one of PyTorch's."""
+    """The same with the backward pass run by the calling thread instead of one of PyTorch's."""
     kernels: float
-    """Sum over the kernels, from the profiler; NaN if it does not work."""
+    """Sum over the kernels, from the profiler, without the gaps between them."""
 
 
 def room_faces() -> np.ndarray:
@@ -238,21 +239,6 @@ def time_in_turns(steps: list[Callable[[], None]], rounds: int) -> list[tuple[fl
     return [tuple(np.median(record, 0).tolist()) for record in times]
 
 
-def kernel_milliseconds(step: Callable[[], None], repeats: int = 10) -> float:
-    """Time of all kernels of a step, without the gaps between them; NaN without a profiler."""
-    from torch.profiler import ProfilerActivity, profile
-
-    try:
-        with profile(activities=[ProfilerActivity.CUDA]) as profiler:
-            for _ in range(repeats):
-                step()
-            torch.cuda.synchronize()
-        total = sum(event.self_device_time_total for event in profiler.key_averages())
-    except RuntimeError:
-        return float("nan")
-    return total / repeats / 1e3 if total else float("nan")
-
-
 def contestants(count: int, width: int, height: int) -> list[Ours | Gsplat]:
     """The renderers on the same room."""
     case = room_case(count, width, height)
@@ -277,8 +263,8 @@ def measure(cases: list[tuple[int, int, int]], rounds: int) -> list[dict]:
     for case, renderers, timed, single in zip(cases, fields, times, alone, strict=True):
         row: dict = dict(zip(("disks", "width", "height"), case, strict=True)) | {"times": {}}
         for renderer, (device, host), (one, _) in zip(renderers, timed, single, strict=True):
-            timing = Timing(device, host, one, kernel_milliseconds(renderer.step))
-            row["times"][renderer.name] = asdict(timing)
+            kernels = sum(kernel_milliseconds(renderer.step, 10).values())
+            row["times"][renderer.name] = asdict(Timing(device, host, one, kernels))
         if isinstance(renderers[-1], Gsplat):
             row |= compare(renderers[0], renderers[-1])
         rows.append(row)

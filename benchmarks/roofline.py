@@ -12,18 +12,16 @@ faster than memory gives them, so single small kernels may lie below their memor
 
 import argparse
 import json
-import statistics
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.profiler import ProfilerActivity, profile
 
 from geogs.gpu.kernels import kernels_for
 from geogs.splat.render import render
 from geogs.world.disks import DiskParameters
+from gpu_times import kernel_milliseconds, median_milliseconds
 from renderer_cuda import CASES, NEAR, Case, room_case
 from roofline_counts import TILE, Counts, count_work
 
@@ -51,7 +49,7 @@ class Work:
     operations: float = 0.0
     is_double: bool = False
     instructions: float = 0.0
-    """Of warps, in its inner loops; 0 where they were not counted."""
+    """Warp instructions in its inner loops; 0 where they were not counted."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Rates:
     """Operations; a multiply-add is two."""
     double: float
     instructions: float
-    """Of warps: one multiply-add of 32 lanes each."""
+    """Warp instructions: one multiply-add of 32 lanes each."""
 
 
 def least_work(c: Counts) -> dict[str, Work]:
@@ -109,21 +107,6 @@ def floors(work: Work, rates: Rates) -> dict[str, float]:
     }
 
 
-def median_seconds(step: Callable[[], object], repeat: int = 20) -> float:
-    """Median time on the device after a warm-up."""
-    for _ in range(3):
-        step()
-    times = []
-    for _ in range(repeat):
-        before, after = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        before.record()
-        step()
-        after.record()
-        after.synchronize()
-        times.append(before.elapsed_time(after) / 1e3)
-    return statistics.median(times)
-
-
 def multiply_add(dtype: torch.dtype, blocks: int, rounds: int, device: torch.device) -> Tensor:
     """One launch of 8 chains of so many multiply-adds in 256 threads of each block."""
     name = "multiply_add_double" if dtype == torch.float64 else "multiply_add_single"
@@ -133,48 +116,45 @@ def multiply_add(dtype: torch.dtype, blocks: int, rounds: int, device: torch.dev
 
 
 def measure_rates() -> Rates:
-    """Of the current GPU."""
+    """Rates of the current GPU."""
     device = torch.device("cuda")
     source = torch.zeros(2**28, device=device)  # 1 GiB
     target = torch.empty_like(source)
-    copied = 2 * source.nbytes / median_seconds(lambda: target.copy_(source))
+    copied = 2e3 * source.nbytes / median_milliseconds(lambda: target.copy_(source), 20)
     blocks = 8 * torch.cuda.get_device_properties(device).multi_processor_count
 
     def rate(dtype: torch.dtype, rounds: int) -> float:
-        seconds = median_seconds(lambda: multiply_add(dtype, blocks, rounds, device))
-        return 2 * 8 * rounds * 256 * blocks / seconds
+        time = median_milliseconds(lambda: multiply_add(dtype, blocks, rounds, device), 20)
+        return 2e3 * 8 * rounds * 256 * blocks / time
 
     single = rate(torch.float32, 2**14)
     return Rates(copied, single, rate(torch.float64, 2**13), single / 2 / WARP)
 
 
-def kernel_milliseconds(case: Case, repeat: int) -> dict[str, float]:
+def pass_milliseconds(case: Case, repeat: int) -> dict[str, float]:
     """Mean time of each kernel in a forward and backward pass."""
     disks = DiskParameters(*(p.clone().requires_grad_() for p in case.disks))
     torch.manual_seed(0)
 
-    def step(weights: list[Tensor]) -> None:
+    weights: list[Tensor] = []
+
+    def step() -> None:
         out = render(disks, case.camera, case.T_cw, "cuda", NEAR)
         maps = (out.depth, out.normal, out.alpha, out.distortion)
         weights.extend(torch.randn_like(m) for m in maps[len(weights) :])
         torch.autograd.grad(maps, disks, weights)
 
-    weights: list[Tensor] = []
     for _ in range(3):
-        step(weights)
+        step()
     torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
-        for _ in range(repeat):
-            step(weights)
-        torch.cuda.synchronize()
-    found = {e.key.split("(")[0]: e.self_device_time_total for e in profiler.key_averages()}
-    return {name: found.get(name, float("nan")) / 1e3 / repeat for name in KERNELS}
+    found = {k.split("(")[0]: time for k, time in kernel_milliseconds(step, repeat).items()}
+    return {name: found.get(name, float("nan")) for name in KERNELS}
 
 
 def measure(case: Case, rates: Rates, repeat: int) -> dict:
     """Counts of a case and a row per kernel."""
     counts = count_work(case.disks, case.camera, case.T_cw, NEAR)
-    times, rows = kernel_milliseconds(case, repeat), []
+    times, rows = pass_milliseconds(case, repeat), []
     for name, work in least_work(counts).items():
         least = floors(work, rates)
         bound = max(least, key=lambda k: least[k])

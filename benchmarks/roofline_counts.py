@@ -22,7 +22,7 @@ _AT_ONCE = 2**19
 
 @dataclass(frozen=True)
 class Counts:
-    """Of one view."""
+    """Counts of one view."""
 
     disks: int
     boxed: int
@@ -37,13 +37,13 @@ class Counts:
     entries: int
     """Disks in tiles."""
     exchanges: int
-    """Of two keys at most, in the tiles' sorting networks."""
+    """Exchanges of two keys at most, in the tiles' sorting networks."""
     tests: int
-    """Of 32 entries for one part of a tile, by the forward pass."""
+    """Tests of 32 entries for one part of a tile, by the forward pass."""
     hits: int
     """Entries that reach a part whose warp evaluates them in the forward pass."""
     hits_blended: int
-    """Those of which a pixel is blended, in either pass."""
+    """Hits of which a pixel is blended, in either pass."""
     blended: int
     """Pixels blended, over all disks."""
     backward_tests: int

@@ -46,7 +46,7 @@ STARTS = {
 }
 """What a process of its own does before it ends."""
 LEAST_SHARE = 0.01
-"""Of a stage's time, below which a function is not printed."""
+"""Part of a stage's time below which a function is not printed."""
 
 
 class StageMeter(Stopwatch):

@@ -46,7 +46,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 SWITCHES = ("--online-results", "--depth-mesh", "--no-keyframe-images")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 MOST_KILLS = 4
-"""Of a run."""
+"""Kills of a run, at most."""
 STARTED = 2.0
 """Seconds after which Python has begun with the program, to which signals belong from then on."""
 
@@ -63,7 +63,7 @@ class Report:
     runs: int = 0
     """Processes."""
     kills: Counter[str] = field(default_factory=Counter)
-    """By signal."""
+    """Number by signal."""
     resumes: int = 0
     compared: int = 0
     """Runs that were disturbed and ended like their undisturbed twin, or should have."""
@@ -71,7 +71,7 @@ class Report:
     """Sentences of undisturbed runs that ended with 2, such as of a camera that stands still."""
     faults: list[dict[str, str]] = field(default_factory=list)
     leaks: dict[str, object] = field(default_factory=dict)
-    """As leaks.py says."""
+    """What leaks.py found."""
     seconds: float = 0.0
 
 

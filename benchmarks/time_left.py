@@ -93,19 +93,19 @@ class Recording(RunProgress):
             print(f"{time.perf_counter() - BEGUN:6.1f} s  {text}")
 
     def plan(self, plan: Plan) -> None:
-        """As in the protocol."""
+        """A plan of the command."""
         self.keep("plan", plain(plan))
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
-        """As in the protocol."""
+        """How many frames are expected."""
         self.keep("expect", frames, begun)
 
     def frame(self, status: PoseEstimate) -> None:
-        """As in the protocol."""
+        """A frame was tracked."""
         self.keep("frame", status.frames, status.keyframes)
 
     def stage(self, name: str, fraction: float) -> None:
-        """As in the protocol."""
+        """How far a stage is."""
         self.keep("stage", name, fraction)
 
 

@@ -1,11 +1,10 @@
 """Track a folder with known poses and print errors and speed.
 
-    python benchmarks/tracking.py SOURCE_DIR [--long-edge 512] [--frames 150] [--out TRACK.npz]
+    python benchmarks/tracking.py SOURCE_DIR [--long-edge 512] [--frames 150] [--depth-every 12]
 
 SOURCE_DIR is in Replica layout (results/frame*.jpg, traj.txt, cam_params.json, mesh.ply) or in
 7-Scenes layout (seq-01/frame-*.color.jpg and .pose.txt). Ground truth is read for the printed
-errors only. TRACK.npz holds T (n,4,4 world to camera), d and info (n,gh,gw), k (frame numbers) and
-cam (f, cx, cy, w, h).
+errors only.
 """
 
 import argparse
@@ -21,12 +20,14 @@ import numpy as np
 import torch
 
 from geogs.config import Config, TrackingConfig
+from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,44 +88,13 @@ def keyframe_error(tracker: Tracker, sequence: Sequence) -> tuple[float, float]:
 def true_depth(path: Path, camera: Camera, T_wc: np.ndarray) -> Iterator[np.ndarray]:
     """Depth of a mesh on the tracker's grid from each pose, by ray casting; inf where empty."""
     mesh = read_surface(path)
-    x, y = np.arange(4, camera.width - 3, 8), np.arange(4, camera.height - 3, 8)
+    grid = SampleGrid(camera)
+    cells = Camera(
+        camera.fx / STRIDE, camera.fy / STRIDE, (camera.cx - OFFSET) / STRIDE,
+        (camera.cy - OFFSET) / STRIDE, grid.width, grid.height,
+    )  # fmt: skip
     for T in T_wc:
-        p = (mesh.vertices - T[:3, 3]) @ T[:3, :3]
-        yield _raster(p, mesh.faces, camera, x, y)
-
-
-def _raster(p, faces, camera, xs, ys):
-    """z-buffer at the grid points; triangles that cross z = 1 cm are left out."""
-    z = p[:, 2]
-    u = camera.fx * p[:, 0] / np.maximum(z, 0.01) + camera.cx
-    w = camera.fy * p[:, 1] / np.maximum(z, 0.01) + camera.cy
-    keep = (z[faces] > 0.01).all(1)
-    tu, tv = u[faces], w[faces]
-    keep &= (
-        (tu.max(1) >= xs[0]) & (tu.min(1) <= xs[-1]) & (tv.max(1) >= ys[0]) & (tv.min(1) <= ys[-1])
-    )
-    f, tu, tv = faces[keep], tu[keep], tv[keep]
-    iz = 1 / z[f]
-    depth = np.full((len(ys), len(xs)), np.inf)
-    area = (tu[:, 1] - tu[:, 0]) * (tv[:, 2] - tv[:, 0]) - (tu[:, 2] - tu[:, 0]) * (
-        tv[:, 1] - tv[:, 0]
-    )
-    lo_c = np.clip(np.ceil((tu.min(1) - 4) / 8), 0, len(xs)).astype(int)
-    hi_c = np.clip(np.floor((tu.max(1) - 4) / 8) + 1, 0, len(xs)).astype(int)
-    lo_r = np.clip(np.ceil((tv.min(1) - 4) / 8), 0, len(ys)).astype(int)
-    hi_r = np.clip(np.floor((tv.max(1) - 4) / 8) + 1, 0, len(ys)).astype(int)
-    hit = (hi_c > lo_c) & (hi_r > lo_r) & (np.abs(area) > 1e-12)
-    for n in np.flatnonzero(hit):
-        gx, gy = np.meshgrid(xs[lo_c[n] : hi_c[n]], ys[lo_r[n] : hi_r[n]])
-        (ax, bx, cx), (ay, by, cy) = tu[n], tv[n]
-        b1 = ((bx - gx) * (cy - gy) - (cx - gx) * (by - gy)) / area[n]
-        b2 = ((cx - gx) * (ay - gy) - (ax - gx) * (cy - gy)) / area[n]
-        b3 = 1 - b1 - b2
-        inside = (b1 >= 0) & (b2 >= 0) & (b3 >= 0)
-        d = 1 / (b1 * iz[n, 0] + b2 * iz[n, 1] + b3 * iz[n, 2])
-        cell = depth[lo_r[n] : hi_r[n], lo_c[n] : hi_c[n]]
-        np.minimum(cell, np.where(inside, d, np.inf), out=cell)
-    return depth
+        yield render_mesh(mesh.vertices, mesh.faces, cells, np.linalg.inv(T))[0].ravel()
 
 
 def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int) -> None:
@@ -162,20 +132,6 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
     )
 
 
-def save(path: Path, tracker: Tracker) -> None:
-    """Write the keyframes for work on mapping."""
-    states = [tracker.keyframes[k] for k in tracker.segment.ids]
-    c = tracker.keyframes.grid.camera
-    np.savez(
-        path,
-        T=np.stack([s.T_cw.numpy() for s in states]),
-        d=np.stack([s.inverse_depth.numpy() for s in states]),
-        info=np.stack([s.information.numpy() for s in states]),
-        k=np.array([s.frame_index for s in states]),
-        cam=np.array([c.fx, c.cx, c.cy, c.width, c.height]),
-    )
-
-
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -186,7 +142,6 @@ def main() -> None:
     parser.add_argument(
         "--depth-every", type=int, default=0, help="check every n-th keyframe's depth"
     )
-    parser.add_argument("--out", type=Path)
     parser.add_argument("--set", nargs="*", default=[], help="name=value of TrackingConfig")
     args = parser.parse_args()
     torch.set_num_threads(1)  # as the system works; our own threads use the cores
@@ -198,16 +153,10 @@ def main() -> None:
 
     start, spent, lost, cpu = time.perf_counter(), 0.0, 0, time.process_time()
     for frame in sequence.frames():
-        count, tick = len(tracker.keyframes), time.perf_counter()
+        tick = time.perf_counter()
         result = tracker.track(frame)
         spent += time.perf_counter() - tick
         lost += result.state.value == "lost"
-        if len(tracker.keyframes) > count and len(tracker.keyframes) % 10 == 0:
-            print(
-                f"  frame {frame.index}: {len(tracker.keyframes)} keyframes, "
-                f"ATE {keyframe_error(tracker, sequence)[0]:.3f} cm, {spent:.1f} s",
-                flush=True,
-            )
     tick = time.perf_counter()
     tracker.finish()
     spent += time.perf_counter() - tick
@@ -242,8 +191,6 @@ def main() -> None:
         f"all frames: ATE {full:.3f} cm ({time.perf_counter() - tick:.1f} s to solve), "
         f"{(~trajectory.tracked).sum()} untracked, peak memory {peak:.0f} MiB"
     )
-    if args.out:
-        save(args.out, tracker)
 
 
 if __name__ == "__main__":

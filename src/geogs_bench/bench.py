@@ -1,4 +1,4 @@
-"""A benchmark from a user's wishes to its tables."""
+"""A benchmark from the user's options to its tables."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,26 +11,26 @@ from geogs_bench.catalogue.registry import BENCHMARKS, EDGES, find_benchmark
 from geogs_bench.data.benchmark_scene import Option
 from geogs_bench.data.motion_cells import render_cells
 from geogs_bench.harness import Harness, score_given
-from geogs_bench.plan import Wishes, find_scenes, make_jobs
+from geogs_bench.plan import Selection, find_scenes, make_jobs
 from geogs_bench.results.record import Record
 from geogs_bench.runners.runner import Runner
 
 _FRAMES, _WIDTH, _HEIGHT = 280, 640, 480
-"""As long as the path takes to come back to its start."""
+"""Frames, in which the path comes back to its start, and their size."""
 
 
 @dataclass(frozen=True)
-class Benched:
-    """What a benchmark came to."""
+class BenchResult:
+    """The records of a benchmark and where they are."""
 
     benchmark: Benchmark
     output: Path
     """Folder of the results."""
     records: list[Record]
-    """Those of earlier calls in the same folder included."""
+    """All in the folder, earlier calls' included."""
 
 
-def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:
+def bench(settings: BenchOptions, say: Callable[[str], None]) -> BenchResult:
     """Run and score every scene, and write the tables.
 
     Raises:
@@ -40,18 +40,18 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> Benched:
     benchmark = find_benchmark(_name(settings))
     if settings.result is not None:
         return _given(settings, benchmark, settings.result)
-    wishes = _wishes(settings, benchmark)
+    selection = _selection(settings, benchmark)
     output = settings.output or Path("out") / f"bench-{benchmark.name}"
-    data = settings.data or _made_data(benchmark, output, wishes.scenes, say)
-    scenes = find_scenes(benchmark, data.expanduser(), wishes.scenes)
-    jobs = make_jobs(benchmark, scenes, output, wishes)
+    data = settings.data or _made_data(benchmark, output, selection.scenes, say)
+    scenes = find_scenes(benchmark, data.expanduser(), selection.scenes)
+    jobs = make_jobs(benchmark, scenes, output, selection)
     harness = Harness(
         benchmark, output, Runner(), say, fresh=settings.fresh, rescore=settings.rescore
     )
-    return Benched(benchmark, output, harness.run(jobs))
+    return BenchResult(benchmark, output, harness.run(jobs))
 
 
-def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> Benched:
+def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> BenchResult:
     """Score a result of earlier."""
     if benchmark is not EDGES:
         raise InputError(f"--result is for {EDGES.name}; {benchmark.name} scores its own runs.")
@@ -62,7 +62,7 @@ def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> Benche
         names = ", ".join(scene.name for scene in scenes)
         raise InputError(f"--result is of one sequence; choose it by --scenes: {names}.")
     output = settings.output or result / f"bench-{benchmark.name}"
-    return Benched(benchmark, output, score_given(benchmark, scenes[0], result, output))
+    return BenchResult(benchmark, output, score_given(benchmark, scenes[0], result, output))
 
 
 def _name(settings: BenchOptions) -> str:
@@ -90,7 +90,7 @@ def listing() -> str:
     return "\n".join(lines)
 
 
-def _wishes(settings: BenchOptions, benchmark: Benchmark) -> Wishes:
+def _selection(settings: BenchOptions, benchmark: Benchmark) -> Selection:
     common = [Option("device", settings.device), Option("seed", str(settings.seed))]
     if settings.preset:
         common.append(Option("preset", settings.preset))
@@ -98,7 +98,7 @@ def _wishes(settings: BenchOptions, benchmark: Benchmark) -> Wishes:
         common.append(Option("depth-mesh"))
     if benchmark.command == "run" and benchmark.keeps_online:
         common.append(Option("online-results"))
-    return Wishes(
+    return Selection(
         _names(settings.scenes),
         _names(settings.variants),
         (*common, *(_option(text) for text in settings.set)),

@@ -21,7 +21,7 @@ class Variant:
     command: Command | None = None
     """Other than the benchmark's."""
     needs_depth: bool = False
-    """Whether it is of scenes alone whose images come with the depth of a sensor."""
+    """Whether only scenes whose images come with the depth of a sensor have it."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Benchmark:
     layouts: tuple[Layout, ...]
     variants: tuple[Variant, ...] = (Variant(),)
     scenes: tuple[str, ...] = ()
-    """Those of the paper; others are run only if asked for, or if none of these is there."""
+    """Scenes of the paper; others are run only if asked for, or if none of these is there."""
     published: tuple[PublishedTable, ...] = ()
     notes: tuple[str, ...] = ()
     """What to know before comparing with the published figures."""

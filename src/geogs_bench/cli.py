@@ -10,7 +10,7 @@ from geogs_bench.bench_options import BenchOptions
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from geogs_bench.bench import Benched
+    from geogs_bench.bench import BenchResult
 
 
 def main(argv: Sequence[str]) -> int:
@@ -31,7 +31,7 @@ def main(argv: Sequence[str]) -> int:
     return 2 if not done.records or any(record.error for record in done.records) else 0
 
 
-def _tables(done: "Benched") -> "list[Table]":
+def _tables(done: "BenchResult") -> "list[Table]":
     """The tables of a benchmark for a terminal."""
     from rich.table import Table
 

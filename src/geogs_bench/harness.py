@@ -1,4 +1,4 @@
-"""Runs the jobs of a benchmark, scores them, and keeps what is done through any failure."""
+"""Runs and scores the jobs of a benchmark; a job that fails takes nothing from the others."""
 
 import time
 import traceback
@@ -69,7 +69,7 @@ class Harness:
         for number, (job, values) in enumerate(zip(jobs, settings, strict=True), start=1):
             name = f"{job.scene.name} {job.variant}".strip()
             self._say(f"[{number}/{len(jobs)}] {self._benchmark.name}: {name}")
-            self._do(job, values)
+            self._process(job, values)
             records = self._ordered(records_below(self._output, self._benchmark.name), jobs)
             write_report(self._output, self._benchmark, records)
         return records
@@ -83,7 +83,7 @@ class Harness:
 
         return sorted(records, key=place)
 
-    def _do(self, job: BenchmarkJob, settings: dict[str, object]) -> None:
+    def _process(self, job: BenchmarkJob, settings: dict[str, object]) -> None:
         """Run and score a job, as far as needed, and write its record."""
         folder = job.task.output
         digest = config_hash(job.task.command, settings)

@@ -1,4 +1,4 @@
-"""Which tasks a benchmark consists of, given the user's folder and wishes."""
+"""The tasks of a benchmark, given the user's folder and selection."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +14,8 @@ _BUDGET = 120.0
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What the user chose beside the benchmark and its data."""
+class Selection:
+    """What of a benchmark is run, and how, by the user's choice."""
 
     scenes: tuple[str, ...] = ()
     """Only these, by name; those of the paper if none is named."""
@@ -60,22 +60,22 @@ def find_scenes(
 
 
 def make_jobs(
-    benchmark: Benchmark, scenes: Sequence[BenchmarkScene], output: Path, wishes: Wishes
+    benchmark: Benchmark, scenes: Sequence[BenchmarkScene], output: Path, selection: Selection
 ) -> list[BenchmarkJob]:
     """One job for each scene and variant, scene by scene; what needs depth only where it is there.
 
     Raises:
         InputError: a variant that is named does not exist, or can be run on none of the scenes.
     """
-    variants = _variants(benchmark, wishes)
+    variants = _variants(benchmark, selection)
     known = [variant.name for variant in variants]
-    if missing := [name for name in wishes.variants if name not in known]:
+    if missing := [name for name in selection.variants if name not in known]:
         raise InputError(
             f"{benchmark.name} has no variant {missing[0]}, only {', '.join(known) or 'one'}."
         )
-    chosen = [v for v in variants if v.name in wishes.variants or not wishes.variants]
+    chosen = [v for v in variants if v.name in selection.variants or not selection.variants]
     jobs = [
-        _job(benchmark, scene, v, output, wishes)
+        _job(benchmark, scene, v, output, selection)
         for scene in scenes
         for v in chosen
         if scene.has_depth or not v.needs_depth
@@ -86,18 +86,18 @@ def make_jobs(
     return jobs
 
 
-def _variants(benchmark: Benchmark, wishes: Wishes) -> list[Variant]:
+def _variants(benchmark: Benchmark, selection: Selection) -> list[Variant]:
     """The benchmark's variants, at each budget, and the baseline at each."""
     variants = list(benchmark.variants)
-    budgets = wishes.budgets or benchmark.budgets
+    budgets = selection.budgets or benchmark.budgets
     if not benchmark.budgets:
-        if wishes.budgets or wishes.baseline:
+        if selection.budgets or selection.baseline:
             raise InputError(
                 f"{benchmark.name} does not start from known poses; leave out --budgets and "
                 f"--baseline."
             )
         return variants
-    if wishes.baseline:
+    if selection.baseline:
         command: Command = "colour-2dgs"
         variants.append(Variant(command, command=command))
     several = len(budgets) > 1
@@ -117,9 +117,13 @@ def _timed(name: str, seconds: float) -> str:
 
 
 def _job(
-    benchmark: Benchmark, scene: BenchmarkScene, variant: Variant, output: Path, wishes: Wishes
+    benchmark: Benchmark,
+    scene: BenchmarkScene,
+    variant: Variant,
+    output: Path,
+    selection: Selection,
 ) -> BenchmarkJob:
-    options = merged(scene.options, wishes.options, variant.options)
+    options = merged(scene.options, selection.options, variant.options)
     folder = output / scene.name / variant.name
     command = variant.command or benchmark.command
     if benchmark.by_kind and scene.kind in ("object", "scan"):

@@ -21,7 +21,7 @@ class PublishedRow:
     metric: str
     values: tuple[float, ...]
     mean: float | None = None
-    """As printed; none where the table has no mean."""
+    """The printed mean; none where the table has none."""
 
 
 @dataclass(frozen=True)

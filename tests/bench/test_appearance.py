@@ -220,15 +220,14 @@ def test_refinement_doubles_splits_and_removes() -> None:
     clear = torch.tensor([0.5, 0.5, 0.5, 0.01, 0.5, 0.5]).logit()
     disks = replace(disks, log_scales=sizes[:, None].repeat(1, 2), opacity_logits=clear)
     gradient = torch.tensor([1e-3, 1e-5, 1e-3, 1e-5, 1e-5, 1e-5])
-    before = refine(disks, gradient, 2000.0, 1.0, CONFIG, torch.Generator())
-    assert before.kept.tolist() == [0, 1, 4, 5]  # 2 is split, 3 too clear
-    assert (before.doubled, before.split, before.removed) == (1, 1, 1)
-    assert len(before.added) == 3
-    torch.testing.assert_close(before.added.means[0], disks.means[0])
-    torch.testing.assert_close(before.added.scales[1:], torch.full((2, 2), 0.05 / 1.6))
-    after = refine(disks, gradient, 4000.0, 1.0, CONFIG, torch.Generator())
-    assert after.kept.tolist() == [0, 1, 5]  # 4 is too large by now
-    assert after.removed == 2
+    kept, added = refine(disks, gradient, 2000.0, 1.0, CONFIG, torch.Generator())
+    assert kept.tolist() == [0, 1, 4, 5]  # 2 is split, 3 too clear
+    assert len(added) == 3  # 0 is doubled
+    torch.testing.assert_close(added.means[0], disks.means[0])
+    torch.testing.assert_close(added.scales[1:], torch.full((2, 2), 0.05 / 1.6))
+    kept, added = refine(disks, gradient, 4000.0, 1.0, CONFIG, torch.Generator())
+    assert kept.tolist() == [0, 1, 5]  # 4 is too large by now
+    assert len(added) == 3
 
 
 def test_halves_of_a_disk_lie_in_its_plane() -> None:
@@ -476,6 +475,6 @@ def test_too_few_points_are_refused() -> None:
     views = plane_views(CAMERA, 2)
     with pytest.raises(InputError, match="only 3"):
         AppearanceTrainer(
-            views, np.zeros((3, 3)), np.zeros((3, 3), np.uint8), ReferenceRasteriser(0.01),
+            views, np.zeros((3, 3)), np.zeros((3, 3), np.uint8), ReferenceRasteriser(0.01), CONFIG,
             device="cpu",
         )  # fmt: skip

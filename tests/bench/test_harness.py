@@ -12,7 +12,7 @@ from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
 from geogs_bench.harness import Harness
 from geogs_bench.machine import machine_name, program_version
-from geogs_bench.plan import Wishes, make_jobs, merged
+from geogs_bench.plan import Selection, make_jobs, merged
 from geogs_bench.results.store import clear
 from geogs_bench.tables.columns import COST, area_layout, trajectory_layout
 
@@ -30,13 +30,19 @@ def benchmark(scenes: list[BenchmarkScene], **changes) -> Benchmark:
     return Benchmark(**values | changes)
 
 
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch) -> None:
+    """Scores come without their pictures, which take longer than they do."""
+    monkeypatch.setattr("geogs_bench.scoring.scores.draw", lambda *_: None)
+
+
 @pytest.fixture
 def scenes(tmp_path) -> list[BenchmarkScene]:
     return [write_truth(tmp_path / "data" / name, name) for name in ("attic", "cellar", "hall")]
 
 
-def run(test: Benchmark, scenes, output: Path, runner: FakeRunner, wishes=None, **how):
-    jobs = make_jobs(test, scenes, output, wishes or Wishes())
+def run(test: Benchmark, scenes, output: Path, runner: FakeRunner, selection=None, **how):
+    jobs = make_jobs(test, scenes, output, selection or Selection())
     return Harness(test, output, runner, lambda text: None, **how).run(jobs)
 
 
@@ -87,7 +93,7 @@ def test_finished_scenes_are_not_run_again_unless_something_changed(scenes, tmp_
     run(test, scenes[:1], output, runner, rescore=True)
     assert runner.done == ["attic"]
     assert (output / "attic" / "bench.json").stat().st_mtime_ns > record
-    changed = Wishes(options=(Option("mapping.iterations", "9"),))
+    changed = Selection(options=(Option("mapping.iterations", "9"),))
     run(test, scenes[:1], output, runner, changed)
     assert runner.done == ["attic"] * 2
     run(test, scenes[:1], output, runner, changed, fresh=True)
@@ -118,31 +124,31 @@ def test_variants_have_folders_and_their_options_win(scenes, tmp_path):
             Variant("fast", (Option("mapping.iterations", "2"),)),
         ),
     )
-    wishes = Wishes(options=(Option("mapping.iterations", "5"), Option("seed", "1")))
-    jobs = make_jobs(test, scenes[:1], tmp_path, wishes)
+    selection = Selection(options=(Option("mapping.iterations", "5"), Option("seed", "1")))
+    jobs = make_jobs(test, scenes[:1], tmp_path, selection)
     assert [job.task.output for job in jobs] == [tmp_path / "attic/slow", tmp_path / "attic/fast"]
     assert [options_of(job.task)["mapping.iterations"] for job in jobs] == ["20", "2"]
     assert options_of(jobs[0].task)["seed"] == "1"
     with pytest.raises(InputError, match="no variant medium, only slow, fast"):
-        make_jobs(test, scenes, tmp_path, Wishes(variants=("medium",)))
+        make_jobs(test, scenes, tmp_path, Selection(variants=("medium",)))
 
 
 def test_depth_is_used_where_it_is_there(scenes, tmp_path):
     depth = Variant("rgb-d", (Option("depth", "sensor"),), needs_depth=True)
     test = benchmark(scenes, variants=(Variant("rgb"), depth))
     scenes = [scenes[0], replace(scenes[1], has_depth=True)]
-    jobs = make_jobs(test, scenes, tmp_path, Wishes())
+    jobs = make_jobs(test, scenes, tmp_path, Selection())
     assert [(job.scene.name, job.variant, options_of(job.task).get("depth")) for job in jobs] == [
         ("attic", "rgb", None), ("cellar", "rgb", None), ("cellar", "rgb-d", "sensor"),
     ]  # fmt: skip
     with pytest.raises(InputError, match="No scene has depth images, which rgb-d needs"):
-        make_jobs(test, scenes[:1], tmp_path, Wishes(variants=("rgb-d",)))
+        make_jobs(test, scenes[:1], tmp_path, Selection(variants=("rgb-d",)))
 
 
 def test_budgets_and_the_baseline_make_variants(scenes, tmp_path):
     test = benchmark(scenes, command="reconstruct", budgets=(120.0,))
-    wishes = Wishes(budgets=(20.0, 60.0), baseline=True)
-    jobs = make_jobs(test, scenes[:1], tmp_path, wishes)
+    selection = Selection(budgets=(20.0, 60.0), baseline=True)
+    jobs = make_jobs(test, scenes[:1], tmp_path, selection)
     assert [(job.variant, job.task.command, options_of(job.task)["budget"]) for job in jobs] == [
         ("20s", "reconstruct", "20s"),
         ("60s", "reconstruct", "60s"),
@@ -150,7 +156,7 @@ def test_budgets_and_the_baseline_make_variants(scenes, tmp_path):
         ("colour-2dgs-60s", "colour-2dgs", "60s"),
     ]
     with pytest.raises(InputError, match="leave out --budgets"):
-        make_jobs(benchmark(scenes), scenes, tmp_path, wishes)
+        make_jobs(benchmark(scenes), scenes, tmp_path, selection)
 
 
 def test_later_options_win_whatever_their_spelling():

@@ -22,7 +22,7 @@ from geogs_bench.data.sequence_scenes import (
     find_tum,
 )
 from geogs_bench.data.true_poses import read_true_poses
-from geogs_bench.plan import Wishes, find_scenes, make_jobs
+from geogs_bench.plan import Selection, find_scenes, make_jobs
 from io_samples import write_images
 from posed_layouts import write_colmap_text, write_dtu, write_scannet
 
@@ -94,8 +94,8 @@ def test_a_mix_of_rooms_and_objects_is_run_and_reconstructed(tmp_path):
     assert [(s.name, s.kind) for s in scenes] == [
         ("den", "room"), ("hall", "room"), ("vase", "object")
     ]  # fmt: skip
-    wishes = Wishes(options=(Option("online-results"),))
-    jobs = make_jobs(benchmark, scenes, tmp_path / "out", wishes)
+    selection = Selection(options=(Option("online-results"),))
+    jobs = make_jobs(benchmark, scenes, tmp_path / "out", selection)
     commands = {(j.scene.name, j.variant): j.task.command for j in jobs}
     assert commands["den", "paper"] == "run"
     assert commands["vase", "default"] == commands["vase", "paper"] == "reconstruct"

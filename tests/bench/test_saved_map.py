@@ -15,7 +15,7 @@ from geogs_bench.runners.task import Task
 pytestmark = pytest.mark.system
 
 TINY = {
-    "stop": "24", "mapping.render-long-edge": "64", "mapping.iterations": "1",
+    "stop": "16", "mapping.render-long-edge": "64", "mapping.iterations": "1",
     "mapping.pose-iterations": "0", "mapping.final-iterations": "0",
     "tracking.init-keyframes": "6", "mapping.depth.planes": "48", "device": "cpu",
 }  # fmt: skip

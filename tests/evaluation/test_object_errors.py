@@ -1,6 +1,7 @@
 """Scores of an object inside its masks; exact distances to triangles."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,7 @@ def test_masks_decide_by_every_view_that_has_the_point_in_its_image():
     assert inside_masks(points, [front]).tolist() == [True, True, True, False, False, True]
     empty = Silhouette(np.zeros_like(mask), CAMERA, np.eye(4))
     assert inside_masks(points, [front, empty]).tolist() == [False, True, True] + [False] * 3
-    wide = front.dilated(21.0)
+    wide = replace(front, mask=dilate(mask, 21.0))
     assert inside_masks(points, [wide])[3]  # 20 pixels beside the last column
     assert np.count_nonzero(front.dilated().mask) == np.count_nonzero(dilate(mask, 2.4))
 
@@ -93,7 +94,7 @@ def test_mesh_is_cut_to_triangles_inside_the_masks():
     assert view[0].mask.sum() == 38 * 38
     cut = cull_by_masks(plane(1.0, half=0.5, cells=10), view)
     assert np.abs(cut.vertices[:, :2]).max() == pytest.approx(0.1)
-    widened = [view[0].dilated(12.0)]
+    widened = [replace(view[0], mask=dilate(view[0].mask, 12.0))]
     assert np.abs(
         cull_by_masks(plane(1.0, half=0.5, cells=10), widened).vertices[:, :2]
     ).max() == pytest.approx(0.3)
@@ -109,7 +110,8 @@ def test_shifted_plane_and_clutter():
     beside = moved(half, 0.75, 0, 0)
     view = mesh_silhouettes(truth, CAMERA, np.eye(4)[None])
     result = joined(left, right, behind, beside)
-    s = evaluate_object(result, truth, [view[0].dilated(1.0)], samples=40_000).scores
+    wide = replace(view[0], mask=dilate(view[0].mask, 1.0))
+    s = evaluate_object(result, truth, [wide], samples=40_000).scores
     assert s.outside_masks == pytest.approx(25, abs=2)
     assert s.accuracy_left_out == pytest.approx(100 / 3, abs=1)
     assert s.accuracy_mm == pytest.approx(1.05, abs=0.01)
@@ -125,14 +127,12 @@ def test_a_hole_costs_completeness_and_far_truth_is_counted_as_left_out():
     truth = plane(1.0, half=0.3, cells=2)
     half = truth.part((truth.vertices[truth.faces][..., 0] <= 0).all(1))
     view = mesh_silhouettes(truth, CAMERA, np.eye(4)[None])
-    errors = evaluate_object(half, truth, view, samples=20_000)
-    s = errors.scores
+    s = evaluate_object(half, truth, view, samples=20_000).scores
     assert s.accuracy_mm < 1e-6
     assert s.precision == 100.0
     # x in [0, 0.3] is x away; 0.02 of it counts, 0.28 is left out.
     assert s.completeness_left_out == pytest.approx(100 * 0.28 / 0.6, abs=0.5)
     assert s.completeness_mm == pytest.approx(10 * 0.02 / 0.32, abs=0.05)
-    assert np.isinf(errors.completeness).mean() == pytest.approx(0.28 / 0.6, abs=0.005)
     with pytest.raises(InputError, match="frame of the true poses"):
         evaluate_object(plane(1.5), truth, view, samples=1000)
 

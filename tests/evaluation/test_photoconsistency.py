@@ -44,8 +44,8 @@ def views() -> list[EvaluatedPhoto]:
     return [EvaluatedPhoto(photograph(T, texture), T) for T in poses]
 
 
-def score(mesh, views, **options):
-    return evaluate_photoconsistency(mesh, CAMERA, views, [0], **options)
+def score(mesh, views):
+    return evaluate_photoconsistency(mesh, CAMERA, views, [0])
 
 
 def test_true_plane_beats_planes_one_percent_off(views):

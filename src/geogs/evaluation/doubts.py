@@ -1,4 +1,4 @@
-"""What speaks against the comparison of two trajectories, in sentences."""
+"""Warnings on a comparison of two trajectories whose errors may mean little."""
 
 import numpy as np
 
@@ -35,10 +35,13 @@ def doubts(
         max_difference: of the times of poses that were compared, seconds.
         is_metric: whether the estimate claims to be in metres.
     """
-    said = [_of_times(errors, estimate, reference, max_difference)]
-    said.append("" if errors.alignment == "none" else _of_alignment(errors))
-    said += [_of_size(errors, is_metric or errors.alignment == "se3"), _of_speed(errors)]
-    return [sentence for sentence in said if sentence]
+    sentences = (
+        _of_times(errors, estimate, reference, max_difference),
+        "" if errors.alignment == "none" else _of_alignment(errors),
+        _of_size(errors, is_metric or errors.alignment == "se3"),
+        _of_speed(errors),
+    )
+    return [sentence for sentence in sentences if sentence]
 
 
 def _of_times(

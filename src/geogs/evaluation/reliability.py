@@ -1,4 +1,4 @@
-"""Whether errors are as large as was foretold."""
+"""Errors of positions beside their predicted deviations: are they as large as predicted?"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,31 +7,31 @@ import numpy as np
 from jaxtyping import Float
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Foretold parts of the frames at which the observed ones are told."""
+"""Predicted fractions of the frames at which the observed ones are given."""
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """Errors of positions beside the deviations that were foretold of them."""
+    """Errors of positions and their predicted deviations."""
 
     error: Float[np.ndarray, "n"]
     """Length of each error."""
     sigma: Float[np.ndarray, "n"]
-    """Its foretold standard deviation, all axes together, in the same unit; finite."""
+    """Predicted standard deviation, all axes together, in the same unit; finite."""
 
     @property
     def within_two_sigma(self) -> float:
-        """Part of the frames whose error is at most twice what was foretold."""
+        """Fraction of the frames whose error is at most two predicted deviations."""
         return float((self.error <= 2 * self.sigma).mean())
 
     @property
     def error_per_sigma(self) -> float:
-        """Errors by deviations, both root mean square: 1 where they are as large as foretold."""
-        foretold = float(np.square(self.sigma).mean())
-        return float(np.sqrt(np.square(self.error).mean() / max(foretold, 1e-300)))
+        """Errors over deviations, both root mean square: 1 where they are as large as predicted."""
+        variance = float(np.square(self.sigma).mean())
+        return float(np.sqrt(np.square(self.error).mean() / max(variance, 1e-300)))
 
-    def observed(self, foretold: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-        """Parts of the frames that lie as near as foretold for such parts of them.
+    def observed(self, predicted: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+        """Fractions of the frames that lie as near as predicted for such fractions of them.
 
         Errors are taken for normal and alike along the three axes, so that three times their
         square by the variance of all axes together follows a chi-squared distribution with three
@@ -39,9 +39,9 @@ class Reliability:
         """
         from scipy.special import chdtr
 
-        # Where a frame's own error is at the edge of what was foretold for this part of them.
+        # The fraction of frames that is predicted to lie nearer than this one does.
         edge = chdtr(3, 3 * np.square(self.error / np.maximum(self.sigma, 1e-300)))
-        return (edge <= foretold[:, None]).mean(1)
+        return (edge <= predicted[:, None]).mean(1)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -68,10 +68,10 @@ def reliability(
     Args:
         times: of the errors, seconds.
         error: their lengths.
-        known_times: of the frames whose place is known, ascending.
+        known_times: of the frames whose position is known, ascending.
         sigma: their deviations, in the unit of the errors; infinite where nothing is known.
     """
     middle = (known_times[1:] + known_times[:-1]) / 2
-    foretold = sigma[np.searchsorted(middle, times)] if len(sigma) else np.full(len(times), np.inf)
-    known = np.isfinite(foretold)
-    return Reliability(error[known], foretold[known]) if known.any() else None
+    nearest = sigma[np.searchsorted(middle, times)] if len(sigma) else np.full(len(times), np.inf)
+    known = np.isfinite(nearest)
+    return Reliability(error[known], nearest[known]) if known.any() else None

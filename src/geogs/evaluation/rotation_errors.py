@@ -17,16 +17,17 @@ def rotation_angle(
 def best_rotation(
     estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Rotation of the world of some orientations that takes them nearest to others."""
+    """Rotation of the world that takes the estimated orientations nearest to the others."""
     return nearest_rotation((reference @ estimate.transpose(0, 2, 1)).sum(0))
 
 
 def stretches(
     along: Float[np.ndarray, "n"], length: float
 ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """First and last pose of the stretch of so much ``length`` that begins at each pose.
+    """First and last poses of the stretches of the path that are ``length`` long.
 
-    ``along`` is the way to each pose, ascending; one with less before it begins no stretch.
+    ``along`` is the length of the path up to each pose, ascending. A stretch begins at each pose
+    that has as much of the path after it.
     """
     last = np.searchsorted(along, along + length * (1 - 1e-9))
     first = np.flatnonzero(last < len(along))
@@ -39,7 +40,7 @@ def relative_rotation_error(
     first: Int[np.ndarray, "m"],
     last: Int[np.ndarray, "m"],
 ) -> Float[np.ndarray, "m"]:
-    """Angle in degrees between what both say of the rotation from ``first`` to ``last``.
+    """Angle in degrees between the estimated and the true rotation from ``first`` to ``last``.
 
     It is the rotation of the relative pose error (RPE; Sturm et al. 2012), which does not depend on
     how the trajectories are aligned.

@@ -41,8 +41,8 @@ class TrajectoryErrors:
     rotation_rmse_deg: float
     """Angle between aligned and true orientation, root mean square."""
     relative_rotation_rmse_deg: float | None
-    """That between the estimated and the true rotation over stretches of the path, whatever the
-    alignment; none where the reference does not move."""
+    """Relative rotation error over stretches of the path, which no alignment changes; none where
+    the reference does not move."""
     stretch_m: float
     """Length of these stretches."""
     roll_deg: float
@@ -75,9 +75,9 @@ class TrajectoryErrors:
 
     @property
     def rotations(self) -> tuple[str, Float[np.ndarray, "n"], float]:
-        """Which rotation errors count, absolute or relative; they, and their root mean square.
+        """The kind of rotation errors that counts, these errors, and their root mean square.
 
-        The absolute ones do where the alignment is determined well enough.
+        It is "absolute" where the alignment is determined well enough, else "relative".
         """
         if self.roll_deg <= MAX_ROLL or self.relative_rotation_rmse_deg is None:
             return "absolute", self.rotation_error, self.rotation_rmse_deg
@@ -108,36 +108,6 @@ def associate(
     return chosen, to_estimate[chosen]
 
 
-def align(
-    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"], how: Alignment
-) -> tuple[Float[np.ndarray, "4 4"], float]:
-    """Similarity (or rigid motion, or identity) moving ``estimate`` onto ``reference``; its scale.
-
-    Least squares over the positions (Umeyama 1991).
-    """
-    T = np.eye(4)
-    if how == "none":
-        return T, 1.0
-    scale, R, t = umeyama(
-        torch.from_numpy(np.ascontiguousarray(estimate, np.float64)),
-        torch.from_numpy(np.ascontiguousarray(reference, np.float64)),
-        with_scale=how == "sim3",
-    )
-    T[:3, :3], T[:3, 3] = (scale * R).numpy(), t.numpy()
-    return T, float(scale)
-
-
-def align_orientations(
-    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
-) -> Float[np.ndarray, "4 4"]:
-    """Rigid motion that fits orientations best (chordal mean) and takes the mean place to the
-    mean place."""
-    T = np.eye(4)
-    T[:3, :3] = best_rotation(estimate[:, :3, :3], reference[:, :3, :3])
-    T[:3, 3] = reference[:, :3, 3].mean(0) - T[:3, :3] @ estimate[:, :3, 3].mean(0)
-    return T
-
-
 @on_one_torch_thread
 def evaluate_trajectory(
     estimate: Trajectory,
@@ -160,13 +130,12 @@ def evaluate_trajectory(
         raise InputError(_no_match(reference, estimate, len(i), max_difference))
     truth, guess = reference.T_wc[i], estimate.T_wc[j]
     by_positions = alignment != "none" and not (guess[:, :3, 3] == guess[0, :3, 3]).all()
-    if alignment != "none" and not by_positions:
-        T, scale = align_orientations(guess, truth), 1.0
-    else:
-        try:
-            T, scale = align(guess[:, :3, 3], truth[:, :3, 3], alignment)
-        except GeogsError as reason:
-            raise InputError(f"The trajectories cannot be aligned: {reason}") from None
+    T, scale = np.eye(4), 1.0
+    if by_positions:
+        T, scale = _similarity(guess[:, :3, 3], truth[:, :3, 3], alignment == "sim3")
+    elif alignment != "none":
+        T[:3, :3] = best_rotation(guess[:, :3, :3], truth[:, :3, :3])
+        T[:3, 3] = truth[:, :3, 3].mean(0) - T[:3, :3] @ guess[:, :3, 3].mean(0)
     aligned = np.tile(np.eye(4), (len(guess), 1, 1))
     aligned[:, :3, 3] = guess[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     aligned[:, :3, :3] = T[:3, :3] / scale @ guess[:, :3, :3]
@@ -203,6 +172,20 @@ def evaluate_trajectory(
         aligned=aligned,
         truth=truth,
     )
+
+
+def _similarity(
+    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"], with_scale: bool
+) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Least-squares similarity or rigid motion of ``estimate`` onto ``reference``; its scale."""
+    x, y = (torch.from_numpy(np.ascontiguousarray(p, np.float64)) for p in (estimate, reference))
+    try:
+        scale, R, t = umeyama(x, y, with_scale)
+    except GeogsError as reason:
+        raise InputError(f"The trajectories cannot be aligned: {reason}") from None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = (scale * R).numpy(), t.numpy()
+    return T, float(scale)
 
 
 def _roll(positions: Float[np.ndarray, "n 3"], error: Float[np.ndarray, "n"]) -> float:

@@ -60,7 +60,7 @@ class AppearanceConfig:
     initial_opacity: float = 0.1
     """Opacity of a new disk at a start point."""
     scene_margin: float = 1.1
-    """BenchmarkScene scale in largest distances of a camera from the middle of the cameras."""
+    """Scene scale in largest distances of a camera from the middle of the cameras."""
     near: float = 0.01
     """Disks with centres nearer to a camera are not rendered, units of the poses."""
     min_alpha: float = 0.5

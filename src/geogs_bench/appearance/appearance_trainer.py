@@ -25,7 +25,7 @@ OnTime = Callable[[float, AppearanceDisks], None]
 
 @dataclass(frozen=True)
 class AppearanceResult:
-    """What training came to."""
+    """The trained disks, and what their training took."""
 
     disks: AppearanceDisks
     iterations: int
@@ -47,7 +47,7 @@ class AppearanceTrainer:
         points: Float[np.ndarray, "n 3"],
         colours: UInt8[np.ndarray, "n 3"],
         rasteriser: Rasteriser,
-        config: AppearanceConfig | None = None,
+        config: AppearanceConfig,
         seed: int = 0,
         device: str = "cuda",
     ) -> None:
@@ -58,8 +58,8 @@ class AppearanceTrainer:
                 f"The appearance baseline starts from points, and there are only {len(points)}; "
                 "the images may have too little texture."
             )
-        self.config = config or AppearanceConfig()
-        self.scene_scale = scene_scale(list(views), self.config.scene_margin)
+        self.config = config
+        self.scene_scale = scene_scale(views, config.scene_margin)
         """Largest distance of a camera from their middle, with a margin; units of the poses."""
         self.iterations = 0
         self._device = torch.device(device)
@@ -153,11 +153,11 @@ class AppearanceTrainer:
             self._gradients.add(gradient.reshape(-1, 2), rendering.visible, *shape)
 
     def _refine(self, step: float) -> None:
-        refinement = refine(
+        kept, added = refine(
             self.disks, self._gradients.mean(), step, self.scene_scale, self.config, self._random
         )
-        if len(refinement.kept) + len(refinement.added) >= FEWEST_POINTS:
-            self._optimizer.change(refinement.kept, refinement.added)
+        if len(kept) + len(added) >= FEWEST_POINTS:
+            self._optimizer.change(kept, added)
         self._gradients = GradientStatistics(len(self._optimizer.disks), self._device)
 
     def _render(

@@ -1,10 +1,10 @@
-"""Adaptive density control: where the image pulls at disks, they are doubled or split.
+"""Adaptive density control: disks with large image gradients are doubled or split.
 
 The rules of 3D Gaussian splatting (Kerbl et al. 2023, Sec. 5.2) on the image gradients of 2DGS.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,7 +16,7 @@ from geogs_bench.appearance.appearance_disks import AppearanceDisks
 
 
 class GradientStatistics:
-    """How strongly the images have pulled at each disk since the last refinement."""
+    """Mean image gradient of each disk since the last refinement."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         self._sum = torch.zeros(count, device=device)
@@ -39,19 +39,6 @@ class GradientStatistics:
         return self._sum / self._views.clamp(min=1)
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """What becomes of the disks."""
-
-    kept: Int[Tensor, "k"]
-    """Rows that stay as they are."""
-    added: AppearanceDisks
-    doubled: int
-    split: int
-    removed: int
-    """Disks that were too clear or too large, new ones included."""
-
-
 def refine(
     disks: AppearanceDisks,
     gradient: Float[Tensor, "n"],
@@ -59,31 +46,27 @@ def refine(
     scene_scale: float,
     config: AppearanceConfig,
     generator: torch.Generator,
-) -> Refinement:
-    """Double small disks and split large ones where gradients are high; remove useless ones."""
+) -> tuple[Int[Tensor, "k"], AppearanceDisks]:
+    """Double small disks and split large ones where gradients are high; remove useless ones.
+
+    Returns the rows that stay as they are, and the new disks.
+    """
     disks = disks.map(lambda tensor: tensor.detach())
-    pulled = gradient > config.grow_gradient
+    is_steep = gradient > config.grow_gradient
     small = disks.scales.amax(1) <= config.grow_scale * scene_scale
-    split = pulled & ~small
-    doubles = disks.map(lambda tensor: tensor[pulled & small])
+    split = is_steep & ~small
+    doubles = disks.map(lambda tensor: tensor[is_steep & small])
     halves = split_disks(disks.map(lambda tensor: tensor[split]), config.split_shrink, generator)
     added = doubles.joined(halves)
-    useless = _useless(disks, step, scene_scale, config)
-    useless_added = _useless(added, step, scene_scale, config)
-    kept = torch.nonzero(~split & ~useless)[:, 0]
-    return Refinement(
-        kept,
-        added.map(lambda tensor: tensor[~useless_added]),
-        len(doubles),
-        len(halves) // 2,
-        int((useless & ~split).sum() + useless_added.sum()),
-    )
+    kept = torch.nonzero(~split & ~_useless(disks, step, scene_scale, config))[:, 0]
+    useful = ~_useless(added, step, scene_scale, config)
+    return kept, added.map(lambda tensor: tensor[useful])
 
 
 def split_disks(
     disks: AppearanceDisks, shrink: float, generator: torch.Generator
 ) -> AppearanceDisks:
-    """Two smaller disks for each, at places drawn from it, in its plane."""
+    """Two smaller disks for each, at points drawn from it, in its plane."""
     tangents = quaternion_to_matrix(torch.nn.functional.normalize(disks.quaternions, dim=-1))
     both = disks.map(lambda tensor: torch.cat([tensor, tensor]))
     drawn = torch.randn(both.log_scales.shape, generator=generator, device=disks.means.device)
@@ -95,6 +78,7 @@ def split_disks(
 def _useless(
     disks: AppearanceDisks, step: float, scene_scale: float, config: AppearanceConfig
 ) -> Bool[Tensor, "n"]:
+    """Disks that are too transparent, or by now too large."""
     clear = disks.opacities < config.prune_opacity
     if step <= config.prune_scale_start:
         return clear

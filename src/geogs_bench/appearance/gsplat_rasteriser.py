@@ -1,14 +1,13 @@
 """Coloured disks through the CUDA operators of gsplat (Apache-2.0)."""
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-from geogs.errors import DeviceError, InputError
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs_bench.appearance.appearance_disks import AppearanceDisks
 from geogs_bench.appearance.rasteriser import (
@@ -19,21 +18,6 @@ from geogs_bench.appearance.rasteriser import (
 )
 
 _TILE = 16
-
-
-def import_gsplat() -> ModuleType:
-    """The package.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import gsplat
-    except ImportError as error:
-        raise InputError(
-            "The appearance baseline needs gsplat; install it with: pip install gsplat"
-        ) from error
-    return gsplat
 
 
 @dataclass(frozen=True)
@@ -58,16 +42,19 @@ class GsplatRasteriser:
 
     Raises:
         InputError: gsplat is not installed.
-        DeviceError: there is no GPU.
     """
 
     def __init__(self, near: float) -> None:
-        self._gsplat = import_gsplat()
+        try:
+            import gsplat
+        except ImportError as error:
+            raise InputError(
+                "The appearance baseline needs gsplat; install it with: pip install gsplat"
+            ) from error
+        self._gsplat = gsplat
         self._near = near
         self._matrices: dict[Camera, Tensor] = {}
         self._rays: dict[Camera, Tensor] = {}
-        if not torch.cuda.is_available():
-            raise DeviceError("The appearance baseline needs an NVIDIA GPU; there is none here.")
 
     def render(
         self,
@@ -78,7 +65,7 @@ class GsplatRasteriser:
         background: Float[Tensor, "3"] | None,
         with_normals: bool,
     ) -> Rendering:
-        """As :class:`geogs_bench.appearance.rasteriser.Rasteriser` says."""
+        """Colours and, if wanted, normals: see :class:`~.rasteriser.Rasteriser`."""
         projection = self._project(disks, camera, T_cw)
         visible = (projection.radii > 0).all(-1)
         directions = disks.means + T_cw[:3, 3] @ T_cw[:3, :3]
@@ -108,7 +95,7 @@ class GsplatRasteriser:
     def median_disks(
         self, disks: AppearanceDisks, camera: Camera, T_cw: Float[Tensor, "4 4"]
     ) -> MedianDisks:
-        """As :class:`geogs_bench.appearance.rasteriser.Rasteriser` says.
+        """The median disk of each pixel: see :class:`~.rasteriser.Rasteriser`.
 
         gsplat's median is the last channel's value of the median disk, so that each disk is
         painted with its own number, from 1 on. Float32 holds these up to 2^24 disks.

@@ -22,7 +22,7 @@ from geogs_photos.pycolmap_library import load_colmap
 
 @dataclass(frozen=True)
 class StartPoints:
-    """Where the scene is, about."""
+    """Sparse points of the scene."""
 
     positions: Float64[np.ndarray, "n 3"]
     """World frame."""

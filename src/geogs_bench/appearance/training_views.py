@@ -1,5 +1,6 @@
 """Posed images to train on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,17 +30,11 @@ def training_views(source: PosedSource) -> list[TrainingView]:
     return [TrainingView(v.image, v.mask, source.camera, v.T_cw) for v in source]
 
 
-def scene_scale(views: list[TrainingView], margin: float) -> float:
+def scene_scale(views: Sequence[TrainingView], margin: float) -> float:
     """Largest distance of a camera from the middle of the cameras, times ``margin``."""
-    centres = camera_centres(views)
-    radius = np.linalg.norm(centres - centres.mean(0), axis=1).max()
-    return float(margin * radius)
-
-
-def camera_centres(views: list[TrainingView]) -> Float64[np.ndarray, "n 3"]:
-    """Where the cameras are in the world."""
     T_cw = np.stack([view.T_cw for view in views])
-    return -np.einsum("nji,nj->ni", T_cw[:, :3, :3], T_cw[:, :3, 3])
+    centres = -np.einsum("nji,nj->ni", T_cw[:, :3, :3], T_cw[:, :3, 3])
+    return float(margin * np.linalg.norm(centres - centres.mean(0), axis=1).max())
 
 
 class DeviceView:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 Culling = Literal["done", "frustum", "occlusion"]
-"""By its provider; to what lies inside the images; and of that to what is not hidden."""
+"""Culled by its provider; to be culled by the frusta; and by what hides it, too."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Option:
     value: str = ""
 
     def arguments(self) -> list[str]:
-        """As on a command line."""
+        """The option on a command line."""
         return [f"--{self.name}", self.value] if self.value else [f"--{self.name}"]
 
 
@@ -46,7 +46,7 @@ class Truth:
     """What a result can be compared with; a part is none where it is not there."""
 
     poses: Path | None = None
-    """As ``geogs eval --gt`` takes it, or the COLMAP model of a video at 60 frames a second, whose
+    """Path as for ``geogs eval --gt``, or the COLMAP model of a video at 60 frames a second, whose
     images are called by their frames."""
     surface: Path | None = None
     """PLY in metres, in the frame of the poses."""
@@ -66,7 +66,7 @@ class BenchmarkScene:
     """What ``geogs run`` or ``geogs reconstruct`` reads."""
     truth: Truth
     options: tuple[Option, ...] = ()
-    """That this scene needs, such as its intrinsics."""
+    """What this scene needs, such as its intrinsics."""
     kind: Literal["room", "object", "scan", "motion", "depth"] = "room"
     """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU; of a
     motion the trajectory alone is scored, of depth the views alone."""

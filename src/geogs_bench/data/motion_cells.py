@@ -1,12 +1,12 @@
 """The matrix of motions and cameras that ``geogs bench motions`` renders, and finds again."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geogs.errors import InputError
+from geogs.threads import available_cores
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import folders_like
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
@@ -29,7 +29,7 @@ class Cell:
     moving: float = 0.0
     """Share of the image that moves."""
     seed: int = 0
-    """Of the place and of the path."""
+    """Seed of the place and of the path."""
 
     @property
     def place(self) -> MotionKind:
@@ -158,7 +158,7 @@ def _raycaster(place: MotionKind, seed: int) -> "Raycaster":
     from geogs_synth.raycast.raycaster import Raycaster
     from geogs_synth.sequence.location import make_scene
 
-    return Raycaster(make_scene(place, seed), _threads())
+    return Raycaster(make_scene(place, seed), available_cores())
 
 
 def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
@@ -167,9 +167,5 @@ def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
     write_sequence(
         folder, cell.frames, cell.width, cell.height, cell.seed,
         motion=cell.motion, flaws=cell.flaws, moving=cell.moving,
-        threads=_threads(), raycaster=raycaster,
+        threads=available_cores(), raycaster=raycaster,
     )  # fmt: skip
-
-
-def _threads() -> int:
-    return os.cpu_count() or 2

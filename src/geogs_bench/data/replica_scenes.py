@@ -23,7 +23,7 @@ def find_replica(root: Path) -> list[BenchmarkScene]:
 
 
 def find_rooms(root: Path) -> list[BenchmarkScene]:
-    """Those of :func:`find_replica` whose true surface is there."""
+    """Scenes of :func:`find_replica` whose true surface is there."""
     return [scene for scene in find_replica(root) if scene.truth.surface is not None]
 
 

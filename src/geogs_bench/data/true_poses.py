@@ -10,6 +10,8 @@ from geogs.io.sources.formats.colmap import is_model, pose_of, read_model
 from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
 
+SAME_TIME = 0.005
+"""Seconds between an image and its pose."""
 _VIDEO_RATE = 60.0
 """Frames per second of ScanNet++'s videos."""
 

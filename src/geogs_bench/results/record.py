@@ -110,9 +110,9 @@ class PlaceScore:
 
     place: Place
     share: float
-    """Of all pixels whose true depth is known."""
+    """Part of all pixels whose true depth is known."""
     covered: float
-    """Where the mesh is seen."""
+    """Pixels that show the mesh."""
     median_error: float | None = None
     """Percent of the depth, where it is seen."""
     within_2: float | None = None

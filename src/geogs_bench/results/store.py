@@ -34,7 +34,7 @@ _LEFT_BY_EARLIER_RUNS = (
 
 @dataclass(frozen=True)
 class CompletedRun:
-    """That a run came to its end: of what, how, and what it took."""
+    """A run that came to its end: its source, how it was made, and what it took."""
 
     source: str
     provenance: Provenance

@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from geogs.evaluation.pages.run_pictures import depth_colours
-from geogs.io.writers.atomic import atomic_file
+from geogs.evaluation.pages.run_pictures import depth_colours, save_picture
 from geogs_bench.results.record import Place
-from geogs_bench.scoring.depth_scores import JudgedView
+from geogs_bench.scoring.depth_scores import ComparedView
 
 DEPTH_PICTURE = "bench_depth.png"
 """In the report of a result."""
@@ -30,28 +28,26 @@ _COLOURS: dict[Place, tuple[int, int, int]] = {
 """Later ones are drawn over earlier ones."""
 
 
-def draw_depths(path: Path, views: Sequence[JudgedView], most: int = 5) -> None:
+def draw_depths(path: Path, views: Sequence[ComparedView], most: int = 5) -> None:
     """A row for each of some views, spread over the sequence.
 
     Raises:
         OutputError: the file cannot be written.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
-    picture = np.concatenate([_row(views[k]) for k in chosen])
-    with atomic_file(path) as stream:
-        stream.write(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+    save_picture(path, np.concatenate([_row(views[k]) for k in chosen]))
 
 
-def _row(judged: JudgedView) -> UInt8[np.ndarray, "h w2 3"]:
-    true = judged.view.depth
+def _row(compared: ComparedView) -> UInt8[np.ndarray, "h w2 3"]:
+    true = compared.view.depth
     known = true[(true > 0) & np.isfinite(true)]
     ends = np.quantile(1 / known, [0.02, 0.98]) if len(known) else np.array([0.0, 1.0])
     panels = [
-        judged.view.image,
+        compared.view.image,
         _depth_colours(true, ends),
-        _depth_colours(np.where(np.isfinite(judged.found), judged.found, 0), ends),
-        error_colours(true, judged.found),
-        _place_colours(judged.view.image, judged.places),
+        _depth_colours(np.where(np.isfinite(compared.found), compared.found, 0), ends),
+        error_colours(true, compared.found),
+        _place_colours(compared.view.image, compared.places),
     ]
     return np.concatenate(panels, 1)
 

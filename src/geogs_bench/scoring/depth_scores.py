@@ -27,11 +27,11 @@ NEAR, FAR = 0.02, 0.05
 _EXACT_WINDOW, _SENSOR_WINDOW = 7, 21
 """Pixels of the planes whose normals are compared."""
 _EXACT_TOLERANCE, _SENSOR_TOLERANCE = 0.003, 0.006
-"""Of these planes, as parts of the depth."""
+"""Deviation from these planes, as a part of the depth."""
 
 
 @dataclass(frozen=True)
-class JudgedView:
+class ComparedView:
     """A view with the depth that is, the depth that was found, and the kinds of its places."""
 
     view: TrueView
@@ -44,7 +44,7 @@ class JudgedView:
 
 def score_depth(
     scene: BenchmarkScene, result: ResultFolder
-) -> tuple[tuple[PlaceScore, ...], list[JudgedView]]:
+) -> tuple[tuple[PlaceScore, ...], list[ComparedView]]:
     """The scores of every kind of place that there is, and the views behind them.
 
     Raises:
@@ -64,7 +64,7 @@ def score_depth(
     window = _EXACT_WINDOW if truth.is_exact else _SENSOR_WINDOW
     tolerance = _EXACT_TOLERANCE if truth.is_exact else _SENSOR_TOLERANCE
     views = [
-        judge_view(view, depth, (truth.camera, camera), window, tolerance)
+        compare_view(view, depth, (truth.camera, camera), window, tolerance)
         for view, depth in zip(truth.views, found, strict=True)
     ]
     return place_scores(views), views
@@ -89,13 +89,13 @@ def one_scale(
     return [(scale * own).astype(np.float32) for own in found]
 
 
-def judge_view(
+def compare_view(
     view: TrueView,
     found: Float32[np.ndarray, "h w"],
     cameras: tuple[Camera, Camera],
     window: int,
     tolerance: float,
-) -> JudgedView:
+) -> ComparedView:
     """The kinds of a view's places, and the error of its normals where they are known.
 
     ``cameras`` are the true one and the result's, of the same pixels. Both normals are of planes of
@@ -107,10 +107,10 @@ def judge_view(
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     angle = np.where(true_fits.is_good & own_fits.is_known, angle, np.nan).astype(np.float32)
     places = places_of(view.depth, view.image, cameras[0], true_fits)
-    return JudgedView(view, found, places, angle)
+    return ComparedView(view, found, places, angle)
 
 
-def place_scores(views: Sequence[JudgedView]) -> tuple[PlaceScore, ...]:
+def place_scores(views: Sequence[ComparedView]) -> tuple[PlaceScore, ...]:
     """The scores of each kind of place over all views; kinds that no view has are left out."""
     true, found, angle = (
         np.concatenate([a.ravel() for a in arrays])

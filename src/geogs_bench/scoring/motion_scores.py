@@ -15,14 +15,12 @@ from geogs.evaluation.trajectory_errors import (
 )
 from geogs.types import Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
-from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.data.true_poses import SAME_TIME, read_true_poses
 from geogs_bench.results.record import MotionScore
 from geogs_bench.results.result_folder import ResultFolder
 
 _LEAST_PATH = 0.05
 """Metres of way below which positions have nothing to be compared with."""
-_SAME_TIME = 0.005
-"""Seconds."""
 _MOST_OFF = 0.05
 """ATE of a reliable run, of the extent of the true path (root of the mean squared distance from its
 middle)."""
@@ -41,55 +39,47 @@ def score_motion(scene: BenchmarkScene, result: ResultFolder) -> MotionScore:
     if reference is None:
         raise InputError(f"{scene.name} has no true poses to compare with.")
     estimate = result.poses()
-    said = result.summary.get("verdict") or {}
+    claim = (result.summary.get("verdict") or {}).get("is_reliable")
     if estimate is None:
-        return MotionScore(tracked=0.0, is_called_reliable=said.get("is_reliable"))
+        return MotionScore(tracked=0.0, is_called_reliable=claim)
     tracked, states = estimate.of("tracked"), result.states()
     turned = sum(state == "orientation only" for _, state, _ in states)
     return replace(
         compare_motion(reference, tracked, estimate),
         turned=100 * turned / max(len(states), 1),
         within=_within(reference, tracked, states) if states else None,
-        is_called_reliable=said.get("is_reliable"),
+        is_called_reliable=claim,
     )
 
 
-def compare_motion(
-    reference: Trajectory, tracked: Trajectory, oriented: Trajectory | None = None
-) -> MotionScore:
+def compare_motion(reference: Trajectory, tracked: Trajectory, oriented: Trajectory) -> MotionScore:
     """The poses that were tracked against the true ones, frame by frame.
 
     Positions are aligned by a Sim(3), orientations by the rotation that fits them best, so that a
     camera that only turns has a rotation error, too. ``oriented`` are the poses whose
-    orientation counts; if they are not given, those that were tracked.
+    orientation counts.
     """
-    reference, tracked = finite_poses(reference), finite_poses(tracked)
-    i, j = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
+    reference, tracked, oriented = map(finite_poses, (reference, tracked, oriented))
+    i, j = associate(reference.timestamps, tracked.timestamps, SAME_TIME)
     percentage = 100 * len(i) / len(reference.timestamps)
-    rotation = _rotation(reference, tracked if oriented is None else oriented)
-    if len(i) < 3:
-        return MotionScore(percentage, rotation=rotation)
-    places = reference.T_wc[i, :3, 3]
-    path = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
-    if path < _LEAST_PATH:
-        return MotionScore(percentage, rotation=rotation)
-    if np.ptp(tracked.T_wc[j, :3, 3], axis=0).max() == 0:  # all estimated positions are one
-        return MotionScore(percentage, rotation=rotation)
+    score = MotionScore(percentage, rotation=_rotation(reference, oriented))
+    true, found = reference.T_wc[i, :3, 3], tracked.T_wc[j, :3, 3]
+    path = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
+    if len(i) < 3 or path < _LEAST_PATH or (found == found[0]).all():
+        return score
     try:
-        ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
+        ate = evaluate_trajectory(tracked, reference, SAME_TIME).ate_rmse_cm
     except InputError:  # they are on a line
-        return MotionScore(percentage, rotation=rotation)
-    extent = extent_of(reference.T_wc[i])
-    turned = 0 if oriented is None else len(finite_poses(oriented).timestamps) - len(i)
+        return score
+    turned = len(oriented.timestamps) - len(i)
     followed = percentage + 100 * turned / len(reference.timestamps)
-    good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent
-    return MotionScore(percentage, 0.0, rotation, ate, ate / path, is_reliable=good)
+    good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent_of(reference.T_wc[i])
+    return replace(score, ate=ate, relative=ate / path, is_reliable=good)
 
 
 def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
     """RMSE of the orientations in degrees; none where there are fewer than three."""
-    oriented = finite_poses(oriented)
-    i, j = associate(reference.timestamps, oriented.timestamps, _SAME_TIME)
+    i, j = associate(reference.timestamps, oriented.timestamps, SAME_TIME)
     if len(i) < 3:
         return None
     return rotation_error(oriented.T_wc[j, :3, :3], reference.T_wc[i, :3, :3])
@@ -100,7 +90,7 @@ def _within(
 ) -> float | None:
     """Percent of the positions that are off by no more than three deviations, aligned."""
     try:
-        errors = evaluate_trajectory(tracked, reference, _SAME_TIME)
+        errors = evaluate_trajectory(tracked, reference, SAME_TIME)
     except InputError:
         return None
     times, _, sigma = zip(*states, strict=True)

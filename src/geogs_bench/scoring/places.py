@@ -75,7 +75,7 @@ def edges(inverse: Float64[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _mark_jumps(line: Float64[np.ndarray, "n"], marks: Bool[np.ndarray, "n"]) -> None:
-    """Of one line: neighbours that differ, and go on neither as before nor as after.
+    """Mark neighbours of one line that differ, and go on neither as before nor as after.
 
     Inverse depth is linear along a plane, so the slope on either side says what the plane explains.
     """

@@ -19,13 +19,13 @@ class PlaneFits:
     value: Float64[np.ndarray, "h w"]
     """Inverse depth at the pixel; 1 where there is no plane."""
     right: Float64[np.ndarray, "h w"]
-    """By how much it grows to the next column; 0 where there is none."""
+    """Growth of inverse depth to the next column; 0 where there is no plane."""
     down: Float64[np.ndarray, "h w"]
-    """By how much it grows to the next row; 0 where there is none."""
+    """Growth of inverse depth to the next row; 0 where there is no plane."""
     is_known: Bool[np.ndarray, "h w"]
-    """Where enough of the neighbourhood has depth."""
+    """Whether enough of the neighbourhood has depth."""
     is_good: Bool[np.ndarray, "h w"]
-    """Where the neighbourhood, besides, is a plane."""
+    """Whether the neighbourhood, besides, is a plane."""
 
     def normals(self, camera: Camera) -> Float64[np.ndarray, "h w 3"]:
         """Unit normals in the camera's frame, away from it.

@@ -22,7 +22,6 @@ _CULLING_POSES = 200
 """About so many true poses decide what the camera saw."""
 _LONGEST_EDGE = 0.05
 """Metres; coarser true meshes are cut into smaller triangles."""
-
 _MOST_FACES = 4_000_000
 
 
@@ -31,11 +30,11 @@ class TrueSurface:
     """What a mesh is compared with."""
 
     whole: Surface
-    """Answers how accurate a point is where distances are exact."""
+    """The whole surface, against which accuracy is measured."""
     seen: Surface
-    """What the camera saw, for comparisons of whole meshes."""
+    """The part that the camera saw, for comparisons of whole meshes."""
     points: Surface | None
-    """Points that it saw, for completeness; none where ``seen`` serves."""
+    """Points that the camera saw, for completeness; none where ``seen`` serves."""
 
 
 def read_true_surface(

@@ -1,7 +1,8 @@
 """Pictures of one result beside the truth, in the report folder of the result."""
 
+from collections.abc import Sequence
+
 import numpy as np
-from jaxtyping import Float
 
 from geogs.evaluation.pages import plots
 from geogs.evaluation.pages.shading import viewpoints
@@ -18,15 +19,20 @@ PICTURES = {
 """File in the report of a result, and title, of everything that a benchmark shows of it."""
 
 
-def draw(errors: StageErrors, result: ResultFolder, T_wc: Float[np.ndarray, "k 4 4"]) -> None:
-    """Draw what the errors of a stage allow; ``T_wc`` are cameras in the truth's frame.
+def draw(stages: Sequence[StageErrors], result: ResultFolder) -> None:
+    """Draw what the errors of the last stage allow, seen from its own cameras.
 
     Raises:
         OutputError: they cannot be written.
     """
-    folder = result.path / "report"
-    if errors.trajectory is not None:
-        plots.plot_trajectory(folder / "bench_trajectory.png", errors.trajectory)
-    if errors.comparison is not None:
-        views = viewpoints(errors.comparison.mesh.vertices, T_wc, result.camera)
-        plots.plot_beside_truth(folder / "bench_surface.png", errors.comparison, views)
+    if not stages:
+        return
+    trajectory, comparison = stages[-1].trajectory, stages[-1].comparison
+    folder, poses = result.path / "report", result.poses()
+    T_wc = np.eye(4)[None] if poses is None else poses.T_wc
+    if trajectory is not None:
+        plots.plot_trajectory(folder / "bench_trajectory.png", trajectory)
+        T_wc = trajectory.aligned
+    if comparison is not None:
+        views = viewpoints(comparison.mesh.vertices, T_wc, result.camera)
+        plots.plot_beside_truth(folder / "bench_surface.png", comparison, views)

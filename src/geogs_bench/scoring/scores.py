@@ -3,8 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.photoconsistency import evaluate_photoconsistency
@@ -18,10 +16,10 @@ from geogs_bench.results.record import CurvePoint, PhotoScore, Record, StageScor
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.depth_pictures import DEPTH_PICTURE, draw_depths
 from geogs_bench.scoring.depth_scores import score_depth
-from geogs_bench.scoring.judges import Judge, judge_of
 from geogs_bench.scoring.motion_scores import score_motion
 from geogs_bench.scoring.score_pictures import draw
 from geogs_bench.scoring.slam_scores import StageErrors, score_slam
+from geogs_bench.scoring.surface_scorers import SurfaceScorer, surface_scorer
 
 _LONG_EDGE = 800
 
@@ -42,49 +40,37 @@ def scored(record: Record, scene: BenchmarkScene, result: ResultFolder) -> Recor
         return replace(record, places=places)
     if record.provenance.command in ("run", "update"):
         stages = score_slam(scene, result, seed)
-        _draw_last(stages, result)
+        draw(stages, result)
         return replace(record, stages=tuple(stage.score for stage in stages))
-    judge = judge_of(scene, result, seed)
-    if judge is None:
+    scorer = surface_scorer(scene, result, seed)
+    if scorer is None:
         return replace(record, photo=score_photo(scene, result))
-    stages = score_posed(judge, result)
-    _draw_last(stages, result)
-    curve = score_snapshots(judge, result)
+    stages = score_posed(scorer, result)
+    draw(stages, result)
+    curve = score_snapshots(scorer, result)
     return replace(record, stages=tuple(stage.score for stage in stages), curve=curve)
 
 
-def _draw_last(stages: list[StageErrors], result: ResultFolder) -> None:
-    """Pictures of the final stage, seen from its own cameras."""
-    if not stages:
-        return
-    last = stages[-1]
-    if last.trajectory is not None:
-        draw(last, result, last.trajectory.aligned)
-        return
-    poses = result.poses()
-    draw(last, result, np.eye(4)[None] if poses is None else poses.T_wc)
-
-
-def score_posed(judge: Judge, result: ResultFolder) -> list[StageErrors]:
+def score_posed(scorer: SurfaceScorer, result: ResultFolder) -> list[StageErrors]:
     """Every stage that left a mesh. Raises InputError where none did."""
     stages = []
     for stage in result.stages():
         mesh = result.mesh(stage)
         if mesh is not None and mesh.is_mesh:
-            scores, comparison = judge(mesh)
+            scores, comparison = scorer(mesh)
             stages.append(StageErrors(StageScore(stage, None, scores), None, comparison))
     if not stages:
         raise InputError(f"{result.path} holds no mesh to score.")
     return stages
 
 
-def score_snapshots(judge: Judge, result: ResultFolder) -> tuple[CurvePoint, ...]:
+def score_snapshots(scorer: SurfaceScorer, result: ResultFolder) -> tuple[CurvePoint, ...]:
     """Errors of the map after so many seconds, where the run left such snapshots."""
     points = []
     for seconds, folder in result.snapshots():
         mesh = read_surface(folder / "mesh.ply")
         if mesh.is_mesh:
-            points.append(CurvePoint(seconds, _disks_of(folder), judge(mesh)[0][-1]))
+            points.append(CurvePoint(seconds, _disks_of(folder), scorer(mesh)[0][-1]))
     return tuple(points)
 
 

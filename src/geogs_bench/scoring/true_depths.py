@@ -19,11 +19,9 @@ from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.types import Frame, Trajectory
 from geogs_bench.data.benchmark_scene import BenchmarkScene
-from geogs_bench.data.true_poses import read_true_poses
+from geogs_bench.data.true_poses import SAME_TIME, read_true_poses
 from geogs_bench.results.result_folder import ResultFolder
 
-SAME_TIME = 0.005
-"""Seconds between an image and its pose."""
 _SENSOR_REACH = 5.0
 """Metres beyond which a sensor's depth is not believed."""
 _OUTDOORS = ("driving",)
@@ -35,7 +33,7 @@ class TrueView:
     """A frame whose depth is known."""
 
     index: int
-    """Of the frame in the sequence."""
+    """Number of the frame in the sequence."""
     timestamp: float
     image: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]
@@ -48,7 +46,7 @@ class TrueDepths:
 
     views: list[TrueView]
     camera: Camera
-    """As far as the data set tells it; else the result's."""
+    """Camera of the data set where it says one; else of the result."""
     is_exact: bool
     """Whether it was rendered; else a sensor measured it."""
 
@@ -151,7 +149,7 @@ def _is_outdoors(folder: Path) -> bool:
 
 
 def _moving(folder: Path, frame: Frame) -> np.ndarray | bool:
-    """Where ``geogs synth`` shows something that moves, which is in no map."""
+    """Pixels where ``geogs synth`` shows something that moves, which is in no map."""
     mask = decoded(folder / "results" / f"moving{frame.index:06d}.png", cv2.IMREAD_GRAYSCALE)
     if mask.picture is None:
         return False

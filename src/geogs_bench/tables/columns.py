@@ -29,8 +29,6 @@ _FURTHER = (
     ("median Comp", "completeness_median", "{unit}"),
     ("F-score", "f_score", "%"),
 )
-
-
 _STAGES: dict[StageName, str] = {
     "online": "after the stream",
     "adjusted": "after final BA and map update",
@@ -42,13 +40,13 @@ _RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
 _POSED: tuple[StageName, ...] = ("depth fusion", "final")
 
 
-def _of(found: Callable[[Record], object], name: str, factor: float | None = None) -> Value:
+def _of(found: Callable[[Record], object], name: str, factor: float = 1.0) -> Value:
     """A field of what is found in a record, times ``factor``; none where nothing is."""
 
     def value(record: Record) -> float | None:
         scored = found(record)
         number: float | None = None if scored is None else getattr(scored, name)
-        return number if number is None or factor is None else factor * number
+        return None if number is None else factor * number
 
     return value
 

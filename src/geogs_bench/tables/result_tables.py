@@ -34,7 +34,7 @@ def result_tables(benchmark: Benchmark, records: Sequence[Record]) -> list[Table
     for layout in benchmark.layouts:
         columns = [c for c in layout.columns if any(c.value(r) is not None for r in scored)]
         if columns:
-            made += _layout_tables(benchmark, layout, _without_strangers(columns, scored), scored)
+            made += _layout_tables(benchmark, layout, _without_foreign(columns, scored), scored)
     failed = [r for r in records if r.error is not None]
     if failed:
         rows = tuple((_name(r), r.error or "") for r in failed)
@@ -83,8 +83,8 @@ def _layout_tables(
     return [Table(title, ("variant", *header), means, f"{note} {layout.note}".strip()), detail]
 
 
-def _without_strangers(columns: Sequence[Column], records: Sequence[Record]) -> list[Column]:
-    """Columns without published figures that say nothing of these scenes and variants."""
+def _without_foreign(columns: Sequence[Column], records: Sequence[Record]) -> list[Column]:
+    """The columns, without published figures where none is of these scenes and variants."""
     rows = {name for record in records for name in (record.scene, record.variant)}
     return [
         replace(column, published=None)

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from geogs.application.viewer.guarded_server import GuardedServer
 from geogs.evaluation.model_view.start_view import FIELD, StartView
-from geogs.evaluation.pages.keyframe_layers import LAYERS, Layer
+from geogs.evaluation.pages.run_pictures import LAYERS, Layer
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.io.writers.exports.mesh_writers import ONE_SIDED, glb

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from geogs.application.viewer.browser_window import Window, reduced
 from geogs.application.viewer.observer import RunObserver
 from geogs.evaluation.held_camera import level_axes
-from geogs.evaluation.pages.keyframe_layers import layer_picture
+from geogs.evaluation.pages.run_pictures import layer_picture
 from geogs.geometry.camera import Camera
 from geogs.types import Frame, MapSnapshot
 

@@ -9,7 +9,7 @@ from geogs.application.results.saved_result import SavedResult
 from geogs.application.viewer.browser_window import Window, reduced
 from geogs.errors import InputError
 from geogs.evaluation.model_view.levelling import facets
-from geogs.evaluation.pages.keyframe_layers import layer_picture
+from geogs.evaluation.pages.run_pictures import layer_picture
 
 MAX_FRUSTA = 24
 """Most keyframes shown, evenly along the path."""

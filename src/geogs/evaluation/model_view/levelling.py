@@ -13,7 +13,7 @@ FARTHEST = 55.0
 AGREES = 5.0
 """Degrees up to which a surface is called level or upright."""
 LEAST_SHARE = 0.18
-"""Of all area, which has to agree; of a ball 9 % do."""
+"""Part of all area that has to agree; of a ball 9 % do."""
 LEAST_WALLS = 0.25
 """Length of the mean of walls' quadrupled azimuths from which rooms count as rectangular."""
 _STEP, _WIDTH = 2.5, 4.0

@@ -23,16 +23,11 @@ SCRIPTS = (
 """Scripts of the page, in the order in which they run; ``three.min.js`` comes before them."""
 
 
-def _scripts() -> tuple[str, str]:
-    """What runs in the page: the library, and ours."""
-    own = "\n".join(_file(name) for name in SCRIPTS)
-    return _file("three.min.js"), f"(() => {{\n'use strict';\n{own}\n}})();"
-
-
 def model_section(model: ShownModel) -> tuple[str, tuple[str, str]]:
     """HTML of the model, and the scripts in it; it needs nothing from elsewhere, and one page holds
     one of them."""
-    scripts = _scripts()
+    own = "\n".join(_file(name) for name in SCRIPTS)
+    scripts = _file("three.min.js"), f"(() => {{\n'use strict';\n{own}\n}})();"
     scene, arrays, images = pack(model)
     notes = " ".join(model.notes)
     below = f"<p class=note>{html.escape(notes)}</p>" if notes else ""

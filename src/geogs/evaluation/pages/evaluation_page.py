@@ -75,12 +75,12 @@ def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:
         if errors is not None:
             trajectory += _trajectory_rows(name, errors)
     result.append(("Trajectory", trajectory))
-    told = evaluation.reliability
-    if told is not None:
+    reliability = evaluation.reliability
+    if reliability is not None:
         rows = [
-            ("frames within 2 sigma (%)", f"{100 * told.within_two_sigma:.1f}"),
-            ("  error / sigma, RMS", f"{told.error_per_sigma:.2f}"),
-            ("  frames compared", f"{len(told.error)}"),
+            ("frames within 2 sigma (%)", f"{100 * reliability.within_two_sigma:.1f}"),
+            ("  error / sigma, RMS", f"{reliability.error_per_sigma:.2f}"),
+            ("  frames compared", f"{len(reliability.error)}"),
         ]
         result.append(("What the run said of its positions", rows))
     return result

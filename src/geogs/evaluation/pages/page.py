@@ -60,7 +60,7 @@ class HtmlSection:
 
     html: str
     scripts: Sequence[str] = ()
-    """Those in it that may run, as they stand between their tags."""
+    """Scripts in it that may run, as they stand between their tags."""
 
 
 Section = TableSection | PictureSection | TextSection | FiguresSection | HtmlSection
@@ -103,7 +103,7 @@ def write_page(
 
 
 def _policy(scripts: Sequence[str]) -> str:
-    """That a page loads nothing from anywhere, and runs these scripts and none that text brings."""
+    """Content security policy: nothing is loaded, and no script runs but these."""
     digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
     allowed = [f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests]
     policy = (

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from geogs.evaluation.held_camera import level_axes
-from geogs.evaluation.pages.shading import Sight, Viewpoint, look
+from geogs.evaluation.pages.shading import Viewpoint, look
 from geogs.evaluation.reliability import Reliability
 from geogs.evaluation.surfaces.surface_errors import SurfaceComparison
 from geogs.evaluation.trajectory_errors import TrajectoryErrors
@@ -18,7 +18,6 @@ from geogs.io.writers.atomic import atomic_file
 from geogs.threads import thread_map
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _TRUTH, _ESTIMATE = "0.45", "#0072b2"
@@ -36,15 +35,20 @@ def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
     truth = (errors.truth[:, :3, 3] - origin) @ axes.T
     estimate = (errors.aligned[:, :3, 3] - origin) @ axes.T
     plots = []
-    for column, (name, vertical) in enumerate((("from above", 1), ("from the side", 2))):
+    sides = ("from above", "forward", 1), ("from the side", "up", 2)
+    for column, (name, upwards, vertical) in enumerate(sides):
         plot = figure.add_subplot(1, 2, column + 1)
         plot.plot(truth[:, 0], truth[:, vertical], color=_TRUTH, lw=2.5, label="truth")
         x, y, colour = estimate[:, 0], estimate[:, vertical], 100 * errors.position_error
         dots = plot.scatter(x, y, 7, colour, cmap="plasma", label="estimate", zorder=3)
-        _finish_map(plot, name, "m")
+        plot.set_aspect("equal", adjustable="datalim")
+        plot.set(title=name, xlabel="right (m)", ylabel=f"{upwards} (m)")
+        plot.grid(alpha=0.3)
+        plot.legend(loc="best")
         plots.append(plot)
     figure.colorbar(dots, ax=plots, label="position error (cm)", shrink=0.8)
-    _save_maps(figure, path)
+    figure.draw_without_rendering()  # settles the limits, whose tick labels then need room
+    save_figure(figure, path)
 
 
 def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
@@ -73,13 +77,13 @@ def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
     save_figure(figure, path)
 
 
-def plot_reliability(path: Path, told: Reliability) -> None:
-    """Reliability diagram: parts of the frames that lie as near as foretold, for all such parts."""
+def plot_reliability(path: Path, reliability: Reliability) -> None:
+    """Reliability diagram: observed over predicted fractions of the frames."""
     figure = new_figure(5.2, 4.6)
     plot = figure.add_subplot(1, 1, 1)
-    foretold = np.linspace(0, 1, 201)
+    predicted = np.linspace(0, 1, 201)
     plot.plot([0, 1], [0, 1], color=_TRUTH, ls="--", lw=1, label="as foretold")
-    plot.plot(foretold, told.observed(foretold), color=_ESTIMATE, lw=2, label="observed")
+    plot.plot(predicted, reliability.observed(predicted), color=_ESTIMATE, lw=2, label="observed")
     plot.text(0.03, 0.8, "above the line: errors smaller than said", color=_TRUTH)
     plot.text(0.97, 0.2, "below: larger", color=_TRUTH, ha="right")
     plot.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
@@ -89,55 +93,38 @@ def plot_reliability(path: Path, told: Reliability) -> None:
     save_figure(figure, path)
 
 
-def plot_meshes(
-    path: Path,
-    rows: Sequence[
-        tuple[
-            str,
-            Float[np.ndarray, "n 3"],
-            Int[np.ndarray, "m 3"],
-            UInt8[np.ndarray, "n 3"] | None,
-        ]
-    ],
-    views: Sequence[Viewpoint],
-    error_limit_cm: float | None = None,
-) -> None:
-    """Shaded meshes, one row each (name, vertices, faces, vertex colours), one column a view.
+def plot_beside_truth(path: Path, compared: SurfaceComparison, views: Sequence[Viewpoint]) -> None:
+    """A shaded mesh, the truth if that is one, and the mesh in the colours of its error.
 
-    With ``error_limit_cm`` a colour bar says what the colours of :func:`error_colours` mean.
+    Each is a row, with a column for each view.
     """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    mesh, truth = compared.mesh, compared.truth
+    sights = thread_map(partial(look, mesh.vertices, mesh.faces), views)
+    rows = [("reconstruction", [sight.paint() for sight in sights])]
+    if truth is not None and truth.is_mesh:
+        true_sights = thread_map(partial(look, truth.vertices, truth.faces), views)
+        rows.append(("truth", [sight.paint() for sight in true_sights]))
+    colours = error_colours(mesh.vertices, compared)
+    rows.append(("its error", [sight.paint(colours) for sight in sights]))
     camera = views[0].camera
     figure = new_figure(4.2 * len(views), 0.5 + 4.2 * camera.height / camera.width * len(rows))
     plots = []
-    sights: list[Sight] = []
-    for row, (name, vertices, faces, colours) in enumerate(rows):
-        if row == 0 or vertices is not rows[row - 1][1] or faces is not rows[row - 1][2]:
-            sights = thread_map(partial(look, vertices, faces), views)
-        for column, view in enumerate(views):
+    for row, (name, pictures) in enumerate(rows):
+        for column, (view, picture) in enumerate(zip(views, pictures, strict=True)):
             plot = figure.add_subplot(len(rows), len(views), row * len(views) + column + 1)
-            plot.imshow(sights[column].paint(colours))
+            plot.imshow(picture)
             plot.set(xticks=[], yticks=[])
             if row == 0:
                 plot.set_title(view.name)
             if column == 0:
                 plot.set_ylabel(name)
             plots.append(plot)
-    if error_limit_cm is not None:
-        _colour_bar(figure, plots, _ERROR_MAP, (0.0, error_limit_cm), "distance to the truth (cm)")
+    scale = ScalarMappable(Normalize(0.0, compared.scores.colour_limit_cm), _ERROR_MAP)
+    figure.colorbar(scale, ax=plots, label="distance to the truth (cm)", shrink=0.6, pad=0.01)
     save_figure(figure, path)
-
-
-def plot_beside_truth(path: Path, compared: SurfaceComparison, views: Sequence[Viewpoint]) -> None:
-    """A mesh, the truth if that is one, and the mesh in the colours of its error."""
-    mesh, truth = compared.mesh, compared.truth
-    colours = error_colours(mesh.vertices, compared)
-    rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
-        ("reconstruction", mesh.vertices, mesh.faces, None),
-        ("its error", mesh.vertices, mesh.faces, colours),
-    ]
-    if truth is not None and truth.is_mesh:
-        rows.insert(1, ("truth", truth.vertices, truth.faces, None))
-    plot_meshes(path, rows, views, compared.scores.colour_limit_cm)
 
 
 def error_colours(
@@ -170,31 +157,6 @@ def new_figure(width: float, height: float) -> "Figure":
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def _colour_bar(
-    figure: "Figure", plots: list["Axes"], colours: str, span: tuple[float, float], label: str
-) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    scale = ScalarMappable(Normalize(*span), colours)
-    figure.colorbar(scale, ax=plots, label=label, shrink=0.6, pad=0.01)
-
-
-def _finish_map(plot: "Axes", name: str, unit: str) -> None:
-    plot.set_aspect("equal", adjustable="datalim")
-    plot.set_title(name)
-    plot.set_xlabel(f"right ({unit})")
-    plot.set_ylabel(f"{'forward' if 'above' in name else 'up'} ({unit})")
-    plot.grid(alpha=0.3)
-    plot.legend(loc="best")
-
-
-def _save_maps(figure: "Figure", path: Path) -> None:
-    """Save plots of equal scale: drawing settles their limits, whose tick labels then need room."""
-    figure.draw_without_rendering()
-    save_figure(figure, path)
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -9,7 +10,11 @@ from jaxtyping import Bool, Float, UInt8
 
 from geogs.evaluation.held_camera import level_axes
 from geogs.io.writers.atomic import atomic_file
-from geogs.types import Trajectory
+from geogs.types import RenderedKeyframe, Trajectory
+
+Layer = Literal["image", "depth", "normal", "confidence"]
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+"""What is known of a keyframe, pixel by pixel."""
 
 _INK, _GRID, _PATH, _LOST = (60, 60, 60), (225, 225, 225), (0, 114, 178), (213, 94, 0)
 _CELL, _GAP, _HEAD, _BAR = 420, 6, 28, 90
@@ -29,7 +34,7 @@ def draw_path(path: Path, trajectory: Trajectory) -> None:
         path_panel(points[:, [0, vertical]], ~trajectory.tracked, name, upwards)
         for name, upwards, vertical in names
     ]
-    _save(path, np.hstack(panels))
+    save_picture(path, np.hstack(panels))
 
 
 def path_panel(
@@ -105,7 +110,7 @@ def draw_keyframes(
     for column, title in enumerate(("image", "depth", "normals")):
         _write(picture, title, (column * (_CELL + _GAP) + 4, 19), 0.5)
     _depth_bar(picture[:, width + 10 :], float(low), float(high))
-    _save(path, picture)
+    save_picture(path, picture)
 
 
 def depth_colours(
@@ -126,6 +131,30 @@ def normal_colours(
     is_known = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
     colours = (255 * (0.5 + 0.5 * normal * [1, -1, -1]).clip(0, 1)).round().astype(np.uint8)
     return np.where(is_known, colours, np.uint8(background))
+
+
+def layer_picture(keyframe: RenderedKeyframe, layer: Layer) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture of one layer, RGB; black where nothing is known.
+
+    Depth goes from blue, near, to red, far (1st to 99th percentile); normals show x, y, z of the
+    camera as red, green, blue, what faces the camera being bright blue; confidence goes to white.
+    """
+    match layer:
+        case "image":
+            if keyframe.image is None:
+                return np.zeros((*keyframe.depth.shape, 3), np.uint8)
+            return keyframe.image
+        case "depth":
+            depth = keyframe.depth.cpu().numpy()
+            known = depth[np.isfinite(depth) & (depth > 0)]
+            low, high = np.quantile(known, [0.01, 0.99]) if len(known) else (0.0, 1.0)
+            return depth_colours(depth, float(low), float(high), background=0)
+        case "normal":
+            return normal_colours(keyframe.normal.cpu().numpy(), background=0)
+        case "confidence":
+            weight = keyframe.weight.cpu().numpy()
+            grey = (255 * weight.clip(0, 1)).round().astype(np.uint8)
+            return np.repeat(grey[..., None], 3, -1)
 
 
 def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> None:
@@ -165,8 +194,8 @@ def _write(
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
 
 
-def _save(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a picture as PNG, completely or not at all."""
+def save_picture(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write a picture (RGB) as PNG, completely or not at all."""
     data = cv2.imencode(".png", picture[..., ::-1])[1]
     with atomic_file(path) as stream:
         stream.write(data.tobytes())

@@ -72,8 +72,8 @@ def look(
     corners, smooth = faces[face[hit]], creased(vertices, faces)
     points = vertices @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
     ray = fine.rays().numpy()[hit].astype(np.float64)
-    share = _shares(points[corners], depth[hit][:, None] * ray)
-    normal = (share[:, :, None] * smooth.normals[smooth.faces[face[hit]]]).sum(1)
+    weights = _barycentric(points[corners], depth[hit][:, None] * ray)
+    normal = (weights[:, :, None] * smooth.normals[smooth.faces[face[hit]]]).sum(1)
     normal = normal @ view.T_cw[:3, :3].T
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-300
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -81,10 +81,10 @@ def look(
     return Sight(hit, corners, light)
 
 
-def _shares(
+def _barycentric(
     corners: Float[np.ndarray, "k 3 3"], points: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Of the corners of triangles in points of these: their barycentric coordinates."""
+    """Barycentric coordinates of points of triangles."""
     a, b, c = (corners[:, i] for i in range(3))
     area = np.cross(b - a, c - a)
     whole = (area * area).sum(1) + 1e-300

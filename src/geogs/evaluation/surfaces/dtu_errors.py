@@ -128,7 +128,7 @@ def evaluate_dtu(mesh: Surface, reference: DtuReference, seed: int = 0) -> Surfa
     scan = reference.points[above]
     d2s = cKDTree(reference.points).query(data, workers=-1)[0]
     s2d = cKDTree(points).query(scan, workers=-1)[0]
-    return SurfaceErrors(_scores(d2s, s2d), data, d2s, scan, s2d)
+    return SurfaceErrors(_scores(d2s, s2d), data, d2s)
 
 
 def _scores(d2s: Float[np.ndarray, "n"], s2d: Float[np.ndarray, "m"]) -> DtuScores:

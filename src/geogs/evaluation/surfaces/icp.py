@@ -11,11 +11,7 @@ from geogs.geometry.umeyama import umeyama
 _REACH, _ITERATIONS, _TOLERANCE = 0.1, 30, 1e-6
 
 
-def icp(
-    points: Float[np.ndarray, "n 3"],
-    target: SurfaceDistance,
-    iterations: int = _ITERATIONS,
-) -> Float[np.ndarray, "4 4"]:
+def icp(points: Float[np.ndarray, "n 3"], target: SurfaceDistance) -> Float[np.ndarray, "4 4"]:
     """Rigid motion of ``points`` onto ``target`` from the identity.
 
     Partners are the nearest surface points within 0.1 m. Distances along the normals
@@ -25,7 +21,7 @@ def icp(
     returned.
     """
     T, fitness, rmse = np.eye(4), 0.0, 0.0
-    for _ in range(iterations):
+    for _ in range(_ITERATIONS):
         moved = points @ T[:3, :3].T + T[:3, 3]
         distance, closest, normal = target.nearest(moved)
         near = distance < _REACH

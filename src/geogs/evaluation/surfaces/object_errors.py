@@ -115,7 +115,7 @@ def evaluate_object(
     accuracy = _distances(to_truth, points)
     completeness = _distances(to_result, true_points)
     scores = _scores(accuracy, completeness, threshold, outside)
-    return SurfaceErrors(scores, points, accuracy, true_points, completeness)
+    return SurfaceErrors(scores, points, accuracy)
 
 
 def _distances(tree: TriangleTree, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

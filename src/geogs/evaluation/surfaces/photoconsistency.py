@@ -14,6 +14,8 @@ from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread, thread_map
 
 _LEAST_ANGLE, _BEST_ANGLE, _MOST_ANGLE = 4.0, 12.0, 30.0
+_NEIGHBOURS, _WINDOW = 4, 9
+"""Most neighbours of a view; side of the correlation window, pixels, odd."""
 _TEXTURE = 4.0
 _OCCLUSION = 0.005
 _NOISE = 1.0
@@ -81,8 +83,6 @@ def evaluate_photoconsistency(
     camera: Camera,
     views: Sequence[EvaluatedPhoto],
     held_out: Sequence[int],
-    neighbours: int = 4,
-    window: int = 9,
 ) -> PhotoScores:
     """How well a mesh explains held-out photographs by others, without any true surface.
 
@@ -107,13 +107,11 @@ def evaluate_photoconsistency(
         camera: of all views.
         views: photographs with true poses.
         held_out: which of them to measure in; the neighbours may be any.
-        neighbours: most neighbours of a view.
-        window: side of the window, odd.
 
     Raises:
         InputError: no view has a neighbour, or there is no textured pixel.
     """
-    pairs = {r: choose_neighbours(r, [v.T_cw for v in views], neighbours) for r in held_out}
+    pairs = {r: choose_neighbours(r, [v.T_cw for v in views], _NEIGHBOURS) for r in held_out}
     pairs = {r: near for r, near in pairs.items() if near}
     if not pairs:
         raise InputError(
@@ -124,10 +122,8 @@ def evaluate_photoconsistency(
     depths = dict(
         zip(needed, thread_map(lambda i: _depth(mesh, camera, views[i]), needed), strict=True)
     )
-    agreements = thread_map(
-        lambda r: _agreement(r, pairs[r], views, depths, camera, window), sorted(pairs)
-    )
-    return _scores(agreements, camera, window)
+    agreements = thread_map(lambda r: _agreement(r, pairs[r], views, depths, camera), sorted(pairs))
+    return _scores(agreements, camera)
 
 
 def choose_neighbours(r: int, T_cw: Sequence[Float[np.ndarray, "4 4"]], most: int) -> list[int]:
@@ -167,7 +163,6 @@ def _agreement(
     views: Sequence[EvaluatedPhoto],
     depths: dict[int, Float32[np.ndarray, "h w"]],
     camera: Camera,
-    window: int,
 ) -> _Agreement:
     view, depth = views[r], depths[r]
     grey = _grey(view.image)
@@ -179,14 +174,14 @@ def _agreement(
         place, z = _transfer(depth, known, camera, view.T_cw, views[t].T_cw)
         visible = known & _visible(place, z, depths[t])
         warped = cv2.remap(_grey(views[t].image), place[..., 0], place[..., 1], cv2.INTER_LINEAR)
-        ncc = _ncc(grey, warped, visible, window)
+        ncc = _ncc(grey, warped, visible)
         use = visible & np.isfinite(ncc)
         total[use] += ncc[use]
         count[use] += 1
         covered |= visible
     ncc = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    mean = cv2.blur(grey, (window, window))
-    variance = cv2.blur(grey * grey, (window, window)) - mean * mean
+    mean = cv2.blur(grey, (_WINDOW, _WINDOW))
+    variance = cv2.blur(grey * grey, (_WINDOW, _WINDOW)) - mean * mean
     return _Agreement(ncc, covered, mask & (variance > _TEXTURE**2), mask, len(near))
 
 
@@ -230,18 +225,19 @@ def _ncc(
     a: Float32[np.ndarray, "h w"],
     b: Float32[np.ndarray, "h w"],
     valid: Bool[np.ndarray, "h w"],
-    window: int,
 ) -> Float32[np.ndarray, "h w"]:
     """Normalised cross-correlation over the valid part of each window; NaN where that is small."""
     weight = valid.astype(np.float64)
     # About zero, so that the differences of squares keep their digits.
     a, b = (a.astype(np.float64) - 128) * weight, (b.astype(np.float64) - 128) * weight
 
-    def mean(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        box = cv2.boxFilter(values, -1, (window, window), borderType=cv2.BORDER_CONSTANT)
-        return box / np.maximum(fraction, 1e-9)
+    def box(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return cv2.boxFilter(values, -1, (_WINDOW, _WINDOW), borderType=cv2.BORDER_CONSTANT)
 
-    fraction = cv2.boxFilter(weight, -1, (window, window), borderType=cv2.BORDER_CONSTANT)
+    def mean(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return box(values) / np.maximum(fraction, 1e-9)
+
+    fraction = box(weight)
     mean_a, mean_b = mean(a), mean(b)
     covariance = mean(a * b) - mean_a * mean_b
     variances = [np.maximum(mean(x * x) - m * m, 0) for x, m in ((a, mean_a), (b, mean_b))]
@@ -249,7 +245,7 @@ def _ncc(
     return np.where(fraction >= 0.5, ncc, np.nan).astype(np.float32)
 
 
-def _scores(agreements: Sequence[_Agreement], camera: Camera, window: int) -> PhotoScores:
+def _scores(agreements: Sequence[_Agreement], camera: Camera) -> PhotoScores:
     textured = np.concatenate([a.ncc[a.textured] for a in agreements])
     in_masks = sum(int(a.mask.sum()) for a in agreements)
     if not len(textured):
@@ -264,6 +260,6 @@ def _scores(agreements: Sequence[_Agreement], camera: Camera, window: int) -> Ph
         views=len(agreements),
         pairs=sum(a.pairs for a in agreements),
         textured=100 * len(textured) / in_masks,
-        window=window,
+        window=_WINDOW,
         width=camera.width,
     )

@@ -82,10 +82,10 @@ def evaluate_reconstruction(
     it; and culling acts on samples, not on whole triangles.
     :mod:`geogs.evaluation.surfaces.toolbox` has the scripts' own ways.
 
-    ``truth`` answers accuracy; ``truth_points``, where given (say, only what the camera saw),
-    completeness. With ``visibility`` the samples of the truth are limited to what the camera saw
-    (and, with ``cull_reconstruction``, those of the reconstruction to the region it saw). With
-    ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
+    Accuracy is measured against ``truth``, completeness on ``truth_points`` where given (say, only
+    what the camera saw). With ``visibility`` the samples of the truth are limited to what the
+    camera saw (and, with ``cull_reconstruction``, those of the reconstruction to the region it
+    saw). With ``use_icp`` a rigid motion by ICP (0.1 m) is applied first, as those scripts do.
     """
     rng = np.random.default_rng(seed)
     if not reconstruction.is_mesh or not reconstruction.areas.sum() > 0:
@@ -104,7 +104,7 @@ def evaluate_reconstruction(
     accuracy = to_truth(points)
     completeness = SurfaceDistance(reconstruction)(reference)
     scores = surface_scores(accuracy, completeness, threshold, shift)
-    return SurfaceErrors(scores, points, accuracy, reference, completeness)
+    return SurfaceErrors(scores, points, accuracy)
 
 
 def _reference_samples(

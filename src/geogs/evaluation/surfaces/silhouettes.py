@@ -29,10 +29,9 @@ class Silhouette:
     T_cw: Float[np.ndarray, "4 4"]
     """World to camera."""
 
-    def dilated(self, pixels: float | None = None) -> "Silhouette":
-        """Widened by a disk of this radius; by 24 pixels of an image 1600 wide if none is given."""
-        radius = DILATION * self.camera.width / FULL_WIDTH if pixels is None else pixels
-        return replace(self, mask=dilate(self.mask, radius))
+    def dilated(self) -> "Silhouette":
+        """Widened by a disk of 24 pixels of an image 1600 wide, as DTU's protocol does."""
+        return replace(self, mask=dilate(self.mask, DILATION * self.camera.width / FULL_WIDTH))
 
 
 def dilate(mask: Bool[np.ndarray, "h w"], radius: float) -> Bool[np.ndarray, "h w"]:

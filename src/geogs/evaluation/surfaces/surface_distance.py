@@ -19,8 +19,7 @@ class SurfaceDistance:
         from scipy.spatial import cKDTree
 
         self._surface = surface
-        self._triangles = TriangleTree(surface) if surface.is_mesh else None
-        self._points = None if surface.is_mesh else cKDTree(surface.vertices)
+        self._tree = TriangleTree(surface) if surface.is_mesh else cKDTree(surface.vertices)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Unsigned distances in the unit of the points."""
@@ -31,11 +30,10 @@ class SurfaceDistance:
     ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None]:
         """Distances, nearest surface points and, for a mesh, the normals there."""
         surface = self._surface
-        if self._triangles is None:
-            assert self._points is not None
-            distance, index = self._points.query(points, workers=-1)
+        if not isinstance(self._tree, TriangleTree):
+            distance, index = self._tree.query(points, workers=-1)
             return distance, surface.vertices[index], None
-        distance, face = self._triangles.nearest(points)
+        distance, face = self._tree.nearest(points)
         corners = (surface.vertices[surface.faces[face, i]] for i in range(3))
         return distance, closest_point_on_triangle(points, *corners), surface.face_normals[face]
 

@@ -35,15 +35,12 @@ S_co = TypeVar("S_co", bound=SurfaceScores, covariant=True)
 
 @dataclass(frozen=True)
 class SurfaceErrors(Generic[S_co]):
-    """Scores with the points they come from, in the unit and the frame of the truth."""
+    """Scores, and errors of the reconstruction's points, in the unit and the frame of the truth."""
 
     scores: S_co
     reconstruction_points: Float[np.ndarray, "n 3"]
     accuracy: Float[np.ndarray, "n"]
     """Distance of each to the truth; inf where it is left out."""
-    truth_points: Float[np.ndarray, "m 3"]
-    completeness: Float[np.ndarray, "m"]
-    """Distance of each to the reconstruction; inf where it is left out."""
 
 
 @dataclass(frozen=True)

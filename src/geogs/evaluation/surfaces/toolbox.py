@@ -127,6 +127,4 @@ def _errors(
     accuracy = cKDTree(true_targets).query(points, workers=-1)[0]
     completeness = cKDTree(targets).query(true_points, workers=-1)[0]
     scores = surface_scores(accuracy, completeness, threshold, shift)
-    return SurfaceErrors(
-        replace(scores, protocol=protocol), points, accuracy, true_points, completeness
-    )
+    return SurfaceErrors(replace(scores, protocol=protocol), points, accuracy)

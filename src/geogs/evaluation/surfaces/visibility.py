@@ -12,33 +12,26 @@ from geogs.geometry.camera import Camera
 
 CullingRule = Literal["frustum", "occlusion"]
 
+_TOLERANCE = 0.03
+"""Metres behind the occluder's depth up to which a point is seen."""
+_LONG_EDGE = 320
+"""Pixels of the depth maps, at most."""
+
 
 class Visibility:
     """Frustum and occlusion test against depth maps of an occluding mesh.
 
     A point is seen by a view if it projects into the image in front of the camera and lies at
-    most ``tolerance`` behind the occluder's depth there (the rule of Neural RGB-D and GO-Surf,
-    which use 0.03 m). For a reconstruction the same rule leaves out what lies outside all frusta
-    or hidden behind the true surface; what stands in seen free space stays, and counts as error.
+    most 3 cm behind the occluder's depth there (the rule of Neural RGB-D and GO-Surf). For a
+    reconstruction the same rule leaves out what lies outside all frusta or hidden behind the true
+    surface; what stands in seen free space stays, and counts as error.
     """
 
-    def __init__(
-        self,
-        occluder: Surface,
-        camera: Camera,
-        T_cw: Float[np.ndarray, "v 4 4"],
-        tolerance: float = 0.03,
-        long_edge: int = 320,
-    ) -> None:
-        """``T_cw`` are the world-to-camera poses to use, in the occluder's frame.
-
-        Depth maps are made at ``long_edge`` pixels, or the camera's own size if that is smaller.
-        """
-        self._camera = camera
-        if max(camera.width, camera.height) > long_edge:
-            self._camera = camera.with_long_edge(long_edge)
+    def __init__(self, occluder: Surface, camera: Camera, T_cw: Float[np.ndarray, "v 4 4"]) -> None:
+        """``T_cw`` are the world-to-camera poses to use, in the occluder's frame."""
+        is_large = camera.long_edge > _LONG_EDGE
+        self._camera = camera.with_long_edge(_LONG_EDGE) if is_large else camera
         self._T_cw = T_cw
-        self._tolerance = tolerance
         self._depths = [
             render_mesh(occluder.vertices, occluder.faces, self._camera, T)[0].astype(np.float32)
             for T in T_cw
@@ -55,7 +48,7 @@ class Visibility:
             inside = (z > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
             surface = np.full(len(rest), -np.inf, np.float32)
             surface[inside] = depth[v[inside].astype(int), u[inside].astype(int)]
-            result[rest] = z <= surface + self._tolerance
+            result[rest] = z <= surface + _TOLERANCE
         return result
 
 

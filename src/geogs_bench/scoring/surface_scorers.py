@@ -1,4 +1,4 @@
-"""Judges of meshes that are in the truth's frame already: of a room, an object, a DTU scan."""
+"""Scorers of meshes that are in the truth's frame already: of a room, an object, a DTU scan."""
 
 from collections.abc import Callable
 
@@ -23,29 +23,29 @@ from geogs_bench.results.record import SurfaceScore
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.room_scores import read_true_surface, score_surface
 
-Judge = Callable[[Surface], tuple[tuple[SurfaceScore, ...], SurfaceComparison]]
+SurfaceScorer = Callable[[Surface], tuple[tuple[SurfaceScore, ...], SurfaceComparison]]
 """Scores of a mesh (the one to plot last) and where it is wrong."""
 
 _MASK_EDGE = 1600
 """Pixels; DTU's masks are of this size."""
 
 
-def judge_of(scene: BenchmarkScene, result: ResultFolder, seed: int) -> Judge | None:
-    """The judge for a scene, its truth read once; none where the scene has no true surface.
+def surface_scorer(scene: BenchmarkScene, result: ResultFolder, seed: int) -> SurfaceScorer | None:
+    """The scorer of a scene, its truth read once; none where the scene has no true surface.
 
     Raises:
         InputError: the truth cannot be read.
     """
     if scene.kind == "scan":
-        return None if scene.truth.dtu is None else _scan_judge(scene, seed)
+        return None if scene.truth.dtu is None else _scan_scorer(scene, seed)
     if scene.truth.surface is None:
         return None
     if scene.kind == "object":
-        return _object_judge(scene, seed)
-    return _room_judge(scene, result, seed)
+        return _object_scorer(scene, seed)
+    return _room_scorer(scene, result, seed)
 
 
-def _room_judge(scene: BenchmarkScene, result: ResultFolder, seed: int) -> Judge:
+def _room_scorer(scene: BenchmarkScene, result: ResultFolder, seed: int) -> SurfaceScorer:
     poses = read_true_poses(scene)
     if poses is None:
         raise InputError(f"{scene.name} has no true poses, which say what its camera saw.")
@@ -54,34 +54,34 @@ def _room_judge(scene: BenchmarkScene, result: ResultFolder, seed: int) -> Judge
     return lambda mesh: score_surface(mesh, truth, False, seed)
 
 
-def _object_judge(scene: BenchmarkScene, seed: int) -> Judge:
+def _object_scorer(scene: BenchmarkScene, seed: int) -> SurfaceScorer:
     assert scene.truth.surface is not None  # the caller has looked
     truth = read_surface(scene.truth.surface)
     points = None if scene.truth.points is None else read_surface(scene.truth.points)
     masks = _masks(scene)
 
-    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
+    def score(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
         found = evaluate_object(mesh, truth, masks, points, seed=seed)
         distance = np.minimum(found.accuracy, MAX_DISTANCE)  # those left out are infinite
         compared_at = found.reconstruction_points
         comparison = SurfaceComparison(found.scores, mesh, truth, compared_at, distance)
         return (_of_object(found.scores),), comparison
 
-    return judge
+    return score
 
 
-def _scan_judge(scene: BenchmarkScene, seed: int) -> Judge:
+def _scan_scorer(scene: BenchmarkScene, seed: int) -> SurfaceScorer:
     assert scene.truth.dtu is not None  # the caller has looked
     reference = read_dtu_reference(scene.truth.dtu.folder, scene.truth.dtu.scan)
     masks = _masks(scene)
 
-    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
+    def score(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], SurfaceComparison]:
         found = evaluate_dtu(cull_by_masks(mesh, masks), reference, seed)
         points, distance = found.reconstruction_points, found.accuracy / 1000
         comparison = SurfaceComparison(found.scores, mesh, None, points, distance)
         return (_of_scan(found.scores),), comparison
 
-    return judge
+    return score
 
 
 def _masks(scene: BenchmarkScene) -> list[Silhouette]:
