@@ -9,8 +9,7 @@ from geogs.config import Config
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.mapping import view_arrays
-from geogs.mapping.dense_depths import get_depth
-from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.view_arrays import MapCameras, get_depth
 from geogs.world.arrays import ArrayTable
 from geogs.world.cell_depths import MeasuredCells
 from geogs.world.map import ViewRow

@@ -7,7 +7,7 @@ import torch
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
-from geogs.mapping.view_arrays import sure_jumps
+from geogs.mapping.view_arrays import confident_jumps
 from geogs.splat.density import spread_candidates, unexplained, worth_keeping
 from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
 from geogs.splat.render import render
@@ -49,7 +49,7 @@ class DiskGrowth:
         output = render(disks, camera, view.T_cw)
         needed = unexplained(output, depth, confidence) & (confidence >= min_confidence)
         v, u, spacing = spread_candidates(
-            needed, sure_jumps(view.dense).around(config.stride), config.stride,
+            needed, confident_jumps(view.dense).around(config.stride), config.stride,
             config.edge_stride, self.table.random.of_torch,
         )  # fmt: skip
         z = depth[v, u]

@@ -12,9 +12,9 @@ from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision.segment_planes import planar_depth
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.dense_depths import get_depth, put_depth
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
+from geogs.mapping.view_arrays import get_depth, put_depth
 from geogs.on_demand import OnDemand
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.threads import ordered_map, worker_count
@@ -34,8 +34,8 @@ class KeyframeDepths:
         self,
         engine: DepthEngine,
         views: KeyframeViews,
-        sensor: DepthSensorConfig | None = None,
-        bare_planes: bool = False,
+        sensor: DepthSensorConfig | None,
+        bare_planes: bool,
     ) -> None:
         """With ``bare_planes``, bare segments lie on planes where a depth is unsure."""
         self.engine = engine

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 
 from geogs.depth.depth_view import ViewPose
+from geogs.depth.sweep_neighbors import RANGE_MARGIN
 from geogs.geometry.camera import Camera
 from geogs.mapping.keyframe_views import MapView
 from geogs.world.map import DepthSearch
@@ -44,12 +45,12 @@ def depth_search(
 
 
 def expect_depths(
-    views: Iterable[MapView], points: Float64[np.ndarray, "n 3"], camera: Camera, margin: float
+    views: Iterable[MapView], points: Float64[np.ndarray, "n 3"], camera: Camera
 ) -> None:
     """Let every view's depth be searched where these points say; its grid counts for nothing."""
     points = points[:: 1 + len(points) // _MOST_POINTS]
     for view in views:
-        view.row.search = depth_search(view.place, points, camera, margin)
+        view.row.search = depth_search(view.place, points, camera, RANGE_MARGIN)
 
 
 def dense_points(

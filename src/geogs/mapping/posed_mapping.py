@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 
 from geogs.config import SearchConfig
-from geogs.depth.sweep_neighbors import RANGE_MARGIN
 from geogs.mapping import known_poses as known
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.map_all import group_size, search_depths, spread_order
@@ -55,13 +54,13 @@ class PosedMapping:
         """
         search, mapper, budget = self._search, self._mapper, self._budget
         camera = mapper.cameras.working
-        known.expect_depths(mapper.views.values(), points, camera, RANGE_MARGIN)
+        known.expect_depths(mapper.views.values(), points, camera)
         part = 0.5 if search.repeat else 1.0
         if more is not None and budget.training_end is not None:
             searched, seconds = self._try_depths()
             more(lambda: budget.further_views(search, searched, seconds))
             new = [v for v in mapper.views.values() if v.row.search is None]
-            known.expect_depths(new, points, camera, RANGE_MARGIN)
+            known.expect_depths(new, points, camera)
         ids = [*mapper.views] if in_order else spread_order([*mapper.views])
         wanted = budget.views or len(ids)
         start, end, before = time.perf_counter(), budget.training_end, len(mapper.table.mapped)
@@ -78,7 +77,7 @@ class PosedMapping:
             mapper.check_depths()
             found = known.dense_points(views, mapper.cameras.render, self._random)
             if len(found) >= known.FEWEST_POINTS:
-                known.expect_depths(views, found, camera, RANGE_MARGIN)
+                known.expect_depths(views, found, camera)
             search_depths(mapper, mapped, lambda f: progress(part + part * f))
         budget.views = len(mapper.table.mapped)
         progress(1.0)

@@ -105,7 +105,7 @@ def rendered_surface(
     camera: Camera,
     T_cw: Float[Tensor, "4 4"],
     rules: SurfaceRules,
-    mask: Bool[Tensor, "h w"] | None = None,
+    mask: Bool[Tensor, "h w"] | None,
 ) -> SurfaceMaps:
     """Disks seen from a pose inside a mask, with the weight of each depth for fusion."""
     output = render(disks, camera, T_cw)

@@ -15,11 +15,11 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import DepthJumps, depth_jumps
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
-from geogs.mapping.dense_depths import get_depth, put_depth
 from geogs.mapping.read_ahead import Basis, ReadAhead
+from geogs.world.arrays import ArrayTable
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from geogs.world.lru import LruCache
-from geogs.world.map import MapTable
+from geogs.world.map import MapTable, SearchedDepth
 
 DEPTHS_ON_GPU = 512
 """Most depths that a GPU keeps of views that are not in use, as bringing one there takes longer
@@ -66,7 +66,7 @@ class LoadedView:
     is_render_written: bool = True
 
 
-SURE = 0.5
+CONFIDENT = 0.5
 """Least confidence of depths whose jumps count as edges."""
 
 
@@ -244,7 +244,7 @@ class ViewArrays:
         """Depth, its weight in L_d, and normals: a prior's, else those that came with the depth."""
         is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
         weight = depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
-        at_edges = sure_jumps(depth).around(self.loss.edge_reach)
+        at_edges = confident_jumps(depth).around(self.loss.edge_reach)
         prior = depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE)
         return (
             prior if depth.sky is None else torch.where(depth.sky, OUTSIDE, prior),
@@ -253,9 +253,43 @@ class ViewArrays:
         )
 
 
-def sure_jumps(depth: DenseDepth) -> DepthJumps:
+def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> SearchedDepth:
+    """Write the depth of a keyframe that has a scale now.
+
+    Raises:
+        OutputError: the disk is full, or cannot be written.
+    """
+    maps = depth.arrays()
+    arrays.put("depth", id, maps.depth)
+    arrays.put("confidence", id, maps.confidence)
+    # Nobody measures with the normals.
+    normal = None if depth.normal is None else depth.normal.half()
+    for name, values in (("depth normal", normal), ("sky", depth.sky)):
+        if values is None:
+            arrays.drop(name, id)
+        else:
+            arrays.put(name, id, values.cpu().numpy())
+    return SearchedDepth(depth.typical, scale)
+
+
+def get_depth(
+    arrays: ArrayTable, id: int, stored: SearchedDepth, scale: float, device: torch.device
+) -> DenseDepth:
+    """Read the depth of a keyframe at another scale of it."""
+    depth, confidence = (torch.from_numpy(arrays.load(n, id)) for n in ("depth", "confidence"))
+    if scale != stored.scale:
+        depth = depth * (scale / stored.scale)
+    normal, sky = arrays.get("depth normal", id), arrays.get("sky", id)
+    return DenseDepth(
+        depth.to(device), confidence.to(device), torch.tensor(stored.typical_at(scale)),
+        normal=None if normal is None else torch.from_numpy(normal).float().to(device),
+        sky=None if sky is None else torch.from_numpy(sky).to(device),
+    )  # fmt: skip
+
+
+def confident_jumps(depth: DenseDepth) -> DepthJumps:
     """Jumps between depths that are known fairly well."""
-    return depth_jumps(torch.where(depth.confidence >= SURE, depth.depth, 0.0))
+    return depth_jumps(torch.where(depth.confidence >= CONFIDENT, depth.depth, 0.0))
 
 
 def _shrunk_normal(
