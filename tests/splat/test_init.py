@@ -77,7 +77,7 @@ def test_scale_is_cut_where_there_is_no_plane():
 def test_edge_on_normals_are_leaned_towards_the_camera():
     normal = torch.tensor([[1.0, 0, 0], [-0.6, 0, -0.8]])
     to_camera = torch.tensor([[0.0, 0, -1], [0, 0, -1]])
-    leaned = face_camera(normal, to_camera, 0.15)
+    leaned = face_camera(normal, to_camera)
     assert (leaned * to_camera).sum(-1).min() > 0.14
     assert torch.allclose(leaned[1], normal[1])
 

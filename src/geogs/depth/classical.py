@@ -64,19 +64,16 @@ class CpuDepthEngine:
         from geogs.depth.carve import vote
         from geogs.splat.cpu.in_view import disks_in_view
 
-        if not 0 < len(depths) <= _FEW_VIEWS:
-            # One view after the other, so that not all are in memory at once.
-            views = ((d.T_cw, d.depth.through_sky().arrays()) for d in depths)
-            return torch.from_numpy(vote(points.detach().numpy(), views, self.render))
-        posed = list(depths)
-        poses = torch.from_numpy(np.stack([d.T_cw for d in posed]))
-        # No view has a say on the others, which may be most of a large map.
-        seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
+        seen = torch.ones(len(points), dtype=torch.bool)
+        # Many views are read one after the other, so that not all are in memory at once.
+        if 0 < len(depths) <= _FEW_VIEWS:
+            depths = list(depths)
+            poses = torch.from_numpy(np.stack([d.T_cw for d in depths]))
+            # No view has a say on the others, which may be most of a large map.
+            seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
         kept = torch.ones_like(seen)
-        if bool(seen.any()):
-            some = points.detach()[seen].numpy()
-            views = ((d.T_cw, d.depth.through_sky().arrays()) for d in posed)
-            kept[seen] = torch.from_numpy(vote(some, views, self.render))
+        views = ((d.T_cw, d.depth.through_sky().arrays()) for d in depths)
+        kept[seen] = torch.from_numpy(vote(points.detach()[seen].numpy(), views, self.render))
         return kept
 
     def photo_costs(

@@ -100,11 +100,10 @@ class DenseDepth:
 
     def within(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
         """Nothing known outside the mask; the median is that of the inside."""
-        inside = self.depth[mask]
-        median = inside.median().cpu() if len(inside) else self.median
-        confidence = torch.where(mask, self.confidence, 0.0)
-        written = None if len(inside) else self.written
-        return replace(self, confidence=confidence, median=median, written=written)
+        inside, confidence = self.depth[mask], torch.where(mask, self.confidence, 0.0)
+        if not len(inside):
+            return replace(self, confidence=confidence)
+        return replace(self, confidence=confidence, median=inside.median().cpu(), written=None)
 
     def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
         """Nothing known in the mask, and no normals anywhere: of bare walls the network's are worse

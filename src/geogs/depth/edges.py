@@ -53,7 +53,7 @@ def resolve_edges(
     """
     maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
     f, planes = np.float32, sweep.planes
-    spacing = (planes[-1] - planes[0]) / f(max(len(planes) - 1, 1))
+    spacing = (planes[-1] - planes[0]) / f(len(planes) - 1)
     settings = [f(x) for x in (CONTRAST, APART, WIDTH, COST_TRUST)]
     for _ in range(PASSES):
         old, maps = maps, [np.empty_like(m) for m in maps]

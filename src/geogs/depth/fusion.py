@@ -53,8 +53,6 @@ def check_depth(
     point violate it, since they see free space where it stands. Meant to be called once per
     estimate: votes counted twice raise the confidence too far.
     """
-    if not others:
-        return depth
     T_wc = np.linalg.inv(T_cw)
     depth = _repair(depth, T_wc, others, other_poses, camera)
     points = depth.depth.reshape(-1, 1) * camera.rays().numpy().reshape(-1, 3)

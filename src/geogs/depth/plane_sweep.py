@@ -63,21 +63,20 @@ def sweep_planes(
 ) -> Float32[np.ndarray, "p"]:
     """At most so many inverse depths, and at least ``LEAST_PART`` of them, equally spaced.
 
-    The median neighbour moves ``PLANE_STEP`` from one to the next.
+    The median of the neighbours, of which there must be one, moves ``PLANE_STEP`` from one to the
+    next.
     """
     pixels = np.array([[x, y] for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)])
     pixels = pixels * [camera.width, camera.height] - [camera.cx, camera.cy]
     rays = np.concatenate([pixels / [camera.fx, camera.fy], np.ones((len(pixels), 1))], 1)
-    shifts = [0.0]
-    if neighbours:
-        relative = relative_poses(reference, neighbours)
-        rotated = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
-        ends = [rotated + relative[:, None, :3, 3] / z for z in (near, far)]
-        seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
-        p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
-        moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
-        shifts += [float(np.median(m[s])) for m, s in zip(moved, seen, strict=True) if s.any()]
-    steps = np.median(shifts[1:] or shifts) / PLANE_STEP
+    relative = relative_poses(reference, neighbours)
+    rotated = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
+    ends = [rotated + relative[:, None, :3, 3] / z for z in (near, far)]
+    seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
+    p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
+    moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
+    shifts = [np.median(m[s]) for m, s in zip(moved, seen, strict=True) if s.any()]
+    steps = np.median(shifts or [0.0]) / PLANE_STEP
     count = int(np.clip(np.ceil(steps), max(2, int(LEAST_PART * most)), most))
     return np.linspace(1.0 / far, 1.0 / near, count, dtype=np.float32)
 

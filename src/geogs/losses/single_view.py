@@ -125,8 +125,6 @@ def gradient_norm(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "h w"]:
     return F.pad((horizontal + vertical).mean(-1), (0, 1, 0, 1))
 
 
-def visible(
-    depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], min_alpha: float = MIN_ALPHA
-) -> Bool[Tensor, "h w"]:
-    """The valid pixels Omega: a finite positive depth seen with more than ``min_alpha``."""
-    return (alpha > min_alpha) & (depth > 0) & torch.isfinite(depth)
+def visible(depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """The valid pixels Omega: a finite positive depth seen with more than ``MIN_ALPHA``."""
+    return (alpha > MIN_ALPHA) & (depth > 0) & torch.isfinite(depth)

@@ -48,7 +48,7 @@ class PlaneSlots:
         rho = np.full(32 * per, -1.0, np.float32)
         rho[:count] = planes
         rho = np.ascontiguousarray(rho.reshape(32, per).T).ravel()
-        spacing = (planes[-1] - planes[0]) / np.float32(max(count - 1, 1))
+        spacing = (planes[-1] - planes[0]) / np.float32(count - 1)
         return PlaneSlots(upload(rho, device), per, count, float(planes[0]), float(spacing))
 
 

@@ -58,23 +58,22 @@ def doubled(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
 
 
 def upsampled(
-    x: Float[Tensor, "b c h w"], logits: Float[Tensor, "b 36 h w"], apart: float = torch.inf
+    x: Float[Tensor, "b c h w"], logits: Float[Tensor, "b 36 h w"], gap: float
 ) -> Float[Tensor, "b c h2 w2"]:
     """Twice the resolution: each fine cell is a convex combination of the nine coarse ones around.
 
     ``logits`` are those of the nine cells, row by row, for each of the four fine cells of a cell.
-    Those whose first number differs by more than ``apart`` from that of the likeliest do not
+    Those whose first number differs by more than ``gap`` from that of the likeliest do not
     count, so that nothing is averaged across an edge.
     """
     b, c, h, w = x.shape
     padded = functional.pad(x, (1, 1, 1, 1), mode="replicate")
     around = [padded[:, :, k // 3 : k // 3 + h, k % 3 : k % 3 + w] for k in range(9)]
     weight = logits.float().unflatten(1, (9, 4)).softmax(1)
-    if apart < torch.inf:
-        first = torch.stack([a[:, :1] for a in around], 1)
-        likeliest = first.expand_as(weight).gather(1, weight.argmax(1, keepdim=True))
-        weight = weight * ((first - likeliest).abs() <= apart)
-        weight = weight / weight.sum(1, keepdim=True)
+    first = torch.stack([a[:, :1] for a in around], 1)
+    likeliest = first.expand_as(weight).gather(1, weight.argmax(1, keepdim=True))
+    weight = weight * ((first - likeliest).abs() <= gap)
+    weight = weight / weight.sum(1, keepdim=True)
     total = x.new_zeros(b, c, 4, h, w)
     for k in range(9):
         total = total + around[k][:, :, None] * weight[:, k, None]
