@@ -13,7 +13,7 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.losses.light import USUAL_NOISE
+from geogs.losses.exposure import USUAL_NOISE
 
 # A point must keep this fraction of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
@@ -101,10 +101,10 @@ class PhotoView:
         """The same image with another pose."""
         return replace(self, T_cw=T_cw)
 
-    def in_light(self, light: Float[Tensor, "3"]) -> "PhotoView":
-        """The same image with its values times a gain plus an offset, which leaves a noise of so
-        much variance."""
-        gain, offset, noise = light
+    def with_exposure(self, exposure: Float[Tensor, "3"]) -> "PhotoView":
+        """The same image with its values times a gain plus an offset, and the variance of the noise
+        that this leaves."""
+        gain, offset, noise = exposure
         colours = None if self.colours is None else gain * self.colours + offset
         texture = self.texture * (gain.square() * self.noise / noise)
         grey = gain * self.grey + offset

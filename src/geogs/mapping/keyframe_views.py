@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, ViewPose, depth_images
 from geogs.depth.revision.bare_segments import bare_segments
 from geogs.geometry.lie import se3_inverse
-from geogs.losses.light import same_light
+from geogs.losses.exposure import identity_exposure
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 from geogs.mapping.view_arrays import ViewArrays
@@ -83,7 +83,7 @@ class MapView:
     def exposure(self) -> Float[Tensor, "3"]:
         """Gain and offset that its photo has had, and the variance of its noise."""
         known = self.row.exposure
-        return same_light(self.arrays.device) if known is None else known
+        return identity_exposure(self.arrays.device) if known is None else known
 
     @property
     def has_depth(self) -> bool:
@@ -143,7 +143,7 @@ class MapView:
         self.row.exposure = exposure
         loaded = self.arrays.loaded.peek(self.id)
         if loaded is not None:
-            loaded.photo = loaded.photo.in_light(exposure)
+            loaded.photo = loaded.photo.with_exposure(exposure)
 
 
 class KeyframeViews(Mapping[int, MapView]):

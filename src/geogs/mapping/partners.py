@@ -12,7 +12,7 @@ from geogs.depth.sweep_neighbors import view_pairs
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
-from geogs.losses.light import noise_between, relative_light, same_light
+from geogs.losses.exposure import identity_exposure, noise_between, relative_exposure
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.world.map import MapTable
 
@@ -82,7 +82,7 @@ def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
     are in them. Gain 1, offset 0 and the usual noise where there is nothing to compare with.
     """
     if not others:
-        return same_light(view.dense.depth.device)
+        return identity_exposure(view.dense.depth.device)
     points, confident = _sparse_points(view)
     (mine, texture), (inside, _) = _sampled(
         torch.stack([view.photo.grey, view.photo.texture]),
@@ -98,7 +98,7 @@ def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
     gain, offset, _ = torch.stack([other.exposure for other in others])[..., None].unbind(1)
     common = (usable & inside & _is_exposed((theirs - offset) / gain)).flatten()
     mine, texture = mine.repeat(len(others)), texture.repeat(len(others))
-    gain, offset = relative_light(mine, theirs.flatten(), common)
+    gain, offset = relative_exposure(mine, theirs.flatten(), common)
     noise = noise_between(gain * mine + offset, theirs.flatten(), texture, common)
     return torch.stack([gain, offset, noise])
 

@@ -178,7 +178,7 @@ class ViewArrays:
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
         )
         if row.exposure is not None:
-            photo = photo.in_light(row.exposure)
+            photo = photo.with_exposure(row.exposure)
         normal = None
         if loss.normal_weight:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)
