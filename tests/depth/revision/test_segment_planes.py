@@ -10,11 +10,11 @@ from geogs.depth.revision import segment_plane_kernels as kernels
 from geogs.depth.revision.bare_segments import LEAST, bare_segments
 from geogs.depth.revision.segment_plane_kernels import PlaneRules, segment_planes
 from geogs.depth.revision.segment_planes import (
-    ALIKE,
     CONFIDENCE,
-    LEAST_SHARE,
+    CORRELATED,
+    MIN_EXPLAINED,
+    MIN_ON_PLANE,
     MOST_PLANES,
-    MOSTLY,
     TOLERANCE,
     on_planes,
     planar_depth,
@@ -169,7 +169,7 @@ def test_normals_are_those_of_the_plane(slopes):
     assert not planar.normal[0, 0].any()
 
 
-RULES = PlaneRules(2, TOLERANCE, LEAST_SHARE, MOSTLY, ALIKE, 40, 750, 4)
+RULES = PlaneRules(2, TOLERANCE, MIN_EXPLAINED, MIN_ON_PLANE, CORRELATED, 40, 750, 4)
 
 
 def slow_planes(x, y, value, weight, rng):
@@ -182,15 +182,15 @@ def slow_planes(x, y, value, weight, rng):
         tried = np.linalg.solve(at[drawn], v[drawn][..., None])[..., 0]
         ons = np.abs(tried @ at.T - v) < TOLERANCE * v
         on = ons[np.argmax((ons * w).sum(1))]
-        for _ in range(RULES.rounds):
+        for _ in range(RULES.refits):
             root = np.sqrt(w[on])
             plane = np.linalg.lstsq(at[on] * root[:, None], v[on] * root, rcond=None)[0]
             fitted, on = on, np.abs(at @ plane - v) < TOLERANCE * v
-        if w[on].sum() < LEAST_SHARE * weight.sum():
+        if w[on].sum() < MIN_EXPLAINED * weight.sum():
             break
         information = (at[fitted] * w[fitted, None]).T @ at[fitted]
         deviation = TOLERANCE / 2 * v[on].mean()
-        planes.append((plane, ALIKE * deviation**2 * np.linalg.inv(information), left[on]))
+        planes.append((plane, CORRELATED * deviation**2 * np.linalg.inv(information), left[on]))
         left = left[~on]
     return planes
 
@@ -230,18 +230,19 @@ def test_rims_and_parts_are_those_of_opencv(seed):
     known = kernels.rim_pixels(labels, 1, boxes[0], 2, sure)
     assert np.array_equal(known, np.flatnonzero(near & sure))
     depth[:, 40:] = 2  # of which the plane is none
-    planes, rules = np.array([[0.0, 0.0, 1.0]]), RULES._replace(least=12)
-    parts, told = np.zeros((2, 60, 80), np.int32)
-    kernels.told_by_rim(labels, 1, boxes[0], unsure, sure, depth, planes, rules, parts, told)
+    planes, rules = np.array([[0.0, 0.0, 1.0]]), RULES._replace(min_pixels=12)
+    parts, marked = np.zeros((2, 60, 80), np.int32)
+    kernels.mark_supported(labels, 1, boxes[0], unsure, sure, depth, planes, rules, parts, marked)
     count, numbers = cv2.connectedComponents((segment & unsure).astype(np.uint8))
     expected = np.zeros((60, 80), bool)
     for number in range(1, count):
         part = numbers == number
         around = (cv2.dilate(part.astype(np.uint8), rim) > 0) & sure
-        if part.sum() >= 12 and (around & (depth == 1)).sum() >= MOSTLY * max(1, around.sum()):
+        least = MIN_ON_PLANE * max(1, around.sum())
+        if part.sum() >= 12 and (around & (depth == 1)).sum() >= least:
             expected |= part
     assert expected.any()
-    assert np.array_equal(told > 0, expected)
+    assert np.array_equal(marked > 0, expected)
 
 
 @pytest.mark.system  # compiles what is kept nowhere by itself
