@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geogs.depth.cuda.photo_vote import light_and_noise
 from geogs.depth.depth_view import DepthView, relative_poses
-from geogs.depth.revision.far_side import APART, as_depth, inverse_planes
+from geogs.depth.revision.far_side import MIN_GAP, as_depth, inverse_planes
 from geogs.depth.revision.photo_vote import CONTRAST, RADIUS
 from geogs.geometry.camera import Camera
 
@@ -104,14 +104,8 @@ def averaged_by_colour(
     return total / weights
 
 
-def farther_surface(
-    depth: Float[Tensor, "h w"], reach: int, apart: float = APART
-) -> Float[Tensor, "h w"]:
-    """Depth of the nearest farther surface within ``reach`` pixels, its plane gone on to the pixel.
-
-    0 where there is none that is farther by ``apart`` of the inverse depth, or it would be farther
-    than all that was found. ``depth`` is positive; inverse depth is linear along a plane.
-    """
+def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
+    """As :func:`geogs.depth.revision.far_side.farther_surface`, all pixels at once."""
     source = inverse_planes(depth)
     inverse, found = source[0], torch.zeros_like(source)
     (height, width), farthest = depth.shape, inverse.amin()
@@ -120,7 +114,7 @@ def farther_surface(
         for dy, dx in _AROUND:
             plane = around[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
             here = plane[0] - dx * plane[1] - dy * plane[2]
-            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - apart) * inverse)
+            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - MIN_GAP) * inverse)
             new = goes_on & (found[0] == 0)
             found = torch.where(new, torch.stack([here, plane[1], plane[2]]), found)
         source = found

@@ -89,10 +89,8 @@ class CpuDepthEngine:
 
         return photo_costs(view, others, depths, same, self.render, asked)
 
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
+    def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""
         from geogs.depth.revision.far_side import farther_surface
 
-        return farther_surface(depth, reach, apart)
+        return farther_surface(depth, reach)

@@ -67,9 +67,7 @@ class DepthEngine(Protocol):
         """How badly the images of the others agree at each of two depths (``photo_costs``)."""
         ...
 
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
+    def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """Depth of the farther surface beside each pixel, or 0 (``farther_surface``)."""
         ...
 

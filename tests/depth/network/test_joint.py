@@ -12,7 +12,7 @@ from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.engine_choice import depth_engine
-from geogs.depth.network.joint import AGREE, APART, REACH, VOTE, joined
+from geogs.depth.network.joint import AGREE, DIFFER, REACH, VOTE, joined
 from geogs.geometry.camera import Camera
 
 
@@ -53,8 +53,8 @@ def test_two_depths_are_joined_as_a_loop_does():
                 score = AGREE[0] * logit(max(c)) + AGREE[1] * logit(min(c)) + AGREE[2]
             else:
                 depth = z[winner]
-                score = APART[0] * logit(c[winner]) + APART[1] * logit(c[1 - winner])
-                score += APART[2] * abs(choice) + APART[3]
+                score = DIFFER[0] * logit(c[winner]) + DIFFER[1] * logit(c[1 - winner])
+                score += DIFFER[2] * abs(choice) + DIFFER[3]
             assert float(found.depth[y, x]) == pytest.approx(depth, rel=1e-4)
             assert float(found.confidence[y, x]) == pytest.approx(
                 1 / (1 + math.exp(-score)), abs=1e-3

@@ -14,7 +14,7 @@ from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision import far_side
-from geogs.depth.revision.far_side import APART, REACH, FarSideSearch
+from geogs.depth.revision.far_side import MIN_GAP, REACH, FarSideSearch
 from geogs.depth.revision.photo_vote import CONTRAST, DEVIATIONS, LEAST_DEVIATION, RADIUS
 from geogs.geometry.camera import Camera
 from oracles.revision_reference import (
@@ -170,11 +170,11 @@ def test_the_same_surfaces_go_on(seed, reach, where, monkeypatch):
     expected = farther_surface(depth, reach)
     if where == "emulated":
         use_emulator(monkeypatch, cuda_far_side)
-        found = cuda_far_side.farther_surface(depth, reach, APART)
+        found = cuda_far_side.farther_surface(depth, reach)
     elif where == "cpu":
-        found = far_side.farther_surface(depth, reach, APART)
+        found = far_side.farther_surface(depth, reach)
     elif torch.cuda.is_available():
-        found = cuda_far_side.farther_surface(depth.cuda(), reach, APART).cpu()
+        found = cuda_far_side.farther_surface(depth.cuda(), reach).cpu()
     else:
         pytest.skip("needs an NVIDIA GPU")
     assert 0.02 < float((expected > 0).float().mean()) < 0.6
@@ -192,7 +192,7 @@ def test_a_farther_plane_goes_on_beneath_the_foreground():
     beneath = (slice(6, -6), slice(15, 20))
     assert found[beneath].numpy() == pytest.approx(floor[beneath].numpy(), rel=1e-4)
     assert not farther_surface(1 / (0.25 + 0.001 * u), 5).any()  # a slanted plane has none
-    assert (found[found > 0] > depth[found > 0] / (1 - 0.9 * APART)).all()
+    assert (found[found > 0] > depth[found > 0] / (1 - 0.9 * MIN_GAP)).all()
 
 
 class _Grown(AlternativeSearch):

@@ -136,11 +136,9 @@ class CudaDepthEngine:
         own, poses = self._images_of(view), relative_poses(view, others)
         return photo_costs(own, images, poses, depths, same, self.render, asked)
 
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
+    def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""
-        return farther_surface(depth, reach, apart)
+        return farther_surface(depth, reach)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""

@@ -10,10 +10,10 @@ from torch import Tensor
 from geogs.depth.cuda.plane_sweep import SweptDepth
 from geogs.depth.cuda.refinement import SlantedMaps
 from geogs.depth.edges import (
-    APART,
     CONTRAST,
     COST_TRUST,
     MEAN_SHIFTS,
+    MIN_GAP,
     MOVED_CONFIDENCE,
     PASSES,
     WIDTH,
@@ -34,7 +34,7 @@ def resolve_edges(
     """As ``geogs.depth.edges.resolve_edges``; ``colours`` is the image in [0, 1]."""
     h, w = confidence.shape
     planes = swept.planes
-    constants = np.array([CONTRAST, APART, WIDTH, COST_TRUST, MOVED_CONFIDENCE], np.float32)
+    constants = np.array([CONTRAST, MIN_GAP, WIDTH, COST_TRUST, MOVED_CONFIDENCE], np.float32)
     settings = upload(constants, confidence.device)
     maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
     for _ in range(PASSES):

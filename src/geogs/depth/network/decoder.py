@@ -19,8 +19,8 @@ from geogs.depth.network.volume import PlaneVolume
 
 MOST_RESIDUAL = 1.0
 """Steps between planes by which a depth may be moved away from what was chosen."""
-APART = 0.04
-"""Relative distance of depths from which on they are of two surfaces, and not averaged."""
+SURFACE_GAP = 0.04
+"""Relative difference above which depths are of two surfaces, and not averaged."""
 _ABOUT = 5
 """Numbers beside the scores of the depths tried at 1/2."""
 LEAST_LOG_SCALE, MOST_LOG_SCALE = -6.5, 0.0
@@ -98,7 +98,7 @@ class DepthReadout(nn.Module):
         to_half = self.to_half(features)
         with torch.autocast(features.device.type, enabled=False):
             modes = plane_modes(logits, log_planes)
-            coarse = upsampled(modes.first[:, None], to_half, APART)
+            coarse = upsampled(modes.first[:, None], to_half, SURFACE_GAP)
             tried, about = close_depths(modes, coarse[:, 0], step)
             found = self.close(fine[:, 0], fine[:, 1:], views, tried)
         local = coarse - functional.avg_pool2d(coarse, 5, 1, 2, count_include_pad=False)
@@ -149,7 +149,7 @@ class DepthReadout(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             normal = facing(tilt[:, :3] + bent, rays)
             numbers = torch.cat([at_half[:, None], raw, normal, tilt[:, 3:]], 1)
-            return upsampled(numbers, to_full, APART)
+            return upsampled(numbers, to_full, SURFACE_GAP)
 
 
 def bounded(raw: Tensor) -> Tensor:
