@@ -82,12 +82,12 @@ class CpuDepthEngine:
         others: Sequence[DepthView],
         depths: Float[Tensor, "2 h w"],
         same: Bool[Tensor, "h w"],
-        asked: Bool[Tensor, "h w"] | None = None,
+        mask: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, "2 h w"]:
         """As in the protocol."""
         from geogs.depth.revision.photo_vote import photo_costs
 
-        return photo_costs(view, others, depths, same, self.render, asked)
+        return photo_costs(view, others, depths, same, self.render, mask)
 
     def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""

@@ -63,10 +63,10 @@ def splat_depth(points, confidence, rotation, translation, lens, least, depth, w
 
 
 @njit(**_FAST)
-def agree_on_depth(depths, weights, asked, reach, clearance, penalty, best, score):
-    """The best of several depths of each pixel that is ``asked`` about, 0 being none, as elsewhere.
+def agree_on_depth(depths, weights, mask, reach, clearance, penalty, best, score):
+    """The best of several depths of each pixel in a ``mask``; 0 is none, as outside the mask.
 
-    depths, weights (n, h, w); asked (h, w). A depth's score is the sum of weights of those near it
+    depths, weights (n, h, w); mask (h, w). A depth's score is the sum of weights of those near it
     (Gaussian, relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of
     it.
     """
@@ -75,7 +75,7 @@ def agree_on_depth(depths, weights, asked, reach, clearance, penalty, best, scor
     for y in range(h):
         for x in range(w):
             top, winner = np.float32(0.0), np.float32(0.0)
-            for j in range(n if asked[y, x] else 0):
+            for j in range(n if mask[y, x] else 0):
                 d = depths[j, y, x]
                 if d <= np.float32(0.0):
                     continue

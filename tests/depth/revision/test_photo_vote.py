@@ -106,7 +106,7 @@ def test_the_images_speak_for_the_true_depth():
 
 
 def asked_of(scene):
-    """Two depths of each pixel, where they are the same, and where something is asked."""
+    """Two depths of each pixel, where they are the same, and a mask of where they differ."""
     depth = torch.from_numpy(scene.truth[0]).clone()
     depth[20:40, 30:60] *= 0.8
     depth[:, :4] = 0
@@ -119,15 +119,15 @@ def asked_of(scene):
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_compiled_loops_say_the_same(everywhere):
     scene = make_scene()
-    depths, same, asked = asked_of(scene)
-    views, asked = (scene.views[0], scene.views[1:]), None if everywhere else asked
-    expected = photo_costs(*views, depths, same, RENDER, asked)
-    found = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, asked)
+    depths, same, mask = asked_of(scene)
+    views, mask = (scene.views[0], scene.views[1:]), None if everywhere else mask
+    expected = photo_costs(*views, depths, same, RENDER, mask)
+    found = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, mask)
     assert float((expected[0] - expected[1]).abs().max()) > 0.3
     assert float((found - expected).abs().max()) < 2e-3
     if not everywhere:
         assert not found[:, ~(depths[0] != depths[1])].any()
-    again = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, asked)
+    again = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, mask)
     assert torch.equal(found, again)  # whatever was in memory
 
 
@@ -140,12 +140,12 @@ def test_a_gpu_says_the_same(device, everywhere, monkeypatch):
     elif not torch.cuda.is_available():
         pytest.skip("needs an NVIDIA GPU")
     scene = make_scene()
-    depths, same, asked = asked_of(scene)
-    views, asked = (scene.views[0], scene.views[1:]), None if everywhere else asked
-    expected = photo_costs(*views, depths, same, RENDER, asked)
+    depths, same, mask = asked_of(scene)
+    views, mask = (scene.views[0], scene.views[1:]), None if everywhere else mask
+    expected = photo_costs(*views, depths, same, RENDER, mask)
     engine = CudaDepthEngine(torch.device(device), RENDER, WORKING, 128, 8)
-    asked = None if asked is None else asked.to(device)
-    found = engine.photo_costs(*views, depths.to(device), same.to(device), asked)
+    mask = None if mask is None else mask.to(device)
+    found = engine.photo_costs(*views, depths.to(device), same.to(device), mask)
     assert float((found.cpu() - expected).abs().max()) < 2e-3
 
 

@@ -128,13 +128,13 @@ class CudaDepthEngine:
         others: Sequence[DepthView],
         depths: Float[Tensor, "2 h w"],
         same: Bool[Tensor, "h w"],
-        asked: Bool[Tensor, "h w"] | None = None,
+        mask: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, "2 h w"]:
         """As in the protocol; at most 16 others are used."""
         others = others[:MAX_NEIGHBOURS]
         images = [self._images_of(v) for v in others]
         own, poses = self._images_of(view), relative_poses(view, others)
-        return photo_costs(own, images, poses, depths, same, self.render, asked)
+        return photo_costs(own, images, poses, depths, same, self.render, mask)
 
     def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""
