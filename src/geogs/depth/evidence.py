@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.depth.completion import CompletedDepth, upsample_grid
+from geogs.depth.grid_completion import CompletedDepth, upsample_grid
 from geogs.depth.plane_sweep import SweepResult
 from geogs.geometry.camera import Camera
 

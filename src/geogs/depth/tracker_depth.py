@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from geogs.depth.completion import known_cells, upsample_grid
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
+from geogs.depth.grid_completion import known_cells, upsample_grid
 from geogs.geometry.camera import Camera
 
 VALID_DEVIATION = 0.3

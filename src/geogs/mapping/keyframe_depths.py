@@ -10,7 +10,7 @@ from geogs.config import DepthSensorConfig
 from geogs.depth.depth_engine import DepthEngine, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision.segment_planes import planar_depth
-from geogs.depth.sensor import joined
+from geogs.depth.sensor_fusion import fused_with_sensor
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
@@ -114,14 +114,14 @@ class KeyframeDepths:
         return list(ordered_map(one, pairs, worker_count()))
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
-        """The searched depth, joined with what a sensor measured where it did."""
+        """The searched depth, fused_with_sensor with what a sensor measured where it did."""
         keyframe, render = view.keyframe, self.views.arrays.cameras.render
         if keyframe.measured is None or (metres := keyframe.sensor_depth) is None:
             return searched
         found = sensor_depth(metres, self.sensor).resized(render.width, render.height)
         inverse_depth, information = found.tensors(self.views.arrays.device)
         scale = keyframe.scale
-        return joined(searched, inverse_depth / scale, information * scale**2)
+        return fused_with_sensor(searched, inverse_depth / scale, information * scale**2)
 
 
 def tracked_depth(keyframe: Keyframe) -> float:

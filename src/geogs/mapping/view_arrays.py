@@ -148,7 +148,7 @@ class ViewArrays:
         keyframe, mask, render = self.keyframes[id], self.mask(id), self.cameras.render
         if keyframe.moving is not None:
             moving = keyframe.grid.enlarged(keyframe.moving, render.width, render.height)
-            depth = depth.unsure_where(moving)
+            depth = depth.unknown_in(moving)
         if mask is not None:
             depth = depth.within(mask)
         loaded = self.loaded.peek(id)

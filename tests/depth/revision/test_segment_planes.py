@@ -7,7 +7,7 @@ import torch
 
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.depth.revision import segment_plane_kernels as kernels
-from geogs.depth.revision.bare_segments import LEAST, bare_segments
+from geogs.depth.revision.bare_segments import MIN_AREA, bare_segments
 from geogs.depth.revision.segment_plane_kernels import PlaneRules, segment_planes
 from geogs.depth.revision.segment_planes import (
     CONFIDENCE,
@@ -66,7 +66,7 @@ def test_bare_parts_are_found_at_any_size():
         assert (found[24:96, 34:126] == 1).all()
         assert not found[~bare].any()
     small = box(70, 77, 50, 57)
-    assert small.sum() < LEAST * small.size
+    assert small.sum() < MIN_AREA * small.size
     assert not bare_segments(image_with(small)).any()
 
 

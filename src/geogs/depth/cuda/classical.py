@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from geogs.depth.completion import complete_grid, edge_weights, known_cells
-from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.edges import resolve_edges
 from geogs.depth.cuda.far_side import farther_surface
 from geogs.depth.cuda.fusion import check, vote
+from geogs.depth.cuda.grid_completion import can_complete, complete
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
 from geogs.depth.cuda.photo_vote import photo_costs
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
@@ -29,6 +28,7 @@ from geogs.depth.depth_view import (
     relative_poses,
 )
 from geogs.depth.evidence import prior_weight, relative_precision
+from geogs.depth.grid_completion import complete_grid, edge_weights, known_cells
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera

@@ -12,7 +12,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.completion import known_cells
 from geogs.depth.depth_engine import (
     AlternativeSearch,
     DepthEngine,
@@ -22,6 +21,7 @@ from geogs.depth.depth_engine import (
     silent,
 )
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths, relative_poses
+from geogs.depth.grid_completion import known_cells
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
