@@ -1,6 +1,6 @@
 """Keyframe depths by matching and fusion without a network, on the CPU.
 
-What is compiled is imported by the first keyframe that needs it, long after the first frame.
+Compiled code is imported by the first keyframe that needs it, long after the first frame.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ _FEW_VIEWS = 128
 
 
 class CpuDepthEngine:
-    """The compiled CPU loops; keyframes, and the rows of one, are worked on side by side."""
+    """The compiled loops; keyframes, and the rows of each, are processed in parallel."""
 
     def __init__(self, render: Camera, working: Camera, planes: int) -> None:
-        """At most so many ``planes`` are swept."""
+        """``planes`` is the largest number of planes of a sweep."""
         self.render = render
         self.working = working
         self.planes = planes

@@ -1,4 +1,4 @@
-"""What the depths of other keyframes say to the depth of one."""
+"""The check of a keyframe's depth by those of other keyframes."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ _SUPPORT = 0.72
 _VIOLATION = -0.92
 
 WEIGHTS = (_BIAS, _OWN, _SUPPORT, _VIOLATION)
-"""All of them, for the CUDA kernel."""
+"""The four for the CUDA kernel."""
 SPLAT_CONFIDENCE = 0.5
 """Confidence from which pixels of other keyframes repair this one."""
 
@@ -31,7 +31,7 @@ VIOLATION_DISTANCE = 0.05
 REPAIR_BELOW = 0.4
 """Confidence below which a pixel takes the depth that others agree on."""
 REPAIR_VOTES = 1.0
-"""Sum of the others' confidences needed for that: more than one says it."""
+"""Sum of the others' confidences needed for that, so that more than one agrees."""
 REPAIR_CONFIDENCE = 0.3
 """Confidence of such a pixel before the others' votes are counted."""
 OCCLUSION_PENALTY = 0.7
@@ -80,7 +80,7 @@ def _repair(
     other_poses: Sequence[Float64[np.ndarray, "4 4"]],
     camera: Camera,
 ) -> KeyframeDepth:
-    """Pixels of low confidence replaced by what the confident ones of other views show there."""
+    """The depth with pixels of low confidence replaced by confident ones of other views."""
     shape = (len(others), *depth.depth.shape)
     seen, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     rays = camera.rays().numpy().reshape(-1, 3)
