@@ -1,4 +1,4 @@
-"""Keyframe depths on the GPU that holds the map."""
+"""The classical search on the GPU that holds the map."""
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -42,7 +42,7 @@ _BATCH = 32
 
 @dataclass(frozen=True, eq=False)
 class SearchPlan:
-    """What the CPU works out before a keyframe's depth is searched."""
+    """Input of a keyframe's search that the CPU computes."""
 
     grids: Float32[np.ndarray, "3 gh gw"]
     """The tracker's inverse depth, its information, and the weights of smoothness."""

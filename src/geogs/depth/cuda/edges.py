@@ -1,4 +1,4 @@
-"""The test at depth edges of ``edges.py`` on a GPU."""
+"""The edge-aware correction of ``edges.py`` on a GPU."""
 
 from pathlib import Path
 

@@ -49,10 +49,7 @@ def vote(
     depths: Sequence[PosedDepth],
     camera: Camera,
 ) -> Bool[Tensor, "n"]:
-    """World points that do not stand in the free space of the views (``carve.vote``).
-
-    Not all depths are on the GPU at once.
-    """
+    """World points outside the free space of the views (``carve.vote``), some views at a time."""
     device = points.device
     keep = torch.empty(len(points), dtype=torch.bool, device=device)
     votes = torch.zeros(len(points), 2, dtype=torch.int32, device=device)
@@ -104,4 +101,4 @@ CHECK = CheckSettings(
     fusion.AVERAGE_REACH, fusion.AGREEMENT_REACH, fusion.VIOLATION_DISTANCE, fusion.REPAIR_BELOW,
     fusion.REPAIR_VOTES, fusion.REPAIR_CONFIDENCE, fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
 )  # fmt: skip
-"""Those of the check, and the weights of its logistic regression."""
+"""Constants of the check, and the weights of its logistic regression."""

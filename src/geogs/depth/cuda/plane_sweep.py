@@ -17,7 +17,7 @@ MATCHING = Path(__file__).with_name("matching.cu")
 AGGREGATION = Path(__file__).with_name("aggregation.cu")
 
 MAX_PLANES = 256
-"""More than that do not fit the registers of a warp."""
+"""Most planes that fit into the registers of a warp."""
 MAX_NEIGHBOURS = 16
 _PLANES_PER_LANE = (1, 3, 4, 5, 8)
 _TILE_W, _TILE_H, _SLOT_GROUP = 32, 8, 8
@@ -61,7 +61,7 @@ class SweptDepth:
     margin: Float32[Tensor, "h w"]
     planes: PlaneSlots
     costs: Float32[Tensor, "h w s"]
-    """By slot."""
+    """One value a slot."""
 
 
 def match_planes(

@@ -37,7 +37,7 @@ SOURCE = Path(__file__).with_name("refinement.cu")
 
 @dataclass(frozen=True, eq=False)
 class PixelPositions:
-    """Where render pixels lie on the tracker's grid, and their patch samples in the fine image."""
+    """Positions of render pixels on the tracker's grid, and of patch samples in the fine image."""
 
     grid_columns: Float32[Tensor, "w"]
     grid_rows: Float32[Tensor, "h"]
@@ -46,7 +46,7 @@ class PixelPositions:
 
     @staticmethod
     def of(render: Camera, working: Camera, device: torch.device) -> "PixelPositions":
-        """Those of two sizes of a camera."""
+        """Positions for two sizes of a camera."""
         reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)[:, None]
         u = (np.arange(render.width) - render.cx + reach) * (working.fx / render.fx) + working.cx
         v = (np.arange(render.height) - render.cy + reach) * (working.fy / render.fy) + working.cy
@@ -57,7 +57,7 @@ class PixelPositions:
 
 @dataclass(frozen=True, eq=False)
 class TrackerMaps:
-    """What the tracker knows, at the render size."""
+    """``TrackerEvidence`` on the device."""
 
     inverse_depth: Float32[Tensor, "h w"]
     prior_weight: Float32[Tensor, "h w"]
@@ -88,7 +88,7 @@ class SlantedMaps:
 
 
 def choose_start(tracker: TrackerMaps, swept: SweptDepth) -> tuple[Tensor, Tensor]:
-    """The inverse depth to refine, and how much each pixel counts in the first plane fits."""
+    """As ``evidence.choose_start``."""
     rho, confidence = torch.empty_like(swept.cost), torch.empty_like(swept.cost)
     kernels_for(SOURCE, rho.device)["choose_start"](
         -(-rho.numel() // 256), 256, tracker.inverse_depth, tracker.prior_weight,
@@ -120,7 +120,7 @@ def photometric_step(
 ) -> tuple[Tensor, Tensor]:
     """Move ``state`` one step, averaged with the tracker; returns precision and plane weight.
 
-    Of the samples of a patch ``every`` so many-th is compared.
+    Every ``every``-th sample of a patch is compared.
     """
     h, w = state.inverse_depth.shape
     data, precision, confidence = (torch.empty_like(state.inverse_depth) for _ in range(3))
@@ -189,14 +189,14 @@ def judge(
     near: float,
     far: float,
 ) -> Float32[Tensor, "h w"]:
-    """Hold the inverse depth within half of 1 / ``far`` and twice 1 / ``near``; its confidence."""
+    """Clamp inverse depth to 0.5 / ``far`` and 2 / ``near``; returns its confidence."""
     h, w = margin.shape
-    held, confidence = torch.empty_like(margin), torch.empty_like(margin)
+    bounded, confidence = torch.empty_like(margin), torch.empty_like(margin)
     weights = upload(np.array(WEIGHTS, np.float32), margin.device)
     kernels_for(SOURCE, margin.device)["judge_depth"](
         (-(-w // 32), -(-h // 4)), (32, 4), refined.inverse_depth, margin, refined.support,
-        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, held,
+        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, bounded,
         confidence,
     )  # fmt: skip
-    refined.inverse_depth = held
+    refined.inverse_depth = bounded
     return confidence

@@ -1,4 +1,4 @@
-"""The classical search and the network: both where they agree, else the one the images back."""
+"""The classical search and the network: their mean where they agree, else one by the images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ _BOUND = 0.02
 
 
 class JointDepthEngine(AlternativeSearch):
-    """Searches with both engines, and takes of each what it knows; normals are the network's."""
+    """Searches with both engines and joins their depths; normals are the network's."""
 
     def __init__(self, network: DepthEngine, classical: DepthEngine) -> None:
         super().__init__(classical)
@@ -54,10 +54,10 @@ def agreement(first: DenseDepth, second: DenseDepth) -> Bool[Tensor, "h w"]:
 def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) -> DenseDepth:
     """One depth of two; normals are the second's.
 
-    Where they agree it is the mean of their logarithms, weighted by the squared precision of normal
-    errors that are below 2 % with the chance that the confidences say; elsewhere that which the
-    ``vote`` of the images makes likelier: how much less the second costs by ``photo_costs``.
-    Squared, because the most confident are more precise than a chance tells.
+    Where they agree it is the mean of their logarithms, weighted by the squared precision of a
+    normal error that is below 2 % with the chance of their confidence: squared, as the most
+    confident are more precise than that. Elsewhere it is the likelier one by the ``vote`` of the
+    images, the first one's ``photo_costs`` less the second's.
     """
     confidence = torch.stack([first.confidence, second.confidence])
     logs = torch.stack([first.depth, second.depth]).log()

@@ -1,4 +1,4 @@
-"""Convolutions that the parts of the depth network are made of."""
+"""Building blocks of the depth network."""
 
 import torch
 from jaxtyping import Float
@@ -7,7 +7,7 @@ from torch.nn import functional
 
 
 class Norm(nn.Module):
-    """Normalises groups of eight channels over the image; stays in the precision of its input."""
+    """Group norm of eight channels each, in the precision of its input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class Norm(nn.Module):
 
 
 class Block(nn.Sequential):
-    """Convolution, norm, ReLU; a kernel of even size halves the resolution, cell on cell."""
+    """Convolution, norm, ReLU; a kernel of even size halves the resolution, aligned to cells."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
         stride = 1 if kernel % 2 else 2
@@ -53,7 +53,7 @@ class Residual(nn.Module):
 
 
 def doubled(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
-    """Bilinear, cell on cells."""
+    """Twice the resolution, bilinear, aligned to cells."""
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
