@@ -1,4 +1,4 @@
-"""Disks that come and go: added where depths show more than the map, dropped in free space."""
+"""Growth of the map: disks added where depths show more than the map, dropped in free space."""
 
 from collections.abc import Sequence
 
@@ -13,12 +13,12 @@ from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
 from geogs.splat.render import render
 from geogs.world.map import MapTable
 
-# Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
+# Nearest keyframes that vote on a keyframe's disks.
 _VOTERS = 96
 
 
 class DiskGrowth:
-    """Adds disks to a map and drops them, as the depths of its keyframes say."""
+    """Adds disks to a map, and drops them, by the depths of its keyframes."""
 
     def __init__(self, table: MapTable, depths: KeyframeDepths, config: MappingConfig) -> None:
         self.table = table
@@ -26,7 +26,7 @@ class DiskGrowth:
         self.config = config
 
     def voters(self, view: MapView) -> list[MapView]:
-        """The mapped keyframes whose votes on what a view shows count."""
+        """The mapped keyframes that vote on the surface of a view."""
         return self.depths.views.near(view, self.table.mapped, _VOTERS)
 
     def carve(self, views: Sequence[MapView]) -> None:

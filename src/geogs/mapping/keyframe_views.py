@@ -1,4 +1,4 @@
-"""Keyframes as mapping sees them: what losses and depth search ask of each."""
+"""Keyframes as mapping sees them: images, depths and constants for losses and depth search."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from geogs.world.keyframes import Keyframe
 from geogs.world.map import ViewRow
 
 UNKNOWN = 1e3
-"""Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""
+"""Relative deviation of a depth that nobody measured."""
 
 
 @dataclass(eq=False)
 class MapView:
-    """A keyframe with its row of the map's table, and what losses and depth search ask of it."""
+    """A keyframe with its row of the map's table, as losses and depth search need it."""
 
     id: int
     row: ViewRow
@@ -31,7 +31,7 @@ class MapView:
 
     @property
     def keyframe(self) -> Keyframe:
-        """Which has pose and scale."""
+        """The keyframe, with its pose and scale."""
         return self.arrays.keyframes[self.id]
 
     @property
@@ -45,8 +45,8 @@ class MapView:
         return se3_inverse(self.T_cw)
 
     @property
-    def place(self) -> ViewPose:
-        """Where it was taken."""
+    def view_pose(self) -> ViewPose:
+        """Its id and pose."""
         return ViewPose(self.id, self.T_cw.numpy())
 
     @property
@@ -56,12 +56,14 @@ class MapView:
 
     @property
     def depth_view(self) -> DepthView:
-        """What the depth estimation needs."""
+        """The view for the depth estimation."""
         loaded = self.arrays.load(self.id)
         inverse_depth, information = self.keyframe.depth_field()
         if loaded.matched is None:
             loaded.matched = depth_images(loaded.image, self.arrays.cameras.render)
-        if (search := self.row.search) is not None:  # the grid says what is usual, and hardly that
+        if (
+            search := self.row.search
+        ) is not None:  # no tracker: the typical depth, hardly weighted
             inverse_depth = np.full_like(inverse_depth, 1.0 / search.typical)
             information = np.full_like(information, (search.typical / UNKNOWN) ** 2)
         return DepthView(
@@ -76,12 +78,12 @@ class MapView:
 
     @property
     def photo(self) -> PhotoView:
-        """What the multi-view losses need."""
+        """The view for the multi-view losses."""
         return self.arrays.load(self.id).photo.at(self.T_cw)
 
     @property
     def exposure(self) -> Float[Tensor, "3"]:
-        """Gain and offset that its photo has had, and the variance of its noise."""
+        """Gain and offset applied to its photo, and the variance of its noise."""
         known = self.row.exposure
         return identity_exposure(self.arrays.device) if known is None else known
 
@@ -93,12 +95,12 @@ class MapView:
 
     @property
     def dense(self) -> DenseDepth:
-        """The dense depth, where there must be one; what is not in memory stays where it is."""
+        """The dense depth, which there must be; read from the file if it is not in memory."""
         return self.arrays.depth(self.id)
 
     @property
     def posed(self) -> PosedDepth:
-        """The dense depth with the view's pose, where there must be one."""
+        """The dense depth, which there must be, with the view's pose."""
         return PosedDepth(self.T_cw.numpy(), self.dense)
 
     @property
@@ -111,12 +113,12 @@ class MapView:
 
     @property
     def constants(self) -> ViewConstants | None:
-        """What the single-view losses need; None until the keyframe has a depth."""
+        """Constants of the single-view losses; None until the keyframe has a depth."""
         return self.arrays.constants(self.id)
 
     @property
     def known(self) -> ViewConstants:
-        """The losses' constants, where there must be a depth."""
+        """The ``constants`` of a keyframe that has a depth."""
         constants = self.constants
         assert constants is not None, f"keyframe {self.id} has no depth yet"
         return constants
@@ -135,11 +137,11 @@ class MapView:
             loaded.rendered_depth, loaded.is_render_written = depth, False
 
     def set_depth(self, depth: DenseDepth) -> None:
-        """Take over a dense depth, on which the losses' constants then live."""
+        """Set the dense depth, and the losses' constants that depend on it."""
         self.arrays.set_depth(self.id, depth)
 
     def set_exposure(self, exposure: Float[Tensor, "3"]) -> None:
-        """Compensate its exposure and know its noise, which were not known."""
+        """Set its exposure and noise, which were not known, and compensate its photo."""
         self.row.exposure = exposure
         loaded = self.arrays.loaded.peek(self.id)
         if loaded is not None:
@@ -163,7 +165,7 @@ class KeyframeViews(Mapping[int, MapView]):
         return len(self._views)
 
     def add(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> MapView:
-        """Take up a keyframe; it has no depth outside a mask of the size of its image."""
+        """Add a keyframe; it has no depth outside a mask of the size of its image."""
         if mask is not None:
             self.arrays.put_mask(id, mask)
         row = self.arrays.table.views[id] = ViewRow()
@@ -172,7 +174,7 @@ class KeyframeViews(Mapping[int, MapView]):
         return view
 
     def near(self, view: MapView, ids: Collection[int], count: int) -> list[MapView]:
-        """The ``count`` of the views ``ids`` whose cameras are nearest to one's, which may be among
+        """The ``count`` views of the ``ids`` with the nearest cameras to a view's, which may be one of
         them, in the order of the ``ids``."""
         if len(ids) > count:
             several = np.fromiter(ids, np.int64, len(ids))

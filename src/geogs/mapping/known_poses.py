@@ -50,7 +50,7 @@ def expect_depths(
     """Let every view's depth be searched where these points say; its grid counts for nothing."""
     points = points[:: 1 + len(points) // _MOST_POINTS]
     for view in views:
-        view.row.search = depth_search(view.place, points, camera, RANGE_MARGIN)
+        view.row.search = depth_search(view.view_pose, points, camera, RANGE_MARGIN)
 
 
 def dense_points(
@@ -64,6 +64,6 @@ def dense_points(
         v, u = np.nonzero(depth.confidence >= _CONFIDENT)
         some = random.permutation(len(v))[:_POINTS_PER_VIEW]
         local = rays[v[some], u[some]] * depth.depth[v[some], u[some], None]
-        T_cw = view.place.T_cw
+        T_cw = view.view_pose.T_cw
         points.append((local - T_cw[:3, 3]) @ T_cw[:3, :3])
     return np.concatenate(points) if points else np.empty((0, 3))

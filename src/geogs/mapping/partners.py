@@ -67,8 +67,8 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
     others = [o for o in others if o.id != view.id]
     if not others:
         return []
-    places, camera = [o.place for o in others], view.arrays.cameras.render
-    pairs = view_pairs(view.place, places, view.typical_depth, camera)
+    poses, camera = [o.view_pose for o in others], view.arrays.cameras.render
+    pairs = view_pairs(view.view_pose, poses, view.typical_depth, camera)
     usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG, config.max_view_angle)
     scores = pairs.misfit(BEST_PARALLAX_DEG)
     scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])

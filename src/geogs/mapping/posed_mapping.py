@@ -38,8 +38,8 @@ class PosedMapping:
             mask = views[index].mask
             return views[index].keyframe.image, None if mask is None else mask.cpu().numpy()
 
-        places = [view.place for view in views]
-        return first_points(places, image_at, self._mapper.cameras.working, progress)
+        poses = [view.view_pose for view in views]
+        return first_points(poses, image_at, self._mapper.cameras.working, progress)
 
     def search(
         self,
