@@ -174,8 +174,8 @@ class KeyframeViews(Mapping[int, MapView]):
         return view
 
     def near(self, view: MapView, ids: Collection[int], count: int) -> list[MapView]:
-        """The ``count`` views of the ``ids`` with the nearest cameras to a view's, which may be one of
-        them, in the order of the ``ids``."""
+        """The ``count`` views among ``ids`` nearest to a view's camera, in the order of ``ids``;
+        the view may be one of them."""
         if len(ids) > count:
             several = np.fromiter(ids, np.int64, len(ids))
             nearest = self.arrays.keyframes.poses.nearest(view.id, several, count)

@@ -1,4 +1,4 @@
-"""Which keyframes check each other by their images, and the exposure and noise of these."""
+"""Selection of the photometric partners of keyframes, and compensation of their exposure."""
 
 from collections.abc import Sequence
 
@@ -21,17 +21,17 @@ BEST_PARALLAX_DEG = 8.0
 MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 2.0, 25.0
 """Least and largest parallax of partners."""
 CANDIDATES = 128
-"""Nearest keyframes among which those are looked for that match or check one."""
+"""Nearest keyframes among which neighbours and partners are chosen."""
 _STRIDE = 4
-"""Every fourth pixel of a dense depth, in both directions, is compared."""
+"""Stride over the pixels of a dense depth that are compared, in both directions."""
 _CONFIDENT = 0.3
 """Least confidence of its depth."""
 _DARK, _BRIGHT = 0.02, 0.98
-"""Grey values beyond which a sensor says no more than that."""
+"""Grey values beyond which a sensor is saturated."""
 
 
 class Partners:
-    """Chooses the photometric partners of mapped views and compensates the exposure of these."""
+    """Chooses the photometric partners of mapped views and compensates their exposure."""
 
     def __init__(self, views: KeyframeViews, table: MapTable, config: PhotoConfig) -> None:
         self._views, self._table, self._config = views, table, config
@@ -44,7 +44,7 @@ class Partners:
             self._compensate(view)
 
     def _choose(self, view: MapView) -> None:
-        """Partners of a view; it becomes a candidate for those before it."""
+        """Choose the partners of a view, which becomes a candidate of theirs."""
         near = self._views.near(view, self._table.mapped, CANDIDATES)
         view.row.partners = choose_partners(view, near, self._config)
         for i in view.row.partners:
@@ -54,7 +54,7 @@ class Partners:
             other.row.partners = choose_partners(other, pool, self._config)
 
     def _compensate(self, view: MapView) -> None:
-        """Give a view's grey values the exposure of the partners where that is known."""
+        """Bring a view to the exposure of those partners whose exposure is known."""
         if view.row.exposure is not None or not self._config.compensate_exposure:
             return
         partners = [self._views[i] for i in view.row.partners]
@@ -104,7 +104,7 @@ def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
 
 
 def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Points of every fourth pixel of a view in its camera, and which depth is confident."""
+    """Points in a view's camera of every ``_STRIDE``-th pixel, and whether each is confident."""
     depth = view.dense
     rays = view.arrays.cameras.render.rays(device=depth.depth.device)[::_STRIDE, ::_STRIDE]
     points = rays * depth.depth[::_STRIDE, ::_STRIDE, None]
@@ -115,7 +115,7 @@ def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n
 def _sampled(
     greys: Float[Tensor, "k h w"], camera: Camera, points: Float[Tensor, "k n 3"]
 ) -> tuple[Float[Tensor, "k n"], Bool[Tensor, "k n"]]:
-    """What each image shows of points in its camera, and where it does."""
+    """Grey value of each image at points in its camera, and whether they are inside."""
     ahead = points[..., 2] > 1e-6
     pixels, _ = camera.project(points)
     edges = (camera.width - 1, camera.height - 1)
