@@ -1,4 +1,4 @@
-"""What the losses on one rendered view know of a keyframe."""
+"""Constants of a keyframe for the losses on one rendered view."""
 
 import functools
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ SMOOTHNESS_ETA = 10.0
 OUTSIDE = -1.0
 """Prior depth where a mask says that nothing of the scene is."""
 ONE_SURFACE = 0.08
-"""Relative difference of inverse depth within a pixel of half the resolution up to which it has one
+"""Largest relative difference of inverse depth within a pixel of half the resolution that has one
 depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewConstants:
-    """What the single-view losses know of a keyframe besides its rendering, at render size."""
+    """A keyframe's constants for the single-view losses, at render size."""
 
     camera: Camera
     """Intrinsics at render size."""
@@ -86,9 +86,11 @@ class ViewConstants:
         maps = torch.stack(
             [self.edge, self.image_gradient, inverse, weight, known.float(), outside.float()]
         )
-        edge, gradient, inverse_mean, mean_weight, share, beyond = F.adaptive_avg_pool2d(maps, size)
+        edge, gradient, inverse_mean, mean_weight, known_fraction, beyond = F.adaptive_avg_pool2d(
+            maps, size
+        )
         most, least = F.adaptive_max_pool2d(torch.stack([inverse, -inverse]), size)
-        one = (share > 0.999) & (most + least < ONE_SURFACE * inverse_mean)
+        one = (known_fraction > 0.999) & (most + least < ONE_SURFACE * inverse_mean)
         depth = torch.where(one, 1 / inverse_mean.clamp(min=1e-9), 0.0)
         normal = None
         if self.prior_normal is not None:

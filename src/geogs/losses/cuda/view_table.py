@@ -1,4 +1,4 @@
-"""What the losses know of the keyframes, kept on a GPU by slot."""
+"""The keyframes' constants for the losses, on a GPU by slot."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -29,9 +29,9 @@ class ViewField(IntEnum):
 class ViewTable:
     """Maps and poses of keyframes on a device, one slot each, in any number.
 
-    The kernels find them through ``pointers`` and ``poses``, so a captured graph follows whatever
-    slots its input names. Adding slots beyond the capacity replaces what has a row for each by
-    larger ones and raises ``generation``: graphs captured before must be captured again.
+    Kernels find them through ``pointers`` and ``poses``, so a captured graph works with any slots.
+    Adding slots beyond the capacity replaces the tensors that have a row for each by larger ones
+    and raises ``generation``: graphs captured before must be captured again.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class ViewTable:
         return len(self._maps)
 
     def add(self, view: ViewConstants | None, photo: PhotoView) -> int:
-        """Take up a keyframe and return its slot; constants may follow later."""
+        """Add a keyframe and return its slot; constants may follow later."""
         slot = len(self)
         if slot == len(self.pointers):
             self._grow()
