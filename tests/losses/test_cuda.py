@@ -332,7 +332,7 @@ def test_the_table_grows_and_says_so(device: torch.device) -> None:
     scene = Scene.make(device)
     table, pointers = scene.table, scene.table.pointers.clone()
     assert (len(table), table.generation, len(table.pointers)) == (4, 1, 4)
-    slot = table.add(None, photo_on(scene.photos[0], torch.device("cpu")))
+    slot = table.add(scene.views[0], photo_on(scene.photos[0], torch.device("cpu")))
     assert (slot, len(table), table.generation, len(table.pointers)) == (4, 5, 2, 8)
     assert torch.equal(table.pointers[:4], pointers)
     assert torch.equal(table.poses[4], table.poses[0])

@@ -269,8 +269,8 @@ def test_parked_views_change_nothing(sequence):
     for i in held.table.mapped:
         a, b = held.views[i], parked.views[i]
         assert torch.equal(a.dense.depth, b.dense.depth)
-        assert torch.equal(a.known.edge, b.known.edge)
-        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+        assert torch.equal(a.constants.edge, b.constants.edge)
+        assert torch.equal(a.constants.prior_depth, b.constants.prior_depth)
         assert torch.equal(a.photo.grey, b.photo.grey)
         assert (a.typical_depth, a.row.partners) == (b.typical_depth, b.row.partners)
         if a.rendered_depth is not None:

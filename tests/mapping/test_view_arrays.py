@@ -51,7 +51,6 @@ def test_measured_depth_weighs_more_in_the_losses_alone():
         for confidence in (0.5, 0.9):  # searched, then checked when the constants are there
             pool[n].set_depth(DenseDepth(2 * one, confidence * one, torch.tensor(2.0)))
             constants, depth = pool[n].constants, pool[n].dense
-            assert constants is not None
             factor = config.loss.measured_factor if n else 1.0
             torch.testing.assert_close(constants.confidence, factor * confidence * one)
             torch.testing.assert_close(depth.confidence, confidence * one)
@@ -70,7 +69,6 @@ def test_depth_weighs_more_beside_sure_jumps():
     confidence[16:] = 0.4  # too unsure to say where it jumps
     pool[0].set_depth(DenseDepth(depth, confidence, torch.tensor(2.0)))
     constants = pool[0].constants
-    assert constants is not None
     expected = confidence.clone()
     expected[:18, 17:23] *= 4
     expected[16:18, 17:18] = expected[16:18, 22:23] = 1.6

@@ -10,15 +10,9 @@ from geogs.depth.depth_view import KeyframeDepth
 from geogs.depth.reprojection_kernels import agree_on_depth, splat_depth
 from geogs.geometry.camera import Camera
 
-# Logistic regression of "relative error below 2 %" as in depth_confidence, with the neighbours'
-# votes as evidence.
-_BIAS = -0.10
-_OWN = 0.66
-_SUPPORT = 0.72
-_VIOLATION = -0.92
-
-WEIGHTS = (_BIAS, _OWN, _SUPPORT, _VIOLATION)
-"""The four for the CUDA kernel."""
+BIAS, OWN, SUPPORT, VIOLATION = -0.10, 0.66, 0.72, -0.92
+"""Logistic regression of "relative error below 2 %", as in ``depth_confidence``, on the confidence
+and the others' votes."""
 SPLAT_CONFIDENCE = 0.5
 """Confidence from which pixels of other keyframes repair this one."""
 
@@ -68,8 +62,8 @@ def check_depth(
     shape = depth.depth.shape
     averaged = depth.depth / (1.0 + shift / (votes + np.float32(0.5))).reshape(shape)
     own = np.clip(depth.confidence, 1e-3, 1.0 - 1e-3)
-    score = _BIAS + _OWN * np.log(own / (1.0 - own))
-    score += (_SUPPORT * np.log(support + 0.2) + _VIOLATION * violation).reshape(shape)
+    score = BIAS + OWN * np.log(own / (1.0 - own))
+    score += (SUPPORT * np.log(support + 0.2) + VIOLATION * violation).reshape(shape)
     return KeyframeDepth(averaged, (1.0 / (1.0 + np.exp(-score))).astype(np.float32))
 
 

@@ -47,8 +47,8 @@ class ViewConstants:
     def prepare(
         image: UInt8[np.ndarray, "ih iw 3"],
         camera: Camera,
-        prior_depth: Float[Tensor, "h w"] | None = None,
-        confidence: Float[Tensor, "h w"] | None = None,
+        prior_depth: Float[Tensor, "h w"],
+        confidence: Float[Tensor, "h w"],
         prior_normal: Float[Tensor, "h w 3"] | None = None,
     ) -> "ViewConstants":
         """Constants of a keyframe with this RGB image (any size) rendered by ``camera``.
@@ -57,16 +57,12 @@ class ViewConstants:
         """
         size = (camera.width, camera.height)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        device = None if prior_depth is None else prior_depth.device
-        rgb = torch.from_numpy(small).to(device).float() / 255
-        unknown = torch.zeros(camera.height, camera.width, device=device)
-        if confidence is None:
-            confidence = torch.ones_like(unknown)
+        rgb = torch.from_numpy(small).to(prior_depth.device).float() / 255
         return ViewConstants(
             camera=camera,
             edge=edge_strength(rgb),
             image_gradient=gradient_norm(rgb),
-            prior_depth=unknown if prior_depth is None else prior_depth.float(),
+            prior_depth=prior_depth.float(),
             confidence=confidence.float(),
             prior_normal=None if prior_normal is None else prior_normal.float(),
         )

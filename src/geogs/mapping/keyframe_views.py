@@ -112,16 +112,9 @@ class MapView:
         return self.dense.typical
 
     @property
-    def constants(self) -> ViewConstants | None:
-        """Constants of the single-view losses; None until the keyframe has a depth."""
+    def constants(self) -> ViewConstants:
+        """Constants of the single-view losses; the keyframe must have a depth."""
         return self.arrays.constants(self.id)
-
-    @property
-    def known(self) -> ViewConstants:
-        """The ``constants`` of a keyframe that has a depth."""
-        constants = self.constants
-        assert constants is not None, f"keyframe {self.id} has no depth yet"
-        return constants
 
     @property
     def rendered_depth(self) -> Float[Tensor, "h w"] | None:

@@ -163,9 +163,11 @@ class ViewArrays:
                 prior_normal=normal,
             )  # fmt: skip
 
-    def constants(self, id: int) -> ViewConstants | None:
-        """Constants of the single-view losses; None until the keyframe has a depth."""
-        return self._with_constants(id, self.load(id)).constants
+    def constants(self, id: int) -> ViewConstants:
+        """Constants of the single-view losses; the keyframe must have a depth."""
+        constants = self._with_constants(id, self.load(id)).constants
+        assert constants is not None, f"keyframe {id} has no depth yet"
+        return constants
 
     # --- from and to the file --------------------------------------------------------------
 

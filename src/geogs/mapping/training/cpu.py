@@ -46,7 +46,7 @@ def view_loss(
     Partners without a rendering yet are matched without occlusion test. The view may be rendered
     ``coarse``, at half the resolution.
     """
-    known = view.known.halved if coarse else view.known
+    known = view.constants.halved if coarse else view.constants
     loss = fused_single_view(
         output.depth, output.normal, output.alpha, output.distortion, known, config.loss, unit
     )
@@ -172,7 +172,7 @@ class CpuTrainer:
         """One view forth and back; nothing that other views use is changed."""
         parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))
         full = self.cameras.render
-        camera = view.known.halved.camera if coarse else full
+        camera = view.constants.halved.camera if coarse else full
         output = render(parameters, camera, view.T_cw)
         loss = view_loss(view, partners, output, self.config, self.unit, coarse)
         loss.backward()

@@ -107,7 +107,7 @@ def _pose_loss(
         output = render(disks, cameras.render, T_cw)
         total = total + fused_single_view(
             output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
-            view.known, loss_config, unit,
+            view.constants, loss_config, unit,
         )  # fmt: skip
         depth = output.shown_depth(MIN_ALPHA)
         for i in view.row.partners[:1]:

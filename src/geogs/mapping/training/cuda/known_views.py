@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.single_view import ViewConstants
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.lru import LruCache
@@ -25,7 +26,7 @@ class KnownViews:
         self._slots: LruCache[int, int] = LruCache(resident, self._free)
         self._unused: list[int] = []
         """Slots whose views had to go."""
-        self._constants: dict[int, object] = {}
+        self._constants: dict[int, ViewConstants] = {}
         self._poses: dict[int, Tensor] = {}
 
     def slots(self, views: Sequence[MapView]) -> list[int]:
@@ -34,7 +35,7 @@ class KnownViews:
         for view in views:
             constants, is_new = view.constants, view.id not in self._slots
             slot = self._slots.get(view.id, partial(self._new_slot, view), wanted)
-            if not is_new and constants is not None and self._constants[view.id] is not constants:
+            if not is_new and self._constants[view.id] is not constants:
                 self.table.set_constants(slot, constants)
             slots.append(slot)
             self._constants[view.id] = constants
