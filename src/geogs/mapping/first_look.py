@@ -6,7 +6,6 @@ pixels match. Only images that are swept or matched are read.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -120,16 +119,6 @@ def _spread(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist()
 
 
-@dataclass(frozen=True)
-class _Look:
-    """A small view swept around a distance."""
-
-    reference: DepthView
-    mask: Bool[np.ndarray, "h w"]
-    neighbours: list[DepthView]
-    distance: float
-
-
 class _FirstLook:
     """Small images, each read once when it is first needed, and sweeps over them."""
 
@@ -151,14 +140,12 @@ class _FirstLook:
         """Clear matches of images around distances, where there are suitable neighbours."""
         matched = {task: self._matched_at(*task) for task in tasks}
         looks = {
-            (i, d): _Look(*self._read(i), [self._read(k)[0] for k in others], d)
+            (i, d): (*self._read(i), [self._read(k)[0] for k in others], d)
             for (i, d), others in matched.items()
             if others
         }
         clear = thread_map(
-            lambda look: _clear_matches(look, self._camera),
-            list(looks.values()),
-            progress,
+            lambda look: _clear_matches(*look, self._camera), list(looks.values()), progress
         )
         return dict(zip(looks, clear, strict=True))
 
@@ -196,17 +183,21 @@ class _FirstLook:
         return [others[i].id for i in chosen]
 
 
-def _clear_matches(look: _Look, camera: Camera) -> Float64[np.ndarray, "n 3"]:
-    """World points of the pixels with one good match inside the swept range."""
-    low, high = 1.0 / (_FAR * look.distance), _NEAR / look.distance
+def _clear_matches(
+    reference: DepthView,
+    mask: Bool[np.ndarray, "h w"],
+    neighbours: list[DepthView],
+    distance: float,
+    camera: Camera,
+) -> Float64[np.ndarray, "n 3"]:
+    """World points of the pixels with one good match inside the range around a distance."""
+    low, high = 1.0 / (_FAR * distance), _NEAR / distance
     planes = np.linspace(low, high, _PLANES, dtype=np.float32)
-    nothing = np.zeros_like(look.reference.grey)
-    swept = plane_sweep(
-        look.reference, look.neighbours, camera, planes, nothing + planes[0], nothing
-    )
-    v, u = np.nonzero(_is_clear(swept, low, high) & look.mask)
+    nothing = np.zeros_like(reference.grey)
+    swept = plane_sweep(reference, neighbours, camera, planes, nothing + planes[0], nothing)
+    v, u = np.nonzero(_is_clear(swept, low, high) & mask)
     local = camera.rays(torch.float64).numpy()[v, u] / swept.inverse_depth[v, u, None]
-    T_cw = look.reference.T_cw
+    T_cw = reference.T_cw
     return (local - T_cw[:3, 3]) @ T_cw[:3, :3]
 
 

@@ -16,7 +16,7 @@ from geogs.splat.render import render
 from geogs.world.disks import DiskParameters, GaussianMap
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8
-"""Of Adam: decay of both moments, and what is added to the root of the second."""
+"""Adam's decay of both moments, and the number added to the root of the second."""
 
 
 class TangentAdam:

@@ -19,7 +19,7 @@ from geogs.mapping.training.cuda.window_pass import WindowPass
 from geogs.mapping.training.map_trainer import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.view_arrays import MapCameras
 from geogs.splat.cuda import rasterize
-from geogs.splat.optimizer import BETAS, EPSILON, MapOptimizer
+from geogs.splat.optimizer import BETAS, EPSILON
 from geogs.world.disks import GaussianMap
 
 _ADAM = Path(rasterize.__file__).with_name("adam.cu")
@@ -42,7 +42,6 @@ class CudaTrainer:
         resident: int,
     ) -> None:
         self.disks, self.cameras, self.config, self.unit = disks, cameras, config, unit
-        self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
         self.known = KnownViews(cameras, disks.device, resident)
         self._programs: dict[tuple[int, int], _TrainingStep] = {}
         self._pose_pass: WindowPass | None = None
@@ -136,7 +135,7 @@ class _TrainingStep:
         self._schedule[: len(rows)] = to_device(torch.from_numpy(rows), self._device)
         scale = torch.as_tensor(np.asarray(factors, np.float32))
         self._factors[: len(rows)] = to_device(scale, self._device)
-        rates = torch.tensor(self._trainer.optimizer.learning_rates)
+        rates = torch.tensor(learning_rates(self._trainer.config, self._trainer.unit))
         self._base.copy_(to_device(rates, self._device))
         self._count.fill_(len(self._trainer.disks))
         self._completed.zero_()
