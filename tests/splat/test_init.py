@@ -6,7 +6,7 @@ import torch
 
 from geogs.config import DiskConfig
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs.splat.init import face_camera, fit_local_planes, initialise_disks, turned_at_random
+from geogs.splat.init import face_camera, fit_local_planes, initialise_disks, randomly_oriented
 
 CONFIG = DiskConfig(planarity_shrink=0.1)
 
@@ -93,7 +93,7 @@ def started(points: torch.Tensor, **settings):
 
 
 def turned(points: torch.Tensor, seed: int = 0, **settings):
-    return turned_at_random(started(points, **settings), torch.Generator().manual_seed(seed))
+    return randomly_oriented(started(points, **settings), torch.Generator().manual_seed(seed))
 
 
 def test_unbounded_scales_are_3dgs_s_and_far_points_make_blankets():

@@ -9,7 +9,7 @@ from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import confident_jumps
 from geogs.splat.density import spread_candidates, unexplained, worth_keeping
-from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
+from geogs.splat.init import NEIGHBOURS, initialise_disks, randomly_oriented
 from geogs.splat.render import render
 from geogs.world.map import MapTable
 
@@ -66,5 +66,5 @@ class DiskGrowth:
         existing = disks.position.detach()
         new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config)
         if self.config.ablation.initialisation == "random":
-            new = turned_at_random(new, self.table.random.of_torch)
+            new = randomly_oriented(new, self.table.random.of_torch)
         disks.append(new, view.id)

@@ -1,4 +1,4 @@
-"""How disks start: in local planes (paper, Sec. "Local-plane driven initialization"), or anyhow."""
+"""Initial disks: in local planes (paper, Sec. "Local-plane driven initialization") or random."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ NEIGHBOURS = 12
 """Points of the local plane fit: enough for noise to average, few enough to follow edges."""
 MIN_COSINE = 0.15
 """Least cosine of a disk's normal to its own camera: one that is seen edge-on gets no gradient."""
-# Part of the extent of some points within which their neighbours are looked for at first.
+# Margin around some points, over their extent, in which neighbours are searched first.
 _MARGIN = 0.05
 
 
@@ -61,7 +61,7 @@ def _neighbourhoods(
 ) -> tuple[Float[Tensor, "n j"], Float[Tensor, "n j 3"]]:
     """Distances and positions of the k + 1 nearest of points and context, float64.
 
-    Of a large context only what lies around the points is searched, as long as that is enough.
+    Of a large context only the points nearby are searched, if they are enough.
     """
     low, high = points.amin(0), points.amax(0)
     margin = _MARGIN * (high - low).norm()
@@ -133,7 +133,7 @@ def initialise_disks(
     )
 
 
-def turned_at_random(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
+def randomly_oriented(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
     """The same disks, of the same scales, with orientations uniform over all rotations."""
     # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
     quaternion = torch.randn(len(disks.position), 4, generator=random).to(disks.position)

@@ -1,4 +1,4 @@
-"""Adam for a map whose disks come, go and move."""
+"""Adam for a map whose disks are added, removed and moved."""
 
 import math
 from typing import NamedTuple

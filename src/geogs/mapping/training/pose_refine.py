@@ -1,4 +1,4 @@
-"""Pose-only refinement: the map stands still, the cameras move to agree with it (Eq. pose_loss)."""
+"""Pose-only refinement: poses are optimised against the fixed map (Eq. pose_loss)."""
 
 from collections.abc import Callable, Mapping
 
@@ -48,7 +48,7 @@ Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
 def descend(
     start: Float[Tensor, "k 4 4"], config: MappingConfig, unit: float, evaluate: Evaluate
 ) -> Float[Tensor, "k 4 4"]:
-    """Poses of less loss near ``start``, the first of them fixed.
+    """Poses near ``start`` of less loss; the first is fixed.
 
     Adam on left perturbations [tau, phi], tau in units of the map's depth. The step with the least
     loss is returned; where no step lowered the loss the poses come back as they were.

@@ -1,4 +1,4 @@
-"""One Adam step of the visible rows of a parameter, fused."""
+"""A fused Adam step of the visible rows of a parameter."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Which tile sees which disks, in which order."""
+"""Lists of the disks in each tile, sorted by depth."""
 
 import math
 

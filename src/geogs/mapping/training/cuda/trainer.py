@@ -28,9 +28,9 @@ _ADAM = Path(rasterize.__file__).with_name("adam.cu")
 class CudaTrainer:
     """As :class:`geogs.mapping.training.cpu.CpuTrainer`; the map never leaves the GPU.
 
-    The views of every step and the factors of the learning rates are uploaded once per call; the
-    steps themselves, from the rendering to Adam, are one CUDA graph that reads its row of that
-    schedule. A step whose list entries find no room changes nothing and is done again with more.
+    The views of every step and the factors of the learning rates are uploaded once per call; a
+    step, from the rendering to Adam, is one CUDA graph that reads its row of that schedule. A step
+    whose lists are too small changes nothing and is repeated with larger ones.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class CudaTrainer:
         return refine_poses(self.disks, active, views, self.known, window, config, self.unit)
 
     def forget_renders(self, views: Iterable[MapView]) -> None:
-        """What the views showed of the map counts no more: it was moved."""
+        """Discard the rendered depths of all views, as the map was moved."""
         self.known.table.forget_rendered()
 
     def _program(self, views: int, partners: int) -> "_TrainingStep":
@@ -150,7 +150,7 @@ class _TrainingStep:
         if self._graph is not None:
             self._graph.replay()
             return
-        self._launch()  # the first step of its kind also loads what it needs
+        self._launch()  # the first step of its kind also loads the kernels
         if self._device.type == "cuda":
             with recording(self._device) as graph:
                 self._launch()
