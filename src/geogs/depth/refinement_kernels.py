@@ -159,22 +159,9 @@ def _add_neighbour(own, sums, inside, floor, total):
 
 @njit(**_FAST)
 def fit_planes(
-    first,
-    last,
-    rho,
-    slope_x,
-    slope_y,
-    confidence,
-    guide,
-    radius,
-    contrast,
-    tolerance,
-    stiffness,
-    new_rho,
-    new_x,
-    new_y,
-    support,
-):
+    first, last, rho, slope_x, slope_y, confidence, guide, radius, contrast, tolerance, stiffness,
+    new_rho, new_x, new_y, support,
+):  # fmt: skip
     """Weighted least-squares plane of inverse depth around each pixel (bilateral, robust).
 
     A pixel within ``radius`` counts by its confidence, its likeness in colour

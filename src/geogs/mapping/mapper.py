@@ -83,12 +83,9 @@ class Mapper:
         self.table = table
         self.views = KeyframeViews(ViewArrays(table, keyframes, self.cameras, config.loss))
         engine = depth_engine(
-            table.disks.device,
-            render,
-            self.cameras.working,
-            config.depth,
+            table.disks.device, render, self.cameras.working, config.depth,
             keyframes.arrays.resident,
-        )
+        )  # fmt: skip
         self.depths = KeyframeDepths(engine, self.views, sensor, config.depth.bare_planes)
         self.partners = Partners(self.views, table, config.photo)
         self.growth = DiskGrowth(table, self.depths, config)
