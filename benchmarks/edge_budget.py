@@ -23,7 +23,6 @@ from torch import Tensor
 
 from geogs.config import Config, InputConfig
 from geogs.depth.depth_view import DenseDepth
-from geogs.depth.sweep_neighbors import RANGE_MARGIN
 from geogs.errors import InputError
 from geogs.evaluation.surfaces.raster import render_mesh
 from geogs.geometry.camera import Camera
@@ -99,7 +98,7 @@ class Keyframes:
             pose = self.frame.pose(T_cw)
             mapper.observe(keyframes.add(view.view.index, time, image, None, pose).id)
         points = self.frame.points(self.points)
-        expect_depths(mapper.views.values(), points, self.camera, RANGE_MARGIN)
+        expect_depths(mapper.views.values(), points, self.camera)
         return mapper
 
     def report(self, name: str, found: Sequence[Float32[np.ndarray, "h w"]]) -> None:

@@ -119,7 +119,7 @@ def _view(
     dense = depth.to(pool.arrays.device)
     view.set_depth(DenseDepth(dense, torch.ones_like(dense), depth.median()))
     normal, _ = normals_from_depth(dense, pool.arrays.cameras.render)
-    pool.arrays.load(view.id).constants = replace(view.known, prior_normal=normal)
+    pool.arrays.load(view.id).constants = replace(view.constants, prior_normal=normal)
     return view
 
 
@@ -198,7 +198,7 @@ class Plain:
         for k, (view, partners) in enumerate(window.batch):
             losses.append(
                 single_view_loss(
-                    out.depth[k], out.normal[k], out.alpha[k], out.distortion[k], view.known,
+                    out.depth[k], out.normal[k], out.alpha[k], out.distortion[k], view.constants,
                     config, window.unit,
                 )
             )  # fmt: skip

@@ -6,13 +6,32 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.splat.render import render
+from geogs.splat.render import RenderOutput, render
 from geogs.world.disks import DiskParameters
 
 CAMERA = Camera(fx=50.0, fy=53.0, cx=22.4, cy=37.7, width=45, height=75)
 
 
 MAPS = ("depth", "normal", "alpha", "distortion")
+
+
+def differentiate(
+    disks: DiskParameters,
+    camera: Camera,
+    backend: str,
+    dtype: torch.dtype,
+    device: torch.device | str = "cpu",
+) -> tuple[RenderOutput, list[torch.Tensor]]:
+    """The rendering, and gradients of a loss of all maps for the parameters and the pose."""
+    leaves = [p.to(device, dtype).requires_grad_() for p in disks]
+    T_cw = pose().requires_grad_()
+    out = render(DiskParameters(*leaves), camera, T_cw, backend=backend)
+    g = torch.Generator().manual_seed(0)
+    maps = [getattr(out, name) for name in MAPS]
+    loss = sum(
+        (m * torch.randn(m.shape, generator=g, dtype=torch.float64).to(m)).sum() for m in maps
+    )
+    return out, [x.cpu() for x in torch.autograd.grad(loss, [*leaves, T_cw])]
 
 
 def disks_at(n: int, seed: int, scale: float, spread: float = 0.4) -> DiskParameters:

@@ -15,16 +15,10 @@ from geogs.depth import plane_sweep_kernels as sweep_loops
 from geogs.depth import refinement as cpu_refinement
 from geogs.depth.carve import vote
 from geogs.depth.classical import CpuDepthEngine
-from geogs.depth.completion import (
-    complete_grid,
-    complete_inverse_depth,
-    known_cells,
-    upsample_grid,
-)
 from geogs.depth.confidence import depth_confidence
-from geogs.depth.cuda import completion as completion_module
 from geogs.depth.cuda import edges as edges_module
 from geogs.depth.cuda import fusion as check_module
+from geogs.depth.cuda import grid_completion as completion_module
 from geogs.depth.cuda import plane_sweep as sweep_module
 from geogs.depth.cuda import refinement as refine_module
 from geogs.depth.cuda.classical import CudaDepthEngine
@@ -40,6 +34,12 @@ from geogs.depth.evidence import (
     prior_weight,
     relative_precision,
     tracker_evidence,
+)
+from geogs.depth.grid_completion import (
+    complete_grid,
+    complete_inverse_depth,
+    known_cells,
+    upsample_grid,
 )
 from geogs.depth.plane_sweep import SweepResult, matching_costs, plane_sweep
 from geogs.geometry.camera import Camera

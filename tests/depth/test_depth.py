@@ -236,11 +236,6 @@ def test_a_camera_that_moves_straight_on_is_matched_with_those_next_to_it():
     assert sorted(chosen) == [15, 16, 17, 18, 19, 21, 22, 23]
 
 
-def test_check_without_others_changes_nothing(scene, depths):
-    same = check_depth(depths[0], scene.views[0].T_cw, [], [], RENDER)
-    assert np.array_equal(same.confidence, depths[0].confidence)
-
-
 def test_neighbours_have_parallax_look_the_same_way_and_spread(scene):
     view = scene.views[0]
 

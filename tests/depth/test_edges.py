@@ -25,11 +25,11 @@ def one_pass(refined, confidence, guide, sweep):
         contrast = ((guide[:, near] - guide[:, y, x, None]).astype(float) ** 2).sum(0)
         weight = confidence[near] / (1 + edges.CONTRAST * contrast) ** 2
         ratio = value / rho[y, x] - 1
-        own = weight[abs(ratio) < edges.APART].sum()
+        own = weight[abs(ratio) < edges.MIN_GAP].sum()
         cost = lambda r, y=y, x=x: np.interp(r, sweep.planes, sweep.costs[y, x])  # noqa: E731
         best = 0.0
         for side in (-1, 1):
-            other = (side * ratio >= edges.APART) & (value > 0)
+            other = (side * ratio >= edges.MIN_GAP) & (value > 0)
             if weight[other].sum() < 0.3:
                 continue
             mode = np.average(value[other], weights=weight[other])

@@ -12,7 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import kernel_settings
 from geogs.losses.cpu import fused_multi_view, fused_single_view
-from geogs.losses.light import USUAL_NOISE
+from geogs.losses.exposure import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView
 from loss_scenes import ALL_TERMS, random_view
 from oracles import multi_view_reference
@@ -73,7 +73,7 @@ def photo_case(seed: int) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Ten
     near = se3_exp(torch.tensor([0.02, -0.01, 0.01, 0.002, 0.003, -0.01]).double())
     images = [x.astype(np.uint8) for x in (texture, other)]
     reference = PhotoView.prepare(images[0], BIG, torch.eye(4).double(), with_colour=True)
-    reference = reference.in_light(torch.tensor([1.0, 0.0, 3 * USUAL_NOISE]))
+    reference = reference.with_exposure(torch.tensor([1.0, 0.0, 3 * USUAL_NOISE]))
     target = PhotoView.prepare(images[1], BIG, near, with_colour=True)
     hidden = depth.clone().nan_to_num(0.0)
     hidden[40:50, 10:30] *= 0.8

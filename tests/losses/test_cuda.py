@@ -18,7 +18,7 @@ from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses.cuda import ViewTable, WindowLosses, window_losses
-from geogs.losses.light import USUAL_NOISE
+from geogs.losses.exposure import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import MIN_ALPHA, ViewConstants
 from loss_scenes import random_view
@@ -81,7 +81,9 @@ class Scene:
             scene.views.append(constants_on(view, device))
             pixels = image.astype(np.uint8)
             taken = PhotoView.prepare(pixels, photo, T_cw, 0.3, with_colour=True)
-            scene.photos.append(taken.in_light(torch.tensor([1.0, 0.0, (k + 1) * USUAL_NOISE])))
+            scene.photos.append(
+                taken.with_exposure(torch.tensor([1.0, 0.0, (k + 1) * USUAL_NOISE]))
+            )
             scene.table.add(view, scene.photos[k])
             rendered.append(maps)
         scene.photos = [photo_on(p, device) for p in scene.photos]
@@ -330,7 +332,7 @@ def test_the_table_grows_and_says_so(device: torch.device) -> None:
     scene = Scene.make(device)
     table, pointers = scene.table, scene.table.pointers.clone()
     assert (len(table), table.generation, len(table.pointers)) == (4, 1, 4)
-    slot = table.add(None, photo_on(scene.photos[0], torch.device("cpu")))
+    slot = table.add(scene.views[0], photo_on(scene.photos[0], torch.device("cpu")))
     assert (slot, len(table), table.generation, len(table.pointers)) == (4, 5, 2, 8)
     assert torch.equal(table.pointers[:4], pointers)
     assert torch.equal(table.poses[4], table.poses[0])

@@ -10,8 +10,8 @@ from geogs.config import LossConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.losses.exposure import USUAL_NOISE
 from geogs.losses.kernel_settings import MIN_COVERAGE
-from geogs.losses.light import USUAL_NOISE
 from geogs.losses.multi_view import PhotoView, enlarge_depth
 from oracles.multi_view_reference import multi_view_loss, occlusion_mask, warp
 from oracles.photometric_reference import ssim
@@ -181,7 +181,7 @@ def test_texture_is_the_variance_over_the_noise() -> None:
     )
     slow = slow.reshape(18, 21) / USUAL_NOISE
     torch.testing.assert_close(view.texture, slow, rtol=1e-4, atol=0.01)
-    brighter = view.in_light(torch.tensor([1.5, 0.2, 4 * USUAL_NOISE]))
+    brighter = view.with_exposure(torch.tensor([1.5, 0.2, 4 * USUAL_NOISE]))
     assert brighter.colours is not None
     for plane in (brighter.grey, *brighter.colours):
         torch.testing.assert_close(plane, 1.5 * grey + 0.2)

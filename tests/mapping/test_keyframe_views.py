@@ -26,7 +26,7 @@ def test_the_nearest_come_in_the_order_in_which_they_were_given():
     for id in range(20):
         T = se3_exp(torch.randn(6, generator=random, dtype=torch.float64))
         views.add(segment.add(id, id / 30, image, None, T).id)
-        away = [float(np.linalg.norm(v.place.center - views[id].place.center))
+        away = [float(np.linalg.norm(v.view_pose.center - views[id].view_pose.center))
                 for v in views.values()]  # fmt: skip
         for count in (1, 5, 40):
             nearest = sorted(sorted(range(id + 1), key=lambda n: away[n])[:count])

@@ -15,7 +15,7 @@ from quick_systems import Work, quick_config
 
 pytestmark = pytest.mark.system
 
-FRAMES, AT = 26, 20
+FRAMES, AT = 20, 15
 
 
 class Interrupted(Exception):

@@ -15,6 +15,7 @@ from geogs_synth.sequence.location import centred_camera
 from handheld_walk import handheld_trajectory
 from keyframe_samples import Sample, add, segment_of
 from lit_rooms import lit_room
+from records import copied
 
 pytestmark = pytest.mark.system
 
@@ -70,6 +71,12 @@ def mapper(sequence) -> Mapper:
     return build(sequence[0])
 
 
+def copy_of(mapper: Mapper) -> Mapper:
+    """Another mapper of the same keyframes with a map of its own."""
+    mapper.settle()
+    return Mapper(mapper.keyframes, MAPPING, table=copied(mapper.table))
+
+
 def depth_error(mapper: Mapper, truth: list[np.ndarray]) -> float:
     """Median error in cm of the rendered depth over all keyframes."""
     renders = mapper.renders()
@@ -87,21 +94,21 @@ def test_the_map_renders_the_true_depth(mapper, sequence):
     assert 500 < len(mapper.table.disks) < 12_000
 
 
-def test_training_and_refining_make_it_better(sequence):
+def test_training_and_refining_make_it_better(mapper, sequence):
     keyframes, truth = sequence
     untrained = build(keyframes, replace(MAPPING, iterations=0))
     before = depth_error(untrained, truth)
-    trained = build(keyframes)
-    online = depth_error(trained, truth)
+    online = depth_error(mapper, truth)
+    trained = copy_of(mapper)
     trained.refine()
     final = depth_error(trained, truth)
     assert online < before
     assert final < 0.97 * online
 
 
-def test_a_short_training_looks_only_where_it_trained(sequence, monkeypatch):
+def test_a_short_training_looks_only_where_it_trained(mapper, monkeypatch):
     """Of more views than steps those that were trained; else all, each time."""
-    mapper = build(sequence[0], replace(MAPPING, iterations=1))
+    mapper = copy_of(mapper)
     filled: list[int] = []
     monkeypatch.setattr(mapper.growth, "insert", lambda view, confidence: filled.append(view.id))
     mapper.train(6)
@@ -112,8 +119,8 @@ def test_a_short_training_looks_only_where_it_trained(sequence, monkeypatch):
     assert filled == 2 * list(range(9))
 
 
-def test_the_first_part_of_a_training_goes_at_half_the_resolution(sequence, monkeypatch):
-    mapper = build(sequence[0], replace(MAPPING, iterations=1))
+def test_the_first_part_of_a_training_goes_at_half_the_resolution(mapper, monkeypatch):
+    mapper = copy_of(mapper)
     steps: list[bool] = []
 
     def noted(batches, factors, coarse):
@@ -214,8 +221,8 @@ def test_mapping_goes_on_in_corrected_units(sequence):
     assert len(mapper.table.disks) == pytest.approx(len(plain.table.disks), rel=0.05)
 
 
-def test_a_floater_is_carved_and_the_surface_stays(sequence):
-    mapper = build(sequence[0][:6])
+def test_a_floater_is_carved_and_the_surface_stays(mapper):
+    mapper = copy_of(mapper)
     count = len(mapper.table.disks)
     view = mapper.views[2]
     T_wc = view.T_wc.float()
@@ -262,8 +269,8 @@ def test_parked_views_change_nothing(sequence):
     for i in held.table.mapped:
         a, b = held.views[i], parked.views[i]
         assert torch.equal(a.dense.depth, b.dense.depth)
-        assert torch.equal(a.known.edge, b.known.edge)
-        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+        assert torch.equal(a.constants.edge, b.constants.edge)
+        assert torch.equal(a.constants.prior_depth, b.constants.prior_depth)
         assert torch.equal(a.photo.grey, b.photo.grey)
         assert (a.typical_depth, a.row.partners) == (b.typical_depth, b.row.partners)
         if a.rendered_depth is not None:

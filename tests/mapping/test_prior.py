@@ -56,7 +56,7 @@ def view(normal: torch.Tensor | None, loss: LossConfig) -> MapView:
 
 
 def test_normals_reach_the_losses_at_their_size():
-    prior = view(normals(), LossConfig()).known.prior_normal
+    prior = view(normals(), LossConfig()).constants.prior_normal
     assert prior is not None
     assert prior.shape == (36, 48, 3)
     assert float(prior[:4].abs().max()) == 0
@@ -67,14 +67,14 @@ def test_normals_reach_the_losses_at_their_size():
 
 @pytest.mark.parametrize(("normal", "loss"), [(None, LossConfig()), (normals(), OFF)])
 def test_without_normals_or_weight_there_is_no_term(normal: torch.Tensor | None, loss: LossConfig):
-    assert view(normal, loss).known.prior_normal is None
+    assert view(normal, loss).constants.prior_normal is None
 
 
 def test_the_term_is_the_paper_s():
     """Against |N - N_f|_1 by hand, on both paths: a map that faces the camera everywhere."""
     maps = torch.full((36, 48), 2.0), torch.tensor([0.0, 0.0, -1.0]).expand(36, 48, 3)
     maps = (*maps, torch.full((36, 48), 0.99), torch.zeros(36, 48))
-    known = view(normals(), LossConfig()).known
+    known = view(normals(), LossConfig()).constants
     prior = known.prior_normal
     error = (maps[1] - prior).abs().sum(-1) * (prior.square().sum(-1) > 0)
     expected = LossConfig().normal_weight * float(error.mean())

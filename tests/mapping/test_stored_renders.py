@@ -104,7 +104,7 @@ def count_held(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_the_mesh_is_the_same_to_the_last_bit(monkeypatch):
     """Of views that come from the file, few of which are in memory at a time."""
-    renders = [plane(n) for n in range(45)]
+    renders = [plane(n) for n in range(20)]
     config = MeshConfig(min_component_faces=10, voxel=0.04, detail=0)
     expected = extract_mesh(fusion_views(renders), config)
     counts = count_held(monkeypatch)
@@ -113,7 +113,7 @@ def test_the_mesh_is_the_same_to_the_last_bit(monkeypatch):
     for name in ("vertices", "faces", "normals", "colours"):
         assert np.array_equal(getattr(mesh, name), getattr(expected, name))
     assert max(counts) <= 3
-    assert 3 * 45 <= len(counts) < 10 * 45
+    assert 3 * 20 <= len(counts) < 10 * 20
 
 
 def test_results_hold_few_maps(monkeypatch, tmp_path):

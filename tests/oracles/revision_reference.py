@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.cuda.photo_vote import light_and_noise
+from geogs.depth.cuda.photo_vote import offset_and_limit
 from geogs.depth.depth_view import DepthView, relative_poses
-from geogs.depth.revision.far_side import APART, as_depth, inverse_planes
+from geogs.depth.revision.far_side import MIN_GAP, as_depth, inverse_planes
 from geogs.depth.revision.photo_vote import CONTRAST, RADIUS
 from geogs.geometry.camera import Camera
 
@@ -25,11 +25,11 @@ def photo_costs(
     depths: Float[Tensor, "2 h w"],
     same: Bool[Tensor, "h w"],
     camera: Camera,
-    asked: Bool[Tensor, "h w"] | None = None,
+    mask: Bool[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, "2 h w"]:
     """As :func:`geogs.depth.revision.photo_vote.photo_costs`, pixel by pixel of all."""
-    if asked is not None:
-        depths = torch.stack([depths[0], torch.where(asked, depths[1], depths[0])])
+    if mask is not None:
+        depths = torch.stack([depths[0], torch.where(mask, depths[1], depths[0])])
     device, size = depths.device, (camera.width, camera.height)
     grey = torch.from_numpy(np.stack([v.grey for v in (reference, *neighbours)])).to(device)
     poses = relative_poses(reference, neighbours)
@@ -39,7 +39,7 @@ def photo_costs(
     colour = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
     guide = torch.from_numpy(colour).to(device).movedim(-1, 0).float() / 255
     costs = averaged_by_colour(best_half(truncated(differences, same)), guide)
-    return costs if asked is None else torch.where(asked, costs, 0.0)
+    return costs if mask is None else torch.where(mask, costs, 0.0)
 
 
 def seen_from(
@@ -67,10 +67,9 @@ def seen_from(
 def truncated(
     differences: Float[Tensor, "2 n h w"], same: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "2 n h w"]:
-    """Differences of grey values without that of the light, over what each neighbour's noise makes
-    of them, at most 1."""
-    light, most = light_and_noise(differences[0], same)
-    return ((differences - light[:, None, None]).abs() / most[:, None, None]).clamp(max=1)
+    """Grey differences less each neighbour's offset, over its limit, and at most 1."""
+    offset, limit = offset_and_limit(differences[0], same)
+    return ((differences - offset[:, None, None]).abs() / limit[:, None, None]).clamp(max=1)
 
 
 def best_half(costs: Float[Tensor, "*b n h w"]) -> Float[Tensor, "*b h w"]:
@@ -104,14 +103,8 @@ def averaged_by_colour(
     return total / weights
 
 
-def farther_surface(
-    depth: Float[Tensor, "h w"], reach: int, apart: float = APART
-) -> Float[Tensor, "h w"]:
-    """Depth of the nearest farther surface within ``reach`` pixels, its plane gone on to the pixel.
-
-    0 where there is none that is farther by ``apart`` of the inverse depth, or it would be farther
-    than all that was found. ``depth`` is positive; inverse depth is linear along a plane.
-    """
+def farther_surface(depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
+    """As :func:`geogs.depth.revision.far_side.farther_surface`, all pixels at once."""
     source = inverse_planes(depth)
     inverse, found = source[0], torch.zeros_like(source)
     (height, width), farthest = depth.shape, inverse.amin()
@@ -120,7 +113,7 @@ def farther_surface(
         for dy, dx in _AROUND:
             plane = around[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
             here = plane[0] - dx * plane[1] - dy * plane[2]
-            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - apart) * inverse)
+            goes_on = (plane[0] > 0) & (here >= farthest) & (here < (1 - MIN_GAP) * inverse)
             new = goes_on & (found[0] == 0)
             found = torch.where(new, torch.stack([here, plane[1], plane[2]]), found)
         source = found

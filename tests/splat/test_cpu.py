@@ -14,12 +14,13 @@ from geogs.splat.cpu.blend import blend_disk
 from geogs.splat.cpu.blend_backward import unblend_disk
 from geogs.splat.cpu.layout import exp_minus
 from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
-from geogs.splat.render import RenderOutput, render
+from geogs.splat.render import render
 from geogs.world.disks import DiskParameters, GaussianMap
 from splat_scenes import (
     CAMERA,
     MAPS,
     SCENES,
+    differentiate,
     disks_at,
     edge_on,
     held_at_the_near_plane,
@@ -28,21 +29,6 @@ from splat_scenes import (
     relative,
     tiny,
 )
-
-
-def differentiate(
-    disks: DiskParameters, camera: Camera, backend: str, dtype: torch.dtype
-) -> tuple[RenderOutput, list[torch.Tensor]]:
-    """The rendering, and gradients of a loss of all maps for the parameters and the pose."""
-    leaves = [p.to(dtype).requires_grad_() for p in disks]
-    T_cw = pose().requires_grad_()
-    out = render(DiskParameters(*leaves), camera, T_cw, backend=backend)
-    g = torch.Generator().manual_seed(0)
-    maps = [getattr(out, name) for name in MAPS]
-    loss = sum(
-        (m * torch.randn(m.shape, generator=g, dtype=torch.float64).to(m)).sum() for m in maps
-    )
-    return out, list(torch.autograd.grad(loss, [*leaves, T_cw]))
 
 
 @pytest.mark.parametrize("scene", SCENES)

@@ -138,7 +138,7 @@ def test_few_slots_serve_many_keyframes():
     assert known.table.rendered[:2].tolist() == [0, 1]
     assert torch.equal(known.table.poses[first[0]], c.T_cw[:3].reshape(-1))
     maps = known.table._maps[first[0]]
-    assert torch.equal(maps[2], c.known.prior_depth)
+    assert torch.equal(maps[2], c.constants.prior_depth)
     *planes, texture = known.table._photos[first[0]]
     assert torch.equal(torch.stack(planes), c.photo.planes)
     assert torch.equal(texture, c.photo.texture)

@@ -6,8 +6,9 @@ import torch
 
 from geogs.geometry.lie import sim3_exp
 from geogs.splat.cpu.adam import adam_rows
-from geogs.splat.optimizer import LearningRates, MapOptimizer, adam_reference
+from geogs.splat.optimizer import LearningRates, MapOptimizer
 from geogs.world.disks import DiskParameters, GaussianMap
+from oracles.adam_reference import adam_reference
 
 RATES = LearningRates(position=1e-2, quaternion=2e-2, log_scale=3e-2, opacity_logit=5e-2)
 

@@ -10,14 +10,14 @@ from geogs.depth.reprojection_kernels import relative_depths
 from geogs.geometry.camera import Camera
 
 VOTE_CONFIDENCE = 0.5
-"""Least confidence of a pixel that votes on points."""
+"""Confidence above which pixels vote on points."""
 VOTE_SUPPORT = 0.04
 """Relative distance from a depth within which a point lies on the surface."""
 VOTE_VIOLATION = 0.08
-"""Relative distance in front of a depth beyond which a point lies in free space: twice the former,
-so that neither is said in between."""
+"""Relative distance in front of a depth beyond which a point lies in free space: twice that of the
+support, so that points in between get no vote."""
 VOTE_FREE_VIEWS = 2
-"""Fewest views in whose free space a point must lie to be removed: one may be wrong."""
+"""Fewest views in whose free space a removed point lies: one may be wrong."""
 
 
 def look_up(
@@ -45,13 +45,11 @@ def count_votes(
     views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
 ) -> tuple[Int32[np.ndarray, "n"], Int32[np.ndarray, "n"]]:
-    """How many views see each world point on their surface, and how many in their free space.
+    """Number of views that see each world point on their surface, and in their free space.
 
-    A view is its world-to-camera pose and its depth.
-
-    Only pixels with confidence above ``VOTE_CONFIDENCE`` vote: for the surface within
-    ``VOTE_SUPPORT`` of their depth, for free space if the point is more than
-    ``VOTE_VIOLATION`` in front of it (both relative).
+    A view is its world-to-camera pose and its depth. Pixels with confidence above
+    ``VOTE_CONFIDENCE`` vote: for the surface within ``VOTE_SUPPORT`` of their depth, for free space
+    if the point is more than ``VOTE_VIOLATION`` in front of it (both relative).
     """
     points = np.ascontiguousarray(points, np.float32)
     surface, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
@@ -68,8 +66,8 @@ def vote(
     views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
 ) -> Bool[np.ndarray, "n"]:
-    """Which world points to keep: not those that at least two views, and more views than see them
-    on their surface, see in free space; nor those that are not finite.
+    """World points to keep: the finite ones, but for those that at least ``VOTE_FREE_VIEWS`` views,
+    and more views than support them, see in free space.
     """
     finite = np.isfinite(points).all(1)
     surface, free = count_votes(points[finite], views, camera)

@@ -1,6 +1,6 @@
 """Keyframe depths by matching and fusion without a network, on the CPU.
 
-What is compiled is imported by the first keyframe that needs it, long after the first frame.
+Compiled code is imported by the first keyframe that needs it, long after the first frame.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ _FEW_VIEWS = 128
 
 
 class CpuDepthEngine:
-    """The compiled CPU loops; keyframes, and the rows of one, are worked on side by side."""
+    """The compiled loops; keyframes, and the rows of each, are processed in parallel."""
 
     def __init__(self, render: Camera, working: Camera, planes: int) -> None:
-        """At most so many ``planes`` are swept."""
+        """``planes`` is the largest number of planes of a sweep."""
         self.render = render
         self.working = working
         self.planes = planes
@@ -64,19 +64,16 @@ class CpuDepthEngine:
         from geogs.depth.carve import vote
         from geogs.splat.cpu.in_view import disks_in_view
 
-        if not 0 < len(depths) <= _FEW_VIEWS:
-            # One view after the other, so that not all are in memory at once.
-            views = ((d.T_cw, d.depth.through_sky().arrays()) for d in depths)
-            return torch.from_numpy(vote(points.detach().numpy(), views, self.render))
-        posed = list(depths)
-        poses = torch.from_numpy(np.stack([d.T_cw for d in posed]))
-        # No view has a say on the others, which may be most of a large map.
-        seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
+        seen = torch.ones(len(points), dtype=torch.bool)
+        # Many views are read one after the other, so that not all are in memory at once.
+        if 0 < len(depths) <= _FEW_VIEWS:
+            depths = list(depths)
+            poses = torch.from_numpy(np.stack([d.T_cw for d in depths]))
+            # No view has a say on the others, which may be most of a large map.
+            seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
         kept = torch.ones_like(seen)
-        if bool(seen.any()):
-            some = points.detach()[seen].numpy()
-            views = ((d.T_cw, d.depth.through_sky().arrays()) for d in posed)
-            kept[seen] = torch.from_numpy(vote(some, views, self.render))
+        views = ((d.T_cw, d.depth.through_sky().arrays()) for d in depths)
+        kept[seen] = torch.from_numpy(vote(points.detach()[seen].numpy(), views, self.render))
         return kept
 
     def photo_costs(
@@ -85,17 +82,15 @@ class CpuDepthEngine:
         others: Sequence[DepthView],
         depths: Float[Tensor, "2 h w"],
         same: Bool[Tensor, "h w"],
-        asked: Bool[Tensor, "h w"] | None = None,
+        mask: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, "2 h w"]:
         """As in the protocol."""
         from geogs.depth.revision.photo_vote import photo_costs
 
-        return photo_costs(view, others, depths, same, self.render, asked)
+        return photo_costs(view, others, depths, same, self.render, mask)
 
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
+    def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""
         from geogs.depth.revision.far_side import farther_surface
 
-        return farther_surface(depth, reach, apart)
+        return farther_surface(depth, reach)

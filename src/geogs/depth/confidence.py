@@ -1,4 +1,4 @@
-"""How likely a pixel's depth is right, from what its making has seen."""
+"""The chance that a pixel's depth is right."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,10 @@ from geogs.depth.refinement import SlantedDepth
 
 
 class ConfidenceWeights(NamedTuple):
-    """The struct of this name in ``cuda/refinement.cu``.
+    """Weights of a logistic regression of "relative depth error below 2 %" on the evidence of
+    ``depth_confidence``, and the struct of this name in ``cuda/refinement.cu``.
 
-    Weights of a logistic regression of "relative depth error below 2 %" on the evidence below,
-    fitted to two rendered rooms at once; fitted to one room they predict the other as well.
+    Fitted to two rendered rooms at once; fitted to one room they predict the other as well.
     """
 
     bias: float = -0.55

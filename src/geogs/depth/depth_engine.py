@@ -1,4 +1,4 @@
-"""What the mapper asks of whatever finds keyframe depths."""
+"""What the mapper needs of an engine that finds keyframe depths."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ class DepthTask(NamedTuple):
 
 
 def silent(fraction: float) -> None:
-    """Progress that nobody watches."""
+    """Report no progress."""
 
 
 @runtime_checkable
@@ -52,8 +52,8 @@ class DepthEngine(Protocol):
         ...
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """World points that do not stand in the free space of the depths (``vote``), as what is
-        seen in their sky does."""
+        """World points outside the free space of the depths (``vote``); points in front of their
+        sky are in free space."""
         ...
 
     def photo_costs(
@@ -62,23 +62,18 @@ class DepthEngine(Protocol):
         others: Sequence[DepthView],
         depths: Float[Tensor, "2 h w"],
         same: Bool[Tensor, "h w"],
-        asked: Bool[Tensor, "h w"] | None = None,
+        mask: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, "2 h w"]:
-        """How badly the images of the others agree at each of two depths (``photo_costs``)."""
+        """Photometric costs of two depths of each pixel (``photo_costs``)."""
         ...
 
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
-        """Depth of the farther surface beside each pixel, or 0 (``farther_surface``)."""
+    def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
+        """Depth of the farther surface beside each pixel, else 0 (``farther_surface``)."""
         ...
 
 
 class AlternativeSearch:
-    """Finds depths in a way of its own and leaves everything else to the ``classical`` engine.
-
-    That is the check by other keyframes, the votes, and what a subclass asks of it.
-    """
+    """Finds depths in its own way; checks, votes and costs are the ``classical`` engine's."""
 
     def __init__(self, classical: DepthEngine) -> None:
         self.classical = classical
@@ -97,7 +92,7 @@ class AlternativeSearch:
 
 
 class RevisedSearch(AlternativeSearch, ABC):
-    """Another engine's search, of which each depth is looked at once more by itself."""
+    """Another engine's search with each depth revised by itself."""
 
     def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
         """As in the protocol."""
@@ -113,4 +108,4 @@ class RevisedSearch(AlternativeSearch, ABC):
     def revised(
         self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
     ) -> DenseDepth:
-        """What is made of the depth of a view that was matched with some others."""
+        """The revised depth of a view that was matched with some others."""

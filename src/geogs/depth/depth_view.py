@@ -1,4 +1,4 @@
-"""What the depth estimation needs to know of one keyframe."""
+"""A keyframe as the depth estimation needs it, and its dense depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 
 INFINITY = 1e6
-"""Times a depth."""
+"""Factor on a depth that stands for infinity."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,13 +70,13 @@ class DenseDepth:
     confidence: Float32[Tensor, "h w"]
     """In [0, 1]; about the chance that the depth is right to 2 %."""
     median: Float32[Tensor, ""]
-    """About the median depth, in memory of the host; to be read as ``typical``."""
+    """About the median depth, in host memory; read it as ``typical``."""
     written: torch.cuda.Event | None = None
-    """After which a GPU has written the median."""
+    """Event after which a GPU has written the median."""
     normal: Float32[Tensor, "h w 3"] | None = None
-    """Unit, camera frame, facing the camera, where who found the depth knows it; zero elsewhere."""
+    """Unit, camera frame, facing the camera; zero where unknown."""
     sky: Bool[Tensor, "h w"] | None = None
-    """Where nothing is, however far one looks; there nothing is known of a depth, either."""
+    """Pixels without a surface at any depth; their confidence is 0."""
 
     @staticmethod
     def of(depth: KeyframeDepth) -> "DenseDepth":
@@ -95,31 +95,30 @@ class DenseDepth:
         return float(self.median)
 
     def arrays(self) -> KeyframeDepth:
-        """As arrays: the same memory where the tensors are on the CPU."""
+        """The same as arrays, in the same memory where the tensors are on the CPU."""
         return KeyframeDepth(self.depth.cpu().numpy(), self.confidence.cpu().numpy())
 
     def within(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
-        """Nothing known outside the mask; the median is that of the inside."""
-        inside = self.depth[mask]
-        median = inside.median().cpu() if len(inside) else self.median
-        confidence = torch.where(mask, self.confidence, 0.0)
-        written = None if len(inside) else self.written
-        return replace(self, confidence=confidence, median=median, written=written)
+        """The depth with confidence 0 outside the mask; the median is that of the inside."""
+        inside, confidence = self.depth[mask], torch.where(mask, self.confidence, 0.0)
+        if not len(inside):
+            return replace(self, confidence=confidence)
+        return replace(self, confidence=confidence, median=inside.median().cpu(), written=None)
 
-    def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
-        """Nothing known in the mask, and no normals anywhere: of bare walls the network's are worse
-        than those of the map. The depth there, and the median, stay what they are."""
+    def unknown_in(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
+        """The depth with confidence 0 in the mask, and without normals: on bare walls the network's
+        are worse than the map's. Depth and median stay."""
         confidence = torch.where(mask.to(self.confidence.device), 0.0, self.confidence)
         return replace(self, confidence=confidence, normal=None)
 
     def under(self, sky: Bool[Tensor, "h w"] | None) -> "DenseDepth":
-        """With that sky, if there is one."""
+        """The depth with that sky, if any."""
         if sky is None:
             return self
         return replace(self, confidence=torch.where(sky, 0.0, self.confidence), sky=sky)
 
     def through_sky(self) -> "DenseDepth":
-        """Its sky as a depth that is sure, and behind everything."""
+        """The depth with its sky behind everything, at confidence 1."""
         if self.sky is None:
             return self
         far = torch.where(self.sky, INFINITY * self.depth, self.depth)
@@ -153,7 +152,7 @@ def depth_images(
 def relative_poses(
     reference: DepthView, neighbours: Sequence[DepthView]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """What takes the reference's frame to the neighbours'."""
+    """Transformations from the reference's camera to the neighbours'."""
     return np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
 
 

@@ -26,29 +26,29 @@ def _cost_at(costs, first, spacing, rho):
 
 @njit(**_PART)
 def _add_sides(
-    y, v, dx, first, last, rho, slope_x, slope_y, confidence, guide, contrast, apart, sums
+    y, v, dx, first, last, rho, slope_x, slope_y, confidence, guide, contrast, gap, sums
 ):
-    """What the pixels (dx, v - y) away say to the pixels ``first`` to ``last`` of row y.
+    """Votes of the pixels (dx, v - y) away on the pixels ``first`` to ``last`` of row y.
 
-    ``sums`` (5, w) grows by the weight of those of the same surface, by that of farther ones, of
-    nearer ones, and by the weighted inverse depths of the farther and of the nearer ones.
+    To ``sums`` (5, w) are added the weights of those of the same surface, of farther and of nearer
+    ones, and the weighted inverse depths of the farther and of the nearer ones.
     """
     # Views, because an index that could be negative would keep the loop from vectorising.
     own, there = rho[y, first:last], rho[v, first + dx : last + dx]
     gx, gy = slope_x[v, first + dx : last + dx], slope_y[v, first + dx : last + dx]
-    sure = confidence[v, first + dx : last + dx]
+    conf = confidence[v, first + dx : last + dx]
     g0, g1, g2 = guide[0, y, first:last], guide[1, y, first:last], guide[2, y, first:last]
     k0, k1 = guide[0, v, first + dx : last + dx], guide[1, v, first + dx : last + dx]
     k2 = guide[2, v, first + dx : last + dx]
     same, far, near = sums[0, first:last], sums[1, first:last], sums[2, first:last]
     far_sum, near_sum = sums[3, first:last], sums[4, first:last]
     right, down = np.float32(dx), np.float32(v - y)
-    low, high = ONE - apart, ONE + apart
+    low, high = ONE - gap, ONE + gap
     for x in range(last - first):
         d0, d1, d2 = k0[x] - g0[x], k1[x] - g1[x], k2[x] - g2[x]
         like = ONE + contrast * (d0 * d0 + d1 * d1 + d2 * d2)
         value = there[x] - gx[x] * right - gy[x] * down
-        weight = sure[x] / (like * like)
+        weight = conf[x] / (like * like)
         is_far, is_near = value <= own[x] * low, value >= own[x] * high
         of_far = weight if is_far & (value > ZERO) else ZERO
         of_near = weight if is_near else ZERO
@@ -90,12 +90,12 @@ def _mode(samples, count, low, high, start, width, rounds, mode):
     depth, slopes and confidence; returns the weight behind it.
     """
     centre, total = start, ZERO
-    across = down = sure = ZERO
+    across = down = conf = ZERO
     values, slopes_x, slopes_y = samples[0], samples[1], samples[2]
     weights, confidences = samples[3], samples[4]
     for _ in range(rounds):
         inverse = ONE / (width * centre)
-        total = place = across = down = sure = ZERO
+        total = place = across = down = conf = ZERO
         for i in range(count):
             value = values[i]
             away = (value - centre) * inverse
@@ -105,25 +105,25 @@ def _mode(samples, count, low, high, start, width, rounds, mode):
             place += weight * value
             across += weight * slopes_x[i]
             down += weight * slopes_y[i]
-            sure += weight * confidences[i]
+            conf += weight * confidences[i]
         scale = ONE / max(total, np.float32(1e-12))
-        centre, across, down, sure = place * scale, across * scale, down * scale, sure * scale
-    mode[0], mode[1], mode[2], mode[3] = centre, across, down, sure
+        centre, across, down, conf = place * scale, across * scale, down * scale, conf * scale
+    mode[0], mode[1], mode[2], mode[3] = centre, across, down, conf
     return total
 
 
 @njit(**_FAST)
 def resolve_edges(
     first, last, rho, slope_x, slope_y, confidence, guide, costs, plane, spacing, reach, contrast,
-    apart, width, trust, rounds, moved, new_rho, new_x, new_y, new_confidence,
+    gap, width, trust, rounds, moved, new_rho, new_x, new_y, new_confidence,
 ):  # fmt: skip
     """Give each pixel the plane that those of like colour around it and its matching cost favour.
 
-    Candidates are the modes of what is farther and what is nearer by a relative ``apart``; less
-    apart is the pixel's own surface. A candidate's score is the log ratio of its weight to the own
-    surface's plus ``trust`` times how much less its matching cost is; the best above 0 is taken,
-    with ``moved`` times the mean confidence of those that are for it. Row by row all pixels are
-    asked how much there is of each side; only those are looked at alone whom that could move.
+    Candidates are the modes of the pixels that are farther and nearer by a relative ``gap``; the
+    others are of the pixel's own surface. A candidate's score is the log ratio of its weight to the
+    own surface's plus ``trust`` times how much less its matching cost is; the best above 0 is
+    taken, with ``moved`` times the mean confidence of its voters. The weights of both sides are
+    summed row by row; only pixels that they could move are looked at one by one.
     """
     h, w = rho.shape
     samples = np.empty((5, (2 * reach + 1) ** 2), np.float32)
@@ -135,7 +135,7 @@ def resolve_edges(
             for dx in range(-reach, reach + 1):
                 _add_sides(
                     y, v, dx, max(0, -dx), min(w, w - dx), rho, slope_x, slope_y, confidence,
-                    guide, contrast, apart, sums,
+                    guide, contrast, gap, sums,
                 )  # fmt: skip
         for x in range(w):
             own, same = rho[y, x], sums[0, x]
@@ -143,7 +143,7 @@ def resolve_edges(
             new_confidence[y, x] = confidence[y, x]
             if max(sums[1, x], sums[2, x]) < enough:
                 continue
-            far, near = own * (ONE - apart), own * (ONE + apart)
+            far, near = own * (ONE - gap), own * (ONE + gap)
             best, count = ZERO, 0
             here = _cost_at(costs[y, x], plane, spacing, own)
             for side in range(2):

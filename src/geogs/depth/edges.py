@@ -13,27 +13,27 @@ from geogs.depth.refinement import SlantedDepth
 from geogs.threads import over_rows
 
 REACH = 0.019
-"""Surfaces so far away have a say, in long edges of the image: 6 pixels of 320."""
+"""Half side of the window of pixels that vote, in long edges of the image: 6 pixels of 320."""
 LEAST_REACH = 4
-"""Pixels, in small images."""
+"""The same in pixels, at least."""
 CONTRAST = 300.0
-"""How fast a pixel's say falls with its colour difference, squared; the fall is squared, too."""
-APART = 0.015
+"""How fast a pixel's weight falls with its squared colour difference; the fall is squared, too."""
+MIN_GAP = 0.015
 """Relative difference of inverse depth from which a pixel around is of another surface."""
 WIDTH = 0.02
-"""Relative width of the kernel with which the mode of such pixels is sought."""
+"""Relative width of the kernel of the mean shift to the mode of such pixels."""
 MEAN_SHIFTS = 3
-"""Steps to the mode."""
+"""Steps of the mean shift."""
 COST_TRUST = 6.0
-"""What a matching cost that is less by 1 counts, as a log ratio of weights."""
+"""Weight of a difference of matching costs against a log ratio of the votes."""
 PASSES = 2
-"""Times that all pixels are asked; what has moved is in the way of the next no more."""
+"""Rounds over all pixels; pixels that moved in one no longer vote for the foreground."""
 MOVED_CONFIDENCE = 0.7
-"""Share of the confidence around that a pixel keeps which takes another plane, as measured."""
+"""Confidence of a pixel that takes another plane, over that of the pixels around, as measured."""
 
 
 def reach_of(shape: tuple[int, ...]) -> int:
-    """Pixels that ``REACH`` is in an image."""
+    """``REACH`` in pixels of an image."""
     return max(LEAST_REACH, round(REACH * max(shape)))
 
 
@@ -43,18 +43,18 @@ def resolve_edges(
     guide: Float32[np.ndarray, "3 h w"],
     sweep: SweepResult,
 ) -> tuple[SlantedDepth, Float32[np.ndarray, "h w"]]:
-    """The depth with each pixel on the surface that it most likely shows, and the confidence.
+    """Depth with each pixel on the surface that it most likely shows, and its confidence.
 
-    A pixel may take the plane of farther or nearer pixels around. Each of these has a say by its
-    confidence and its likeness in colour (adaptive support weights, Yoon and Kweon 2006). The modes
-    of their planes' inverse depths there are candidates (mean shift), as in a weighted median
-    filter of a disparity map (Ma et al. 2013), and the sweep's aggregated cost of each counts, too.
-    ``guide`` is the image in [0, 1].
+    A pixel may take the plane of farther or nearer pixels around. These are weighted by confidence
+    and likeness in colour (adaptive support weights, Yoon and Kweon 2006). The modes of their
+    planes' inverse depths at the pixel are candidates (mean shift), as in a weighted median filter
+    of a disparity map (Ma et al. 2013); the sweep's aggregated cost of each counts, too. ``guide``
+    is the image in [0, 1].
     """
     maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
     f, planes = np.float32, sweep.planes
-    spacing = (planes[-1] - planes[0]) / f(max(len(planes) - 1, 1))
-    settings = [f(x) for x in (CONTRAST, APART, WIDTH, COST_TRUST)]
+    spacing = (planes[-1] - planes[0]) / f(len(planes) - 1)
+    settings = [f(x) for x in (CONTRAST, MIN_GAP, WIDTH, COST_TRUST)]
     for _ in range(PASSES):
         old, maps = maps, [np.empty_like(m) for m in maps]
         over_rows(

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from geogs.config import DepthConfig
-from geogs.depth.completion import complete_inverse_depth
 from geogs.depth.confidence import depth_confidence
 from geogs.depth.depth_view import DepthView, KeyframeDepth
 from geogs.depth.edges import resolve_edges
 from geogs.depth.evidence import choose_start, tracker_evidence
+from geogs.depth.grid_completion import complete_inverse_depth
 from geogs.depth.plane_sweep import plane_sweep, sweep_planes
 from geogs.depth.refinement import colour_guide, refine_depth
 from geogs.depth.sweep_neighbors import depth_range

@@ -1,22 +1,23 @@
-"""What the tracker and the sweep know of a keyframe's depth, at the render size."""
+"""The tracker's depth and its weight against the sweep's, at the render size."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.depth.completion import CompletedDepth, upsample_grid
+from geogs.depth.grid_completion import CompletedDepth, upsample_grid
 from geogs.depth.plane_sweep import SweepResult
 from geogs.geometry.camera import Camera
 
 CONFIDENT_DEVIATION = 0.05
 """Relative deviation at which the confidence in the tracker is 1/2."""
 TRACKER_SCALE = 0.5
-"""Taken for the real over the expected relative deviation of the tracker's depth: more than the 0.2
-that rendered rooms have in the median, as a cell near an edge may be of either side."""
+"""Real over expected relative deviation of the tracker's depth, as assumed: more than the median of
+0.2 on rendered rooms, as a cell near an edge may be of either side."""
 UNKNOWN_DEVIATION = 10.0
+"""Relative deviation of a cell that the completion rejected."""
 BEST_DEVIATION = 0.002
-"""Relative deviation below which the tracker is not believed."""
+"""Least relative deviation of the tracker's depth."""
 KINK = 0.04
 """Relative second difference of inverse depth between cells that marks a depth edge."""
 
@@ -41,8 +42,8 @@ def tracker_evidence(completed: CompletedDepth, working: Camera, render: Camera)
 def prior_weight(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
     """1 / (1 + (deviation / confident one)^2) on the grid, 0 where the tracker was rejected.
 
-    Where inverse depth bends sharply between cells, it falls to nothing: what is interpolated there
-    from foreground to background the tracker has not seen.
+    It falls to 0 where inverse depth bends sharply between cells: there it is interpolated from
+    foreground to background.
     """
     weight = 1.0 / (1.0 + (completed.deviation / np.float32(CONFIDENT_DEVIATION)) ** 2)
     return np.where(completed.inlier, _flatness(completed.inverse_depth) * weight, np.float32(0.0))
@@ -51,8 +52,8 @@ def prior_weight(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
 def relative_precision(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
     """1 / sigma^2 on the grid.
 
-    sigma is ``TRACKER_SCALE`` times the deviation the tracker expects. As ``prior_weight`` it falls
-    to nothing where inverse depth bends, and where the robust completion rejected the tracker.
+    sigma is ``TRACKER_SCALE`` times the deviation that the tracker expects. As ``prior_weight``, it
+    falls to about 0 where inverse depth bends and where the completion rejected the tracker.
     """
     deviation = np.where(completed.inlier, completed.deviation, np.float32(UNKNOWN_DEVIATION))
     sigma = np.maximum(np.float32(TRACKER_SCALE) * deviation, np.float32(BEST_DEVIATION))
@@ -62,9 +63,9 @@ def relative_precision(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"
 def choose_start(
     tracker: TrackerEvidence, sweep: SweepResult
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """The inverse depth to refine, and how much each pixel counts in the first plane fits.
+    """The inverse depth to refine, and the weight of each pixel in the first plane fits.
 
-    It is the sweep's, or the tracker's where that is confident and the sweep is not better.
+    The depth is the sweep's, or the tracker's where that is confident and the sweep not better.
     """
     prior, confidence = tracker.inverse_depth, tracker.prior_weight
     unique = np.clip(0.5 * sweep.margin - 0.25, 0.0, 1.0) * (sweep.cost < 0.8)

@@ -1,4 +1,4 @@
-"""What the depths of other keyframes say to the depth of one."""
+"""The check of a keyframe's depth by those of other keyframes."""
 
 from collections.abc import Sequence
 
@@ -10,15 +10,9 @@ from geogs.depth.depth_view import KeyframeDepth
 from geogs.depth.reprojection_kernels import agree_on_depth, splat_depth
 from geogs.geometry.camera import Camera
 
-# Logistic regression of "relative error below 2 %" as in depth_confidence, with the neighbours'
-# votes as evidence.
-_BIAS = -0.10
-_OWN = 0.66
-_SUPPORT = 0.72
-_VIOLATION = -0.92
-
-WEIGHTS = (_BIAS, _OWN, _SUPPORT, _VIOLATION)
-"""All of them, for the CUDA kernel."""
+BIAS, OWN, SUPPORT, VIOLATION = -0.10, 0.66, 0.72, -0.92
+"""Logistic regression of "relative error below 2 %", as in ``depth_confidence``, on the confidence
+and the others' votes."""
 SPLAT_CONFIDENCE = 0.5
 """Confidence from which pixels of other keyframes repair this one."""
 
@@ -31,7 +25,7 @@ VIOLATION_DISTANCE = 0.05
 REPAIR_BELOW = 0.4
 """Confidence below which a pixel takes the depth that others agree on."""
 REPAIR_VOTES = 1.0
-"""Sum of the others' confidences needed for that: more than one says it."""
+"""Sum of the others' confidences needed for that, so that more than one agrees."""
 REPAIR_CONFIDENCE = 0.3
 """Confidence of such a pixel before the others' votes are counted."""
 OCCLUSION_PENALTY = 0.7
@@ -53,8 +47,6 @@ def check_depth(
     point violate it, since they see free space where it stands. Meant to be called once per
     estimate: votes counted twice raise the confidence too far.
     """
-    if not others:
-        return depth
     T_wc = np.linalg.inv(T_cw)
     depth = _repair(depth, T_wc, others, other_poses, camera)
     points = depth.depth.reshape(-1, 1) * camera.rays().numpy().reshape(-1, 3)
@@ -70,8 +62,8 @@ def check_depth(
     shape = depth.depth.shape
     averaged = depth.depth / (1.0 + shift / (votes + np.float32(0.5))).reshape(shape)
     own = np.clip(depth.confidence, 1e-3, 1.0 - 1e-3)
-    score = _BIAS + _OWN * np.log(own / (1.0 - own))
-    score += (_SUPPORT * np.log(support + 0.2) + _VIOLATION * violation).reshape(shape)
+    score = BIAS + OWN * np.log(own / (1.0 - own))
+    score += (SUPPORT * np.log(support + 0.2) + VIOLATION * violation).reshape(shape)
     return KeyframeDepth(averaged, (1.0 / (1.0 + np.exp(-score))).astype(np.float32))
 
 
@@ -82,7 +74,7 @@ def _repair(
     other_poses: Sequence[Float64[np.ndarray, "4 4"]],
     camera: Camera,
 ) -> KeyframeDepth:
-    """Pixels of low confidence replaced by what the confident ones of other views show there."""
+    """The depth with pixels of low confidence replaced by confident ones of other views."""
     shape = (len(others), *depth.depth.shape)
     seen, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     rays = camera.rays().numpy().reshape(-1, 3)

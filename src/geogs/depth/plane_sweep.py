@@ -14,10 +14,10 @@ from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
 
 PLANE_STEP = 1.2
-"""Pixels that the median neighbour moves from plane to plane: no window steps over its match, which
-a parabola and the refinement then find between planes."""
+"""Pixels that the median neighbour moves from plane to plane: none skips a match, which a parabola
+and the refinement then find between planes."""
 LEAST_PART = 1 / 3
-"""Part of the most planes that are swept at least, however little the neighbours move."""
+"""Least fraction of the most planes that is swept, however little the neighbours move."""
 WINDOW = 3
 """Side of the matching window in pixels: small, as like colours are averaged after it."""
 VARIANCE_FLOOR = 1e-5
@@ -25,7 +25,7 @@ VARIANCE_FLOOR = 1e-5
 SUPPORT_RADIUS = 3
 """Pixels over which matching costs are averaged."""
 SUPPORT_SHARPNESS = 400.0
-"""How fast that average forgets pixels of another colour (RGB in 0 to 1, squared)."""
+"""How fast their weight falls with the squared colour difference (RGB in 0 to 1)."""
 PRIOR_PULL = 0.3
 """Cost of a plane far from the tracker's depth where the tracker is confident."""
 PRIOR_TOLERANCE = 0.03
@@ -61,23 +61,22 @@ def sweep_planes(
     far: float,
     most: int,
 ) -> Float32[np.ndarray, "p"]:
-    """At most so many inverse depths, and at least ``LEAST_PART`` of them, equally spaced.
+    """At most ``most`` inverse depths, and at least ``LEAST_PART`` of these, equally spaced.
 
-    The median neighbour moves ``PLANE_STEP`` from one to the next.
+    The median of the neighbours, of which there must be one, moves ``PLANE_STEP`` from one to the
+    next.
     """
     pixels = np.array([[x, y] for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)])
     pixels = pixels * [camera.width, camera.height] - [camera.cx, camera.cy]
     rays = np.concatenate([pixels / [camera.fx, camera.fy], np.ones((len(pixels), 1))], 1)
-    shifts = [0.0]
-    if neighbours:
-        relative = relative_poses(reference, neighbours)
-        rotated = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
-        ends = [rotated + relative[:, None, :3, 3] / z for z in (near, far)]
-        seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
-        p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
-        moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
-        shifts += [float(np.median(m[s])) for m, s in zip(moved, seen, strict=True) if s.any()]
-    steps = np.median(shifts[1:] or shifts) / PLANE_STEP
+    relative = relative_poses(reference, neighbours)
+    rotated = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
+    ends = [rotated + relative[:, None, :3, 3] / z for z in (near, far)]
+    seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
+    p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
+    moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
+    shifts = [np.median(m[s]) for m, s in zip(moved, seen, strict=True) if s.any()]
+    steps = np.median(shifts or [0.0]) / PLANE_STEP
     count = int(np.clip(np.ceil(steps), max(2, int(LEAST_PART * most)), most))
     return np.linspace(1.0 / far, 1.0 / near, count, dtype=np.float32)
 
@@ -114,7 +113,7 @@ def plane_sweep(
     guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
     small, large = np.float32(SMALL_JUMP), np.float32(LARGE_JUMP)
     contrast = np.float32(JUMP_CONTRAST)
-    raw.fill(0.0)  # is needed no more, and volumes are what takes most memory here
+    raw.fill(0.0)  # used again, as volumes take most of the memory
     totals = raw, np.zeros_like(raw)
     run_chunks(
         lambda k: kernels.aggregate_paths(

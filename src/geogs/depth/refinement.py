@@ -20,8 +20,8 @@ PATCH_REACH = 2
 PATCH_CONTRAST = 500.0
 """How fast a patch sample's weight falls with its grey difference, squared."""
 REFINE_STEPS = (2, 2, 1)
-"""Photometric steps, each with a fit of local planes: of a patch each compares every so many-th
-sample. Every second is those of one colour on a chessboard, which do for all steps but the last."""
+"""Stride over the samples of a patch in each photometric step, which a fit of local planes follows.
+Every second sample, those of one colour on a chessboard, is enough but in the last step."""
 STEP_LIMIT = 0.03
 """Largest step, relative to inverse depth: beyond it patches are no longer alike."""
 PHOTO_DEVIATION = 0.07
@@ -59,7 +59,7 @@ class SlantedDepth:
 
 @dataclass(frozen=True, slots=True)
 class _Patches:
-    """What the photometric steps compare: reference patches, their weights, and the neighbours."""
+    """Reference patches, their weights and the neighbours, for the photometric steps."""
 
     samples: Float32[np.ndarray, "s h w"]
     offsets: Float32[np.ndarray, "s 2"]
@@ -70,7 +70,7 @@ class _Patches:
     b: np.ndarray
 
     def every(self, step: int) -> "_Patches":
-        """With every so many-th sample."""
+        """The patches with every ``step``-th sample."""
         if step == 1:
             return self
         samples, weights = self.samples[::step].copy(), self.weights[::step].copy()
@@ -90,10 +90,10 @@ def refine_depth(
 ) -> SlantedDepth:
     """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
 
-    They begin at the inverse depth ``rho``; ``confidence`` (0 to 1) says which pixels make the
-    first planes; ``guide`` is the image of :func:`colour_guide`. After each step a pixel's inverse
-    depth is the precision-weighted mean of the photometric optimum, the tracker's value (robust)
-    and the local plane.
+    They begin at the inverse depth ``rho``; ``confidence`` (0 to 1) weights the pixels in the first
+    planes; ``guide`` is the image of :func:`colour_guide`. After each step inverse depth is the
+    precision-weighted mean of the photometric optimum, the tracker's value (robust) and the local
+    plane.
     """
     patches = _gather_patches(reference, neighbours, render, working)
     compared = {step: patches.every(step) for step in set(REFINE_STEPS)}

@@ -20,7 +20,7 @@ ONE = np.float32(1.0)
 
 @njit(**_PART)
 def _place_row(pairs, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, du, dv, inside):
-    """Where the samples of one row lie in an image, and how they move with inverse depth.
+    """Positions of one row's samples in an image, and their derivatives by inverse depth.
 
     The patch sample (ox, oy) of pixel (x, y) has inverse depth rho + slope_x ox + slope_y oy and
     projects to a p + rho b (homogeneous).
@@ -159,22 +159,9 @@ def _add_neighbour(own, sums, inside, floor, total):
 
 @njit(**_FAST)
 def fit_planes(
-    first,
-    last,
-    rho,
-    slope_x,
-    slope_y,
-    confidence,
-    guide,
-    radius,
-    contrast,
-    tolerance,
-    stiffness,
-    new_rho,
-    new_x,
-    new_y,
-    support,
-):
+    first, last, rho, slope_x, slope_y, confidence, guide, radius, contrast, tolerance, stiffness,
+    new_rho, new_x, new_y, support,
+):  # fmt: skip
     """Weighted least-squares plane of inverse depth around each pixel (bilateral, robust).
 
     A pixel within ``radius`` counts by its confidence, its likeness in colour
@@ -224,7 +211,7 @@ def _add_samples(
     # Views, because an index that could be negative would keep the loop from vectorising.
     here, there = rho[y, first:last], rho[yy, first + dx : last + dx]
     gx, gy = slope_x[y, first:last], slope_y[y, first:last]
-    sure = confidence[yy, first + dx : last + dx]
+    conf = confidence[yy, first + dx : last + dx]
     fx, fy = np.float32(dx), np.float32(yy - y)
     t0, t1, t2 = sums[0, first:last], sums[1, first:last], sums[2, first:last]
     t3, t4 = sums[3, first:last], sums[4, first:last]
@@ -236,7 +223,7 @@ def _add_samples(
         c0, c1, c2 = g0[x] - k0[x], g1[x] - k1[x], g2[x] - k2[x]
         far = r / (tolerance * here[x])
         like = ONE + contrast * (c0 * c0 + c1 * c1 + c2 * c2)
-        m = sure[x] / (like * (ONE + far * far))
+        m = conf[x] / (like * (ONE + far * far))
         t0[x] += m
         t1[x] += m * fx
         t2[x] += m * fx * fx

@@ -7,8 +7,10 @@ _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 
 @njit(**_FAST)
-def relative_depths(points, rotation, translation, lens, depth, confidence, ratio, sure):
-    """z / depth at each point's pixel of a view, and that pixel's confidence.
+def relative_depths(
+    points, rotation, translation, lens, depth, confidence, ratio, found_confidence
+):
+    """Ratio z / depth of each point at its pixel of a view, and that pixel's confidence.
 
     ``points`` (n, 3) float32 in any frame that (rotation, translation) takes to the view's camera;
     ``lens`` = (fx, fy, cx, cy). Points behind the camera, outside the image or on a pixel without
@@ -17,7 +19,7 @@ def relative_depths(points, rotation, translation, lens, depth, confidence, rati
     h, w = depth.shape
     for i in range(points.shape[0]):
         ratio[i] = np.float32(0.0)
-        sure[i] = np.float32(0.0)
+        found_confidence[i] = np.float32(0.0)
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         cz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
         if not cz > np.float32(1e-4):
@@ -31,7 +33,7 @@ def relative_depths(points, rotation, translation, lens, depth, confidence, rati
         d = depth[int(v), int(u)]
         if d > np.float32(0.0):
             ratio[i] = cz / d
-            sure[i] = confidence[int(v), int(u)]
+            found_confidence[i] = confidence[int(v), int(u)]
 
 
 @njit(**_FAST)
@@ -63,10 +65,10 @@ def splat_depth(points, confidence, rotation, translation, lens, least, depth, w
 
 
 @njit(**_FAST)
-def agree_on_depth(depths, weights, asked, reach, clearance, penalty, best, score):
-    """The best of several depths of each pixel that is ``asked`` about, 0 being none, as elsewhere.
+def agree_on_depth(depths, weights, mask, reach, clearance, penalty, best, score):
+    """The best of several depths of each pixel in a ``mask``; 0 is none, as outside the mask.
 
-    depths, weights (n, h, w); asked (h, w). A depth's score is the sum of weights of those near it
+    depths, weights (n, h, w); mask (h, w). A depth's score is the sum of weights of those near it
     (Gaussian, relative ``reach``) less ``penalty`` times those more than ``clearance`` in front of
     it.
     """
@@ -75,7 +77,7 @@ def agree_on_depth(depths, weights, asked, reach, clearance, penalty, best, scor
     for y in range(h):
         for x in range(w):
             top, winner = np.float32(0.0), np.float32(0.0)
-            for j in range(n if asked[y, x] else 0):
+            for j in range(n if mask[y, x] else 0):
                 d = depths[j, y, x]
                 if d <= np.float32(0.0):
                     continue

@@ -1,8 +1,7 @@
 """Grey values between pixels: each pixel with its right neighbour in one word, fetched by index.
 
-No processor that we know gathers single pixels faster than one after the other, so that the loop
-over a row only copies words, two a sample, and what is computed of them is left to loops that the
-compiler turns into vector instructions.
+No processor that we know gathers pixels faster than by single loads, so that the loop over a row
+only copies words, two a sample, and the computation is left to loops that the compiler vectorises.
 """
 
 import numpy as np
@@ -15,7 +14,7 @@ _PART = inlined({"nogil": True, "fastmath": True, "error_model": "numpy"})
 
 def pixel_pairs(images: np.ndarray) -> np.ndarray:
     """Words (n, h, w) of 64 bits, each of a float32 pixel (n, h, w) and the one to its right; the
-    last of a row stands beside itself."""
+    last of a row is repeated."""
     pairs = np.empty((*images.shape, 2), np.float32)
     pairs[..., 0] = images
     pairs[..., :-1, 1] = images[..., 1:]

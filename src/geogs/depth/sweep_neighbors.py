@@ -1,4 +1,4 @@
-"""Which keyframes to match a keyframe with, and over which depths."""
+"""Selection of the keyframes that a keyframe is matched with, and of its depth range."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,41 +11,41 @@ from geogs.geometry.camera import Camera
 from geogs.world.grid import OFFSET, STRIDE
 
 NEIGHBOURS = 8
-"""Keyframes to match one with: more see it from farther aside."""
+"""Keyframes to match one with: more of them are too far aside."""
 BEST_PARALLAX_DEG = 6.0
-"""Best angle between the rays of two keyframes: smaller ones tell less, larger ones look less
-alike."""
+"""Best angle between the rays of two keyframes: at smaller ones depth is less precise, at larger
+ones surfaces look less alike."""
 MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 1.0, 25.0
 """Least and largest usable angle."""
 MAX_VIEW_ANGLE_DEG = 35.0
 """Largest angle between viewing directions."""
 MIN_OVERLAP = 0.3
-"""Least part of what a keyframe sees that another has to see as well."""
+"""Least fraction of a keyframe's points that another has to see."""
 USUAL_ZOOM = 1.5
 """Ratio of the distances from two keyframes at which a surface looks less alike."""
 MAX_BASELINE_COSINE = 0.97
-"""Baselines closer to parallel than this are left to others where there is choice."""
+"""Largest cosine between two baselines where there is a choice."""
 _RASTER = 9
 """Points along either side of an image by which pairs are judged."""
 RANGE_MARGIN = 1.3
-"""Factor by which searched depths go beyond those that are known, which are not all."""
+"""Factor by which the range exceeds that of the known depths, which are not all."""
 RANGE_DEVIATION = 0.1
-"""Relative deviation below which the tracker's depth counts for the range."""
+"""Relative deviation of the tracker's depths that count for the range in any case."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPairs:
-    """How others see what one keyframe sees: a raster of points at its typical depth.
+    """Geometry of pairs of one keyframe and others, by a raster of points at its typical depth.
 
-    All over the image, since a camera that moves straight on sees no parallax ahead.
+    The points are all over the image: a camera that moves straight on sees no parallax ahead.
     """
 
     parallax: Float64[np.ndarray, "n"]
-    """Degrees between the two rays to a point, median of what both see; 0 if that is nothing."""
+    """Degrees between the two rays to a point, median of those that both see; 0 if none."""
     rotation: Float64[np.ndarray, "n"]
     """Degrees between the viewing directions."""
     overlap: Float64[np.ndarray, "n"]
-    """Part of the points that the other sees."""
+    """Fraction of the points that the other sees."""
     zoom: Float64[np.ndarray, "n"]
     """Ratio, at least 1, of the distances to a point, median of those that both see."""
 
@@ -57,7 +57,7 @@ class ViewPairs:
         return in_range & (self.rotation < max_rotation) & (self.overlap >= MIN_OVERLAP)
 
     def misfit(self, best: float) -> Float64[np.ndarray, "n"]:
-        """How far pairs are from ``best`` degrees of parallax (log scale) and from looks alike."""
+        """Penalty for parallax other than ``best`` (log scale), rotation, zoom, missing overlap."""
         parallax = np.abs(np.log(np.maximum(self.parallax, 0.05) / best))
         zoom = (np.log(self.zoom) / np.log(USUAL_ZOOM)) ** 2
         unseen = -np.log(np.maximum(self.overlap, 0.5 / _RASTER**2))
@@ -114,11 +114,10 @@ def select_sweep_neighbours(
 ) -> list[int]:
     """Indices of the at most ``most`` best candidates, best first; all views are of ``camera``.
 
-    Good is a parallax near ``BEST_PARALLAX_DEG`` at ``depth`` (on a log scale), a similar viewing
-    direction and distance, and to see much of the same. Where there is choice, baselines point
-    different ways, so that edges of any orientation can be matched. Too small or too large a
-    parallax, too little overlap, or looking more than 35 degrees aside, excludes; if nobody is
-    left, the two nearest to good are taken.
+    The best have a parallax near ``BEST_PARALLAX_DEG`` at ``depth``, a similar viewing direction
+    and distance, and see much of the same. Where there is a choice, baselines differ in direction,
+    so that edges of any orientation can be matched. Pairs that are not ``usable`` are excluded; if
+    all are, the two best of them are taken.
     """
     others = np.array([i for i, v in enumerate(candidates) if v.id != reference.id], int)
     if len(others) == 0:
@@ -130,8 +129,7 @@ def select_sweep_neighbours(
     count = int(usable.sum())
     if count == 0:
         return ranked[:2]
-    usable_ids = ranked[:count]
-    pool = usable_ids[: 3 * most]
+    pool = ranked[: min(count, 3 * most)]
     chosen: list[int] = []
     directions: list[np.ndarray] = []
     spread = len(pool) >= 2 * most
@@ -151,9 +149,9 @@ def depth_range(
 ) -> tuple[float, float]:
     """Nearest and farthest depth to search in the reference view.
 
-    From the more certain half of what the tracker knows in this and the other views (and all whose
-    relative deviation is below ``RANGE_DEVIATION``), seen from the reference and widened by
-    ``RANGE_MARGIN`` on both sides. (0.1, 10) if the tracker knows next to nothing.
+    The range of the tracker's depths in all views, seen from the reference, widened by
+    ``RANGE_MARGIN`` on both sides; of each view the more certain half, and all below
+    ``RANGE_DEVIATION``, count. (0.1, 10) if the tracker knows next to nothing.
     """
     inverse = seen_inverse_depth(reference, (reference, *others), working)
     if len(inverse) < 8:

@@ -1,4 +1,4 @@
-"""The tracker's own depth as a keyframe's dense depth: the paper's D_f, with no search."""
+"""The tracker's own depth as a keyframe's dense depth, without a search: the paper's D_f."""
 
 from collections.abc import Sequence
 
@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from geogs.depth.completion import known_cells, upsample_grid
 from geogs.depth.depth_engine import AlternativeSearch, DepthEngine, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
+from geogs.depth.grid_completion import known_cells, upsample_grid
 from geogs.geometry.camera import Camera
 
 VALID_DEVIATION = 0.3
@@ -37,7 +37,7 @@ def enlarged_depth(
 
 
 class TrackerDepthEngine(AlternativeSearch):
-    """Depths as the bundle adjustment has left them; a search engine votes on points, if asked."""
+    """Depths of the bundle adjustment; a search engine votes on points."""
 
     def __init__(
         self, classical: DepthEngine, device: torch.device, render: Camera, working: Camera
@@ -51,7 +51,7 @@ class TrackerDepthEngine(AlternativeSearch):
         """As in the protocol; nothing is matched."""
 
     def estimate(self, tasks: Sequence[DepthTask], progress: Progress = silent) -> list[DenseDepth]:
-        """As in the protocol; neighbours and limits say nothing."""
+        """As in the protocol; neighbours and limits are not used."""
         grids = ((task.view.inverse_depth, task.view.information) for task in tasks)
         return [self._dense(enlarged_depth(*g, self.working, self.render)) for g in grids]
 

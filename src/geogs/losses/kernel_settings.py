@@ -1,4 +1,4 @@
-"""What kernels are told of the losses: float32 records, read by the names of their fields.
+"""Settings of the losses for kernels: float32 records, read by the names of their fields.
 
 On a GPU they are the structs of these names in ``cuda/view_maps.cuh``.
 """

@@ -1,4 +1,4 @@
-"""What the losses between two views know of each, and how their weights are meant."""
+"""Views for the losses between two views, and the weights of these."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.losses.light import USUAL_NOISE
+from geogs.losses.exposure import USUAL_NOISE
 
 # A point must keep this fraction of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
-# Degrees between the rays of two views at which the occlusion test is told in pixels.
+# Degrees between the rays of two views at which a tolerance in pixels is one in depth.
 _PARALLAX = 10.0
 _TEXTURE_SIDE = 5
 """Side in pixels of the window whose variance is a pixel's texture."""
@@ -25,7 +25,7 @@ _TEXTURE_SIDE = 5
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """What the multi-view losses know of a view: its smoothed image and where it was taken."""
+    """A view for the multi-view losses: its smoothed image and its pose."""
 
     grey: Float[Tensor, "h w"]
     """Luma in [0, 1] at photometric size, smoothed; float32."""
@@ -38,7 +38,7 @@ class PhotoView:
     noise: Float[Tensor, ""]
     """Variance of the noise in the grey values."""
     colours: Float[Tensor, "3 h w"] | None = None
-    """Red, green and blue in [0, 1], smoothed; where they are compared."""
+    """Red, green and blue in [0, 1], smoothed, if colours are compared."""
 
     @staticmethod
     def prepare(
@@ -75,8 +75,8 @@ class PhotoView:
         T_cw: Float[Tensor, "4 4"],
         device: torch.device | str = "cpu",
     ) -> "PhotoView":
-        """The view of a grey image, followed by red, green and blue or by nothing, from a CPU. It
-        has the usual noise."""
+        """The view of a grey image, perhaps followed by red, green and blue, on a CPU; it has the
+        usual noise."""
         texture = _local_variance(planes[0]) / USUAL_NOISE
         planes = torch.cat([planes, texture[None]]).to(device)
         colours = planes[1:-1] if len(planes) > 2 else None
@@ -101,10 +101,10 @@ class PhotoView:
         """The same image with another pose."""
         return replace(self, T_cw=T_cw)
 
-    def in_light(self, light: Float[Tensor, "3"]) -> "PhotoView":
-        """The same image with its values times a gain plus an offset, which leaves a noise of so
-        much variance."""
-        gain, offset, noise = light
+    def with_exposure(self, exposure: Float[Tensor, "3"]) -> "PhotoView":
+        """The same image with its values times a gain plus an offset, and the variance of the noise
+        that this leaves."""
+        gain, offset, noise = exposure
         colours = None if self.colours is None else gain * self.colours + offset
         texture = self.texture * (gain.square() * self.noise / noise)
         grey = gain * self.grey + offset
@@ -132,7 +132,7 @@ def enlarge_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float
 
 
 def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
-    """Which of the ``planes`` of two views are compared, each with the weights it has.
+    """Indices of the ``planes`` of two views that are compared, each with its weights.
 
     Grey alone, or L_1 and L_ssim as means over red, green and blue and L_ncc over grey.
     """

@@ -1,4 +1,4 @@
-"""What the losses on one rendered view know of a keyframe."""
+"""Constants of a keyframe for the losses on one rendered view."""
 
 import functools
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ SMOOTHNESS_ETA = 10.0
 OUTSIDE = -1.0
 """Prior depth where a mask says that nothing of the scene is."""
 ONE_SURFACE = 0.08
-"""Relative difference of inverse depth within a pixel of half the resolution up to which it has one
+"""Largest relative difference of inverse depth within a pixel of half the resolution that has one
 depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewConstants:
-    """What the single-view losses know of a keyframe besides its rendering, at render size."""
+    """A keyframe's constants for the single-view losses, at render size."""
 
     camera: Camera
     """Intrinsics at render size."""
@@ -47,8 +47,8 @@ class ViewConstants:
     def prepare(
         image: UInt8[np.ndarray, "ih iw 3"],
         camera: Camera,
-        prior_depth: Float[Tensor, "h w"] | None = None,
-        confidence: Float[Tensor, "h w"] | None = None,
+        prior_depth: Float[Tensor, "h w"],
+        confidence: Float[Tensor, "h w"],
         prior_normal: Float[Tensor, "h w 3"] | None = None,
     ) -> "ViewConstants":
         """Constants of a keyframe with this RGB image (any size) rendered by ``camera``.
@@ -57,16 +57,12 @@ class ViewConstants:
         """
         size = (camera.width, camera.height)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        device = None if prior_depth is None else prior_depth.device
-        rgb = torch.from_numpy(small).to(device).float() / 255
-        unknown = torch.zeros(camera.height, camera.width, device=device)
-        if confidence is None:
-            confidence = torch.ones_like(unknown)
+        rgb = torch.from_numpy(small).to(prior_depth.device).float() / 255
         return ViewConstants(
             camera=camera,
             edge=edge_strength(rgb),
             image_gradient=gradient_norm(rgb),
-            prior_depth=unknown if prior_depth is None else prior_depth.float(),
+            prior_depth=prior_depth.float(),
             confidence=confidence.float(),
             prior_normal=None if prior_normal is None else prior_normal.float(),
         )
@@ -86,9 +82,11 @@ class ViewConstants:
         maps = torch.stack(
             [self.edge, self.image_gradient, inverse, weight, known.float(), outside.float()]
         )
-        edge, gradient, inverse_mean, mean_weight, share, beyond = F.adaptive_avg_pool2d(maps, size)
+        edge, gradient, inverse_mean, mean_weight, known_fraction, beyond = F.adaptive_avg_pool2d(
+            maps, size
+        )
         most, least = F.adaptive_max_pool2d(torch.stack([inverse, -inverse]), size)
-        one = (share > 0.999) & (most + least < ONE_SURFACE * inverse_mean)
+        one = (known_fraction > 0.999) & (most + least < ONE_SURFACE * inverse_mean)
         depth = torch.where(one, 1 / inverse_mean.clamp(min=1e-9), 0.0)
         normal = None
         if self.prior_normal is not None:
@@ -125,8 +123,6 @@ def gradient_norm(image: Float[Tensor, "h w *c"]) -> Float[Tensor, "h w"]:
     return F.pad((horizontal + vertical).mean(-1), (0, 1, 0, 1))
 
 
-def visible(
-    depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], min_alpha: float = MIN_ALPHA
-) -> Bool[Tensor, "h w"]:
-    """The valid pixels Omega: a finite positive depth seen with more than ``min_alpha``."""
-    return (alpha > min_alpha) & (depth > 0) & torch.isfinite(depth)
+def visible(depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """The valid pixels Omega: a finite positive depth seen with more than ``MIN_ALPHA``."""
+    return (alpha > MIN_ALPHA) & (depth > 0) & torch.isfinite(depth)

@@ -1,9 +1,8 @@
-"""Which of many images with known poses make a map: those that see all of it, from different sides.
+"""Selection of the images with known poses that make a map: those that cover it from all sides.
 
-The scene is stood for by points. An image helps at a point that it sees as much as nobody has
-looked there yet, and as its ray makes an angle with the rays of the images chosen before that
-depth can be told from. Chosen one by one, each time the one that helps most, so that every
-beginning of the order is a good choice of so many.
+The scene is represented by points. An image gains at a point that no chosen image sees yet, and
+where its ray makes an angle with theirs from which depth can be triangulated. Images are chosen
+greedily by their gain, so that every beginning of the order is a good choice of that many.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,27 +14,27 @@ from jaxtyping import Float32, Float64, Int64
 from geogs.depth.sweep_neighbors import BEST_PARALLAX_DEG, MAX_PARALLAX_DEG
 from geogs.geometry.camera import Camera
 
-# Rays by which each image says where the scene is, across and down.
+# Rays of each image that make points of the scene, across and down.
 _ACROSS, _DOWN = 4, 3
-# Points that stand for the scene, at most, and how many of their cells the usual depth takes.
+# Most points of the scene, and how many of their cells the usual depth spans.
 _POINTS, _CELLS = 1000, 10.0
 # A point counts as seen from 1/x to x times the depth that is usual in the image.
 _DEPTHS = 3.0
-# Rays of another image that are as far apart see another side, degrees.
+# Angle between rays from which they see different sides, degrees.
 _SAME_SIDE = 75.0
-# What a point is worth that one image sees, of one that two see well; and of one whose rays are
-# too far apart to be matched.
+# Worth of a point that one image sees, over one that two see well; and of one whose rays are too
+# far apart to be matched.
 _ALONE, _UNMATCHED = 0.5, 0.5
 # Newness below which an image is taken for a copy of one that was chosen.
 _COPY = 0.02
-# Images next to each that tell how much detail is usual there; least worth of a blurred one.
+# Nearest images whose detail is compared; least worth of a blurred one.
 _ALIKE, _LEAST_SHARP = 6, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Which images see which of some points of the scene, and along which ray: one row for each
-    point and image, those of a point next to each other."""
+    """Points of the scene in images, and their rays: one row for each point and image, sorted by
+    point."""
 
     point: Int64[np.ndarray, "s"]
     view: Int64[np.ndarray, "s"]
@@ -51,7 +50,7 @@ def scene_points(
     typical: Float64[np.ndarray, "v"],
     random: np.random.Generator,
 ) -> Float64[np.ndarray, "p 3"]:
-    """Points about where the images see the scene, evenly spread: at the usual depth of each."""
+    """Evenly spread points of the scene, at the usual depth of each image."""
     u = (np.arange(_ACROSS) + 0.5) / _ACROSS * camera.width
     v = (np.arange(_DOWN) + 0.5) / _DOWN * camera.height
     x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
@@ -71,7 +70,7 @@ def sightings(
     typical: Float64[np.ndarray, "v"],
     points: Float64[np.ndarray, "p 3"],
 ) -> Sightings:
-    """Points in the image of each camera, not much nearer or farther than is usual there."""
+    """Points in the image of each camera at about its usual depth."""
     point, view, ray = [], [], []
     for i, T in enumerate(T_cw):
         x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
@@ -90,11 +89,11 @@ def sightings(
 
 
 def coverage_order(seen: Sightings, sharpness: Float64[np.ndarray, "v"]) -> Iterator[int]:
-    """Places of the images, the one that adds most first; copies of chosen ones are left out.
+    """Indices of the images, the one of most gain first; copies of chosen ones are left out.
 
     Args:
         seen: which points the images see.
-        sharpness: by which the worth of each image is multiplied, at most 1.
+        sharpness: factor on the gain of each image, at most 1.
     """
     points = int(seen.point.max(initial=-1)) + 1
     begin = np.searchsorted(seen.point, np.arange(points + 1))
@@ -130,7 +129,7 @@ def coverage_order(seen: Sightings, sharpness: Float64[np.ndarray, "v"]) -> Iter
 
 
 def _newness(cosine: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """How much a ray at an angle to the nearest chosen one tells: nothing if it is the same."""
+    """Worth of a ray by its angle to the nearest chosen one: 0 if it is the same."""
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     matched = np.minimum(angle / BEST_PARALLAX_DEG, 1.0)
     matched = np.where(angle > MAX_PARALLAX_DEG, _UNMATCHED, matched)
@@ -138,19 +137,19 @@ def _newness(cosine: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 
 
 def _worth(count: Int64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """What another ray to points is worth that so many see; the second one most."""
+    """Worth of another ray to points that so many see; the second one counts most."""
     return np.where(count == 0, _ALONE, 1.0 / np.maximum(count, 1))
 
 
 def relative_sharpness(
     T_cw: Float64[np.ndarray, "v 4 4"], typical: float, detail: Sequence[int]
 ) -> Float64[np.ndarray, "v"]:
-    """How much detail each image has, of what is usual of those taken next to it; 1 at most.
+    """Detail of each image over the median of those taken next to it; at most 1.
 
     Args:
-        T_cw: where they were taken.
-        typical: the usual depth, by which rotations and translations are compared.
-        detail: of each image, such as the bytes that it takes compressed.
+        T_cw: poses of the images.
+        typical: the usual depth, which makes translations comparable with rotations.
+        detail: of each image, such as its compressed size.
     """
     own = np.asarray(detail, np.float64)
     if len(own) <= _ALIKE:

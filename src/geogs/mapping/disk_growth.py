@@ -1,4 +1,4 @@
-"""Disks that come and go: added where depths show more than the map, dropped in free space."""
+"""Growth of the map: disks added where depths show more than the map, dropped in free space."""
 
 from collections.abc import Sequence
 
@@ -7,18 +7,18 @@ import torch
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
-from geogs.mapping.view_arrays import sure_jumps
+from geogs.mapping.view_arrays import confident_jumps
 from geogs.splat.density import spread_candidates, unexplained, worth_keeping
-from geogs.splat.init import NEIGHBOURS, initialise_disks, turned_at_random
+from geogs.splat.init import NEIGHBOURS, initialise_disks, randomly_oriented
 from geogs.splat.render import render
 from geogs.world.map import MapTable
 
-# Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
+# Nearest keyframes that vote on a keyframe's disks.
 _VOTERS = 96
 
 
 class DiskGrowth:
-    """Adds disks to a map and drops them, as the depths of its keyframes say."""
+    """Adds disks to a map, and drops them, by the depths of its keyframes."""
 
     def __init__(self, table: MapTable, depths: KeyframeDepths, config: MappingConfig) -> None:
         self.table = table
@@ -26,7 +26,7 @@ class DiskGrowth:
         self.config = config
 
     def voters(self, view: MapView) -> list[MapView]:
-        """The mapped keyframes whose votes on what a view shows count."""
+        """The mapped keyframes that vote on the surface of a view."""
         return self.depths.views.near(view, self.table.mapped, _VOTERS)
 
     def carve(self, views: Sequence[MapView]) -> None:
@@ -49,7 +49,7 @@ class DiskGrowth:
         output = render(disks, camera, view.T_cw)
         needed = unexplained(output, depth, confidence) & (confidence >= min_confidence)
         v, u, spacing = spread_candidates(
-            needed, sure_jumps(view.dense).around(config.stride), config.stride,
+            needed, confident_jumps(view.dense).around(config.stride), config.stride,
             config.edge_stride, self.table.random.of_torch,
         )  # fmt: skip
         z = depth[v, u]
@@ -66,5 +66,5 @@ class DiskGrowth:
         existing = disks.position.detach()
         new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config)
         if self.config.ablation.initialisation == "random":
-            new = turned_at_random(new, self.table.random.of_torch)
+            new = randomly_oriented(new, self.table.random.of_torch)
         disks.append(new, view.id)

@@ -1,12 +1,11 @@
-"""Where the scene is, seen in a few small images whose poses are known.
+"""Points of the scene from plane sweeps over a few small images with known poses.
 
-A tracker says how far the scene is; here that is found first. A few small images are swept over
-ranges of depth around growing distances, each with neighbours that suit the distance. At the right
-one many pixels match. Of many images only those that are swept or matched are ever asked for.
+Without a tracker the distance of the scene is not known. A few small images are swept over depth
+ranges around growing distances, each with neighbours that suit the distance; at the right one many
+pixels match. Only images that are swept or matched are read.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,7 +26,7 @@ from geogs.mapping.known_poses import FEWEST_POINTS
 from geogs.threads import thread_map
 
 EDGE = 128
-"""Longer side of the images, pixels: enough to see where the scene is."""
+"""Longer side of the images, pixels."""
 IMAGES = 8
 """Images whose depth is searched."""
 # A sweep around a distance d goes from d / NEAR to d * FAR; the next distance is RATIO times d.
@@ -35,26 +34,26 @@ _NEAR, _FAR, _RATIO = 3.0, 6.0, 2.5
 # Parallax in degrees of the nearest two cameras at the first distance, of the farthest at the last.
 _WIDEST, _NARROWEST = 25.0, 1.5
 _NEIGHBOURS, _PLANES = 6, 64
-# Images that try every distance; the others try the best one of these and those next to it.
+# Images swept at every distance; the others are at the best of these and those next to it.
 _SCOUTS = 3
-# Images among which the first distance to try and neighbours are looked for, at most.
+# Most images among which distances and neighbours are chosen.
 _CANDIDATES = 200
 # A match counts if the windows are this alike and the next best plane is this much worse.
 _MAX_COST, _MIN_MARGIN = 0.3, 1.0
-# Share of the pixels that must match somewhere. Measured: 0.4 to 0.9 where poses are right, below
+# Least fraction of pixels that match. Measured: 0.4 to 0.9 where poses are right, below
 # 0.06 with camera-to-world taken for world-to-camera.
 _LEAST_CLEAR = 0.05
 # Planes at the ends of a range win for whatever lies beyond it.
 _END = 0.04
 
 SmallImage = tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "mh mw"] | None]
-"""An image, of any size of the same view, and which of its pixels count; none where all do."""
+"""An image of any size, and a mask of the pixels that count, if not all do."""
 
 
 def distances_to_try(views: Sequence[ViewPose]) -> Float64[np.ndarray, "n"]:
-    """Typical depths that images from these places could show, in a geometric series.
+    """Typical depths that images from these poses could show, in a geometric series.
 
-    None where all cameras stand in the same place: then no depth shows.
+    Empty where all cameras have the same centre, so that there is no parallax.
     """
     centres = np.stack([v.center for v in views])
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
@@ -69,17 +68,15 @@ def distances_to_try(views: Sequence[ViewPose]) -> Float64[np.ndarray, "n"]:
 
 
 def first_points(
-    places: Sequence[ViewPose],
+    poses: Sequence[ViewPose],
     image_at: Callable[[int], SmallImage],
     working: Camera,
     progress: Callable[[float], None],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Points of the scene that some of the images show clearly, in the world.
-
-    Of the distances that can be tried, those at the one where most pixels find a clear match.
+    """World points of clear matches at the distance where most pixels have one.
 
     Args:
-        places: where the images were taken; their ids are their places in this sequence.
+        poses: poses of the images; their ids are their indices in this sequence.
         image_at: reads an image by its id.
         working: the camera of the images, of any size.
         progress: called with the finished fraction.
@@ -87,10 +84,10 @@ def first_points(
     Raises:
         InputError: hardly anything matches anywhere.
     """
-    look = _FirstLook(places, image_at, working)
-    chosen = _spread(len(places), IMAGES)
+    look = _FirstLook(poses, image_at, working)
+    chosen = _spread(len(poses), IMAGES)
     scouts = [chosen[i] for i in _spread(len(chosen), _SCOUTS)]
-    distances = distances_to_try([places[i] for i in _spread(len(places), _CANDIDATES)])
+    distances = distances_to_try([poses[i] for i in _spread(len(poses), _CANDIDATES)])
     tasks = [(i, float(d)) for d in distances for i in scouts]
     part = len(tasks) / max(len(tasks) + 3 * (len(chosen) - len(scouts)), 1)
     found = look.points(tasks, lambda f: progress(part * f))
@@ -122,26 +119,16 @@ def _spread(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist()
 
 
-@dataclass(frozen=True)
-class _Look:
-    """A small view swept around a distance."""
-
-    reference: DepthView
-    mask: Bool[np.ndarray, "h w"]
-    neighbours: list[DepthView]
-    distance: float
-
-
 class _FirstLook:
     """Small images, each read once when it is first needed, and sweeps over them."""
 
     def __init__(
         self,
-        places: Sequence[ViewPose],
+        poses: Sequence[ViewPose],
         image_at: Callable[[int], SmallImage],
         working: Camera,
     ) -> None:
-        self._places = places
+        self._poses = poses
         self._image_at = image_at
         edge = min(EDGE, max(working.width, working.height))
         self._camera = working.with_long_edge(edge)
@@ -150,22 +137,20 @@ class _FirstLook:
     def points(
         self, tasks: Sequence[tuple[int, float]], progress: Callable[[float], None]
     ) -> Found:
-        """Clear matches of images around distances; none where neighbours are not well placed."""
+        """Clear matches of images around distances, where there are suitable neighbours."""
         matched = {task: self._matched_at(*task) for task in tasks}
         looks = {
-            (i, d): _Look(*self._read(i), [self._read(k)[0] for k in others], d)
+            (i, d): (*self._read(i), [self._read(k)[0] for k in others], d)
             for (i, d), others in matched.items()
             if others
         }
         clear = thread_map(
-            lambda look: _clear_matches(look, self._camera),
-            list(looks.values()),
-            progress,
+            lambda look: _clear_matches(*look, self._camera), list(looks.values()), progress
         )
         return dict(zip(looks, clear, strict=True))
 
     def pixels(self, images: Sequence[int]) -> int:
-        """Pixels of some images that count."""
+        """Number of pixels inside the masks of some images."""
         return sum(int(self._read(i)[1].sum()) for i in images)
 
     def _read(self, index: int) -> tuple[DepthView, Bool[np.ndarray, "h w"]]:
@@ -176,7 +161,7 @@ class _FirstLook:
             grey = cv2.resize(large * np.float32(1 / 255), size, interpolation=cv2.INTER_AREA)
             colours = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
             unknown = np.zeros((1, 1), np.float32)
-            place, inside = self._places[index], np.ones(grey.shape, bool)
+            place, inside = self._poses[index], np.ones(grey.shape, bool)
             if mask is not None:
                 inside = cv2.resize(mask.astype(np.uint8), size) > 0
             view = DepthView(place.id, place.T_cw, grey, grey, colours, unknown, unknown)
@@ -184,31 +169,35 @@ class _FirstLook:
         return self._small[index]
 
     def _matched_at(self, index: int, distance: float) -> list[int]:
-        """Images to match one with at a distance; none where none is well placed for it."""
-        reference = self._places[index]
-        others = [p for p in self._places if p.id != reference.id]
+        """Images to match one with at a distance; empty where none is suitable."""
+        reference = self._poses[index]
+        others = [p for p in self._poses if p.id != reference.id]
         if not others:
             return []
         pairs = view_pairs(reference, others, distance, self._camera)
         usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG)
         others = [p for p, good in zip(others, usable, strict=True) if good]
-        if len(others) < min(2, len(self._places) - 1):
+        if len(others) < min(2, len(self._poses) - 1):
             return []
         chosen = select_sweep_neighbours(reference, others, distance, self._camera, _NEIGHBOURS)
         return [others[i].id for i in chosen]
 
 
-def _clear_matches(look: _Look, camera: Camera) -> Float64[np.ndarray, "n 3"]:
-    """World points of the pixels with one good match inside the swept range."""
-    low, high = 1.0 / (_FAR * look.distance), _NEAR / look.distance
+def _clear_matches(
+    reference: DepthView,
+    mask: Bool[np.ndarray, "h w"],
+    neighbours: list[DepthView],
+    distance: float,
+    camera: Camera,
+) -> Float64[np.ndarray, "n 3"]:
+    """World points of the pixels with one good match inside the range around a distance."""
+    low, high = 1.0 / (_FAR * distance), _NEAR / distance
     planes = np.linspace(low, high, _PLANES, dtype=np.float32)
-    nothing = np.zeros_like(look.reference.grey)
-    swept = plane_sweep(
-        look.reference, look.neighbours, camera, planes, nothing + planes[0], nothing
-    )
-    v, u = np.nonzero(_is_clear(swept, low, high) & look.mask)
+    nothing = np.zeros_like(reference.grey)
+    swept = plane_sweep(reference, neighbours, camera, planes, nothing + planes[0], nothing)
+    v, u = np.nonzero(_is_clear(swept, low, high) & mask)
     local = camera.rays(torch.float64).numpy()[v, u] / swept.inverse_depth[v, u, None]
-    T_cw = look.reference.T_cw
+    T_cw = reference.T_cw
     return (local - T_cw[:3, 3]) @ T_cw[:3, :3]
 
 

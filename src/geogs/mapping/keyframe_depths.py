@@ -1,4 +1,4 @@
-"""The dense depths of the map's keyframes: searched, measured, and checked by those around."""
+"""The dense depths of the map's keyframes: searched, fused with a sensor, and checked."""
 
 from collections.abc import Sequence
 from operator import attrgetter
@@ -10,11 +10,11 @@ from geogs.config import DepthSensorConfig
 from geogs.depth.depth_engine import DepthEngine, DepthTask, Progress, silent
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision.segment_planes import planar_depth
-from geogs.depth.sensor import joined
+from geogs.depth.sensor_fusion import fused_with_sensor
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.dense_depths import get_depth, put_depth
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
+from geogs.mapping.view_arrays import get_depth, put_depth
 from geogs.on_demand import OnDemand
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.threads import ordered_map, worker_count
@@ -34,10 +34,10 @@ class KeyframeDepths:
         self,
         engine: DepthEngine,
         views: KeyframeViews,
-        sensor: DepthSensorConfig | None = None,
-        bare_planes: bool = False,
+        sensor: DepthSensorConfig | None,
+        bare_planes: bool,
     ) -> None:
-        """With ``bare_planes``, bare segments lie on planes where a depth is unsure."""
+        """With ``bare_planes``, uncertain depths of bare segments are put on planes."""
         self.engine = engine
         self.views = views
         self.sensor = sensor or DepthSensorConfig()
@@ -56,7 +56,7 @@ class KeyframeDepths:
                 view.set_depth(self._with_sensor(view, depth))
 
     def check(self, views: Sequence[MapView]) -> None:
-        """Let the neighbours' depths, as they were estimated, revise those of the views."""
+        """Revise the depths of views by those of their neighbours, all as they were estimated."""
         device, arrays, checked = self.views.arrays.device, ArrayTable(), []
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
@@ -80,13 +80,13 @@ class KeyframeDepths:
         return chosen[:CHECKING_VIEWS]
 
     def keep(self, points: Float[Tensor, "n 3"], views: Sequence[MapView]) -> Bool[Tensor, "n"]:
-        """World points that do not stand in the free space that some views see."""
+        """World points outside the free space of some views."""
         known = [v for v in views if v.has_depth]
         # Read one after the other where they are not in memory.
         return self.engine.keep(points, OnDemand(known, attrgetter("posed")))
 
     def _task(self, view: MapView) -> DepthTask:
-        """The search of a view's depth: with whom it is matched, and between which depths."""
+        """The search of a view's depth: its neighbours and its range."""
         search = view.row.search
         depth = tracked_depth(view.keyframe) if search is None else search.typical
         around = self.views.near(view, self.views, CANDIDATES)
@@ -96,12 +96,12 @@ class KeyframeDepths:
 
     def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
         """The other views from which a depth is best seen, best first."""
-        places, camera = [v.place for v in others], self.views.arrays.cameras.render
-        chosen = select_sweep_neighbours(view.place, places, depth, camera)
+        poses, camera = [v.view_pose for v in others], self.views.arrays.cameras.render
+        chosen = select_sweep_neighbours(view.view_pose, poses, depth, camera)
         return [others[i] for i in chosen]
 
     def _planar(self, views: Sequence[MapView], depths: list[DenseDepth]) -> list[DenseDepth]:
-        """The depths of views, on planes where the images are bare."""
+        """The depths of views, with those of bare segments on planes if that is asked for."""
         if not self.bare_planes:
             return depths
         camera = self.views.arrays.cameras.render
@@ -114,14 +114,14 @@ class KeyframeDepths:
         return list(ordered_map(one, pairs, worker_count()))
 
     def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
-        """The searched depth, joined with what a sensor measured where it did."""
+        """The searched depth, fused with a sensor's if there is one."""
         keyframe, render = view.keyframe, self.views.arrays.cameras.render
         if keyframe.measured is None or (metres := keyframe.sensor_depth) is None:
             return searched
         found = sensor_depth(metres, self.sensor).resized(render.width, render.height)
         inverse_depth, information = found.tensors(self.views.arrays.device)
         scale = keyframe.scale
-        return joined(searched, inverse_depth / scale, information * scale**2)
+        return fused_with_sensor(searched, inverse_depth / scale, information * scale**2)
 
 
 def tracked_depth(keyframe: Keyframe) -> float:

@@ -1,4 +1,4 @@
-"""Keyframes as mapping sees them: what losses and depth search ask of each."""
+"""Keyframes as mapping sees them: images, depths and constants for losses and depth search."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, ViewPose, depth_images
 from geogs.depth.revision.bare_segments import bare_segments
 from geogs.geometry.lie import se3_inverse
-from geogs.losses.light import same_light
+from geogs.losses.exposure import identity_exposure
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 from geogs.mapping.view_arrays import ViewArrays
@@ -18,12 +18,12 @@ from geogs.world.keyframes import Keyframe
 from geogs.world.map import ViewRow
 
 UNKNOWN = 1e3
-"""Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""
+"""Relative deviation of a depth that nobody measured."""
 
 
 @dataclass(eq=False)
 class MapView:
-    """A keyframe with its row of the map's table, and what losses and depth search ask of it."""
+    """A keyframe with its row of the map's table, as losses and depth search need it."""
 
     id: int
     row: ViewRow
@@ -31,7 +31,7 @@ class MapView:
 
     @property
     def keyframe(self) -> Keyframe:
-        """Which has pose and scale."""
+        """The keyframe, with its pose and scale."""
         return self.arrays.keyframes[self.id]
 
     @property
@@ -45,8 +45,8 @@ class MapView:
         return se3_inverse(self.T_cw)
 
     @property
-    def place(self) -> ViewPose:
-        """Where it was taken."""
+    def view_pose(self) -> ViewPose:
+        """Its id and pose."""
         return ViewPose(self.id, self.T_cw.numpy())
 
     @property
@@ -56,12 +56,14 @@ class MapView:
 
     @property
     def depth_view(self) -> DepthView:
-        """What the depth estimation needs."""
+        """The view for the depth estimation."""
         loaded = self.arrays.load(self.id)
         inverse_depth, information = self.keyframe.depth_field()
         if loaded.matched is None:
             loaded.matched = depth_images(loaded.image, self.arrays.cameras.render)
-        if (search := self.row.search) is not None:  # the grid says what is usual, and hardly that
+        if (
+            search := self.row.search
+        ) is not None:  # no tracker: the typical depth, hardly weighted
             inverse_depth = np.full_like(inverse_depth, 1.0 / search.typical)
             information = np.full_like(information, (search.typical / UNKNOWN) ** 2)
         return DepthView(
@@ -76,14 +78,14 @@ class MapView:
 
     @property
     def photo(self) -> PhotoView:
-        """What the multi-view losses need."""
+        """The view for the multi-view losses."""
         return self.arrays.load(self.id).photo.at(self.T_cw)
 
     @property
     def exposure(self) -> Float[Tensor, "3"]:
-        """Gain and offset that its photo has had, and the variance of its noise."""
+        """Gain and offset applied to its photo, and the variance of its noise."""
         known = self.row.exposure
-        return same_light(self.arrays.device) if known is None else known
+        return identity_exposure(self.arrays.device) if known is None else known
 
     @property
     def has_depth(self) -> bool:
@@ -93,12 +95,12 @@ class MapView:
 
     @property
     def dense(self) -> DenseDepth:
-        """The dense depth, where there must be one; what is not in memory stays where it is."""
+        """The dense depth, which there must be; read from the file if it is not in memory."""
         return self.arrays.depth(self.id)
 
     @property
     def posed(self) -> PosedDepth:
-        """The dense depth with the view's pose, where there must be one."""
+        """The dense depth, which there must be, with the view's pose."""
         return PosedDepth(self.T_cw.numpy(), self.dense)
 
     @property
@@ -110,16 +112,9 @@ class MapView:
         return self.dense.typical
 
     @property
-    def constants(self) -> ViewConstants | None:
-        """What the single-view losses need; None until the keyframe has a depth."""
+    def constants(self) -> ViewConstants:
+        """Constants of the single-view losses; the keyframe must have a depth."""
         return self.arrays.constants(self.id)
-
-    @property
-    def known(self) -> ViewConstants:
-        """The losses' constants, where there must be a depth."""
-        constants = self.constants
-        assert constants is not None, f"keyframe {self.id} has no depth yet"
-        return constants
 
     @property
     def rendered_depth(self) -> Float[Tensor, "h w"] | None:
@@ -135,15 +130,15 @@ class MapView:
             loaded.rendered_depth, loaded.is_render_written = depth, False
 
     def set_depth(self, depth: DenseDepth) -> None:
-        """Take over a dense depth, on which the losses' constants then live."""
+        """Set the dense depth, and the losses' constants that depend on it."""
         self.arrays.set_depth(self.id, depth)
 
     def set_exposure(self, exposure: Float[Tensor, "3"]) -> None:
-        """Compensate its exposure and know its noise, which were not known."""
+        """Set its exposure and noise, which were not known, and compensate its photo."""
         self.row.exposure = exposure
         loaded = self.arrays.loaded.peek(self.id)
         if loaded is not None:
-            loaded.photo = loaded.photo.in_light(exposure)
+            loaded.photo = loaded.photo.with_exposure(exposure)
 
 
 class KeyframeViews(Mapping[int, MapView]):
@@ -163,7 +158,7 @@ class KeyframeViews(Mapping[int, MapView]):
         return len(self._views)
 
     def add(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> MapView:
-        """Take up a keyframe; it has no depth outside a mask of the size of its image."""
+        """Add a keyframe; it has no depth outside a mask of the size of its image."""
         if mask is not None:
             self.arrays.put_mask(id, mask)
         row = self.arrays.table.views[id] = ViewRow()
@@ -172,8 +167,8 @@ class KeyframeViews(Mapping[int, MapView]):
         return view
 
     def near(self, view: MapView, ids: Collection[int], count: int) -> list[MapView]:
-        """The ``count`` of the views ``ids`` whose cameras are nearest to one's, which may be among
-        them, in the order of the ``ids``."""
+        """The ``count`` views among ``ids`` nearest to a view's camera, in the order of ``ids``;
+        the view may be one of them."""
         if len(ids) > count:
             several = np.fromiter(ids, np.int64, len(ids))
             nearest = self.arrays.keyframes.poses.nearest(view.id, several, count)

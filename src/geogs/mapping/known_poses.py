@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 
 from geogs.depth.depth_view import ViewPose
+from geogs.depth.sweep_neighbors import RANGE_MARGIN
 from geogs.geometry.camera import Camera
 from geogs.mapping.keyframe_views import MapView
 from geogs.world.map import DepthSearch
@@ -44,12 +45,12 @@ def depth_search(
 
 
 def expect_depths(
-    views: Iterable[MapView], points: Float64[np.ndarray, "n 3"], camera: Camera, margin: float
+    views: Iterable[MapView], points: Float64[np.ndarray, "n 3"], camera: Camera
 ) -> None:
     """Let every view's depth be searched where these points say; its grid counts for nothing."""
     points = points[:: 1 + len(points) // _MOST_POINTS]
     for view in views:
-        view.row.search = depth_search(view.place, points, camera, margin)
+        view.row.search = depth_search(view.view_pose, points, camera, RANGE_MARGIN)
 
 
 def dense_points(
@@ -63,6 +64,6 @@ def dense_points(
         v, u = np.nonzero(depth.confidence >= _CONFIDENT)
         some = random.permutation(len(v))[:_POINTS_PER_VIEW]
         local = rays[v[some], u[some]] * depth.depth[v[some], u[some], None]
-        T_cw = view.place.T_cw
+        T_cw = view.view_pose.T_cw
         points.append((local - T_cw[:3, 3]) @ T_cw[:3, :3])
     return np.concatenate(points) if points else np.empty((0, 3))

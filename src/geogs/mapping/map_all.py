@@ -8,7 +8,7 @@ from geogs.mapping.mapper import SEARCHED, Mapper
 from geogs.mapping.training.full import seconds_per_step
 from geogs.threads import worker_count
 
-# Keyframes whose depths are searched in one go, at most; and those that every map has at least.
+# Most and least keyframes whose depths are searched in one go.
 _AT_ONCE, _FIRST = 16, 4
 
 
@@ -18,17 +18,17 @@ def map_all(
     progress: Progress = silent,
     time_budget: float | None = None,
 ) -> None:
-    """Give observed keyframes their depths, grow the map with all of them, and train it.
+    """Search the depths of observed keyframes, grow the map with all of them, and train it.
 
-    An exception raised by ``progress`` keeps what there is by then. Of a time budget in seconds
-    about a part ``SEARCHED`` is for depths, of keyframes evenly spread over all; those that get
-    none are left out. Depths that there are already stay.
+    An exception raised by ``progress`` keeps what there is by then. About a fraction ``SEARCHED``
+    of a time budget, in seconds, is for depths, of keyframes evenly spread over all; those without
+    depth are left out. Depths that exist already stay.
     """
     ids = [i for i in keyframe_ids if not mapper.views[i].has_depth]
     until = None
     if time_budget is not None:
         ids, until = spread_order(ids), time.perf_counter() + SEARCHED * time_budget
-    # In groups that are as small as keeps all cores busy, so that an interruption is soon heard.
+    # In groups just large enough for all cores, so that an interruption takes effect soon.
     search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until, group_size())
     if not mapper.table.mapped:
         return
@@ -43,9 +43,9 @@ def map_all(
 
 
 def spread_order(items: Sequence[int]) -> list[int]:
-    """The items so that those of every beginning are spread evenly over all of them.
+    """The items in an order whose every beginning is spread evenly over all of them.
 
-    The first, then the middle one, then those at the quarters: by the reversed bits of their place.
+    The first, then the middle one, then those at the quarters: by the reversed bits of their index.
     """
     bits = max(len(items) - 1, 1).bit_length()
     places = sorted(range(len(items)), key=lambda i: int(f"{i:0{bits}b}"[::-1], 2))
@@ -64,11 +64,11 @@ def search_depths(
     until: float | None = None,
     at_once: int = _AT_ONCE,
 ) -> None:
-    """Search the depths of keyframes in groups; those that get one are mapped.
+    """Search the depths of keyframes in groups of ``at_once``; those that get one are mapped.
 
-    Groups are of ``at_once``; an exception raised by ``progress`` loses nothing of those before.
-    With ``until``, a time of ``time.perf_counter``, groups are small, and as soon as the next one
-    would last longer the rest is left without depth; the first group is always done.
+    An exception raised by ``progress`` keeps the groups before. With ``until``, a time of
+    ``time.perf_counter``, groups are small, and the rest is left without depth as soon as the next
+    one would take longer; the first group is always done.
     """
     ids = list(keyframe_ids)
     done, size = 0, at_once if until is None else group_size()
@@ -83,9 +83,9 @@ def search_depths(
 
 
 def _affordable(start: float, searched: int, until: float) -> int:
-    """How many keyframes to search next, at the pace of those since ``start``; 0 if too few.
+    """Number of keyframes to search next, at the pace since ``start``; 0 if it is too small.
 
-    Half of those that time allows, as the pace may change.
+    Half of those that fit into the time, as the pace may change.
     """
     now, least = time.perf_counter(), worker_count()
     count = int((until - now) * searched / max(now - start, 1e-9))

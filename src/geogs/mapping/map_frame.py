@@ -1,4 +1,4 @@
-"""The frame and unit that a map is made in, where the world's are somebody else's."""
+"""The frame and unit of a map whose world has given ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.limits import Positive
 from geogs.types import MapSnapshot
 
-# Cameras whose distances make the unit, at most.
+# Most cameras whose distances make the unit.
 _SAMPLED_CAMERAS = 8
 
 
@@ -19,8 +19,8 @@ _SAMPLED_CAMERAS = 8
 class MapFrame:
     """Map coordinates are (world - origin) / unit; axes are the same.
 
-    So disks keep their float32 digits, and the renderer its fixed near plane, whatever the poses
-    are measured in and from where.
+    So disks keep their float32 precision, and the renderer its fixed near plane, whatever the
+    origin and the unit of the poses.
     """
 
     origin: Float64[np.ndarray, "3"]
@@ -32,7 +32,7 @@ class MapFrame:
     def around(
         points: Float64[np.ndarray, "n 3"], poses: Sequence[Float[Tensor, "4 4"]]
     ) -> "MapFrame":
-        """About points of the scene; their median distance from the cameras becomes 1."""
+        """The frame in which the median distance of the scene's points from the cameras is 1."""
         origin = np.median(points, axis=0)
         some = poses[:: 1 + len(poses) // _SAMPLED_CAMERAS]
         centres = np.stack([-(T[:3, :3].T @ T[:3, 3]).numpy() for T in some])

@@ -26,14 +26,14 @@ from geogs.types import PoseCorrection
 
 Strategy = Literal["blended", "coherent", "per_keyframe"]
 
-STILL = 1e-3
-"""An anchor has moved if its disks do by more than this part of their distance to its camera."""
-DESCRIBED = 0.5
-"""Part of the correction of revisited disks that one Sim(3) may leave where others stay behind."""
+MIN_MOTION = 1e-3
+"""An anchor has moved if its disks do by more than this fraction of their distance to it."""
+MAX_RESIDUAL = 0.5
+"""Largest residual of the one Sim(3), as a fraction of the correction, where other disks stay."""
 
 
 def covisible_keyframe(view: MapView, correction: PoseCorrection) -> CovisibleKeyframe:
-    """What a view with a depth saw, and from where, before a correction that it has taken over."""
+    """Depth and pose of a view before a correction that it has taken over."""
     depth, scale = view.dense.depth, correction.scale.get(view.id, 1.0)
     T_cw = correction.before.get(view.id, view.T_cw)
     return CovisibleKeyframe(
@@ -43,7 +43,7 @@ def covisible_keyframe(view: MapView, correction: PoseCorrection) -> CovisibleKe
 
 
 def anchor_transforms(correction: PoseCorrection) -> tuple[Tensor, Tensor]:
-    """Keyframe ids (sorted) and the world similarity each correction amounts to.
+    """Keyframe ids (sorted) and the similarity of the world by which each moves.
 
     The corrected pose T' already lives in corrected units, so a camera-frame point T mu is first
     divided by the scale and then taken back to the world: S = T'^-1 (1/scale) T. (As printed, the
@@ -59,7 +59,7 @@ def anchor_transforms(correction: PoseCorrection) -> tuple[Tensor, Tensor]:
 
 
 def apply_each(S: Float[Tensor, "n 4 4"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Every point by its own similarity."""
+    """Points, each moved by its own similarity."""
     return (S[:, :3, :3] @ points[:, :, None])[:, :, 0] + S[:, :3, 3]
 
 
@@ -104,14 +104,14 @@ def coherent_similarities(
     """One Sim(3) for the revisited disks, fitted to their targets; the others stay.
 
     ``own``, the correction of each disk's anchor, where the revisited disks determine no Sim(3), or
-    where they are only a part of all and it leaves more than ``DESCRIBED`` of their correction.
+    where they are only a part of all and it leaves more than ``MAX_RESIDUAL`` of their correction.
     """
     fit = _fit_similarity(x[revisited], target[revisited])
     if not bool(revisited.any()) or fit is None:
         return own
     S = torch.where(revisited[:, None, None], fit, torch.eye(4).to(x))
     left = _rms((target - apply_each(S, x))[revisited])
-    if not bool(revisited.all()) and left > DESCRIBED * _rms((target - x)[revisited]):
+    if not bool(revisited.all()) and left > MAX_RESIDUAL * _rms((target - x)[revisited]):
         return own
     return S
 
@@ -135,7 +135,7 @@ def _revisited(
     way, distance = x.new_zeros(2, len(centres))
     way.index_add_(0, slot, (target - x).norm(dim=1))
     distance.index_add_(0, slot, (x - centres[slot]).norm(dim=1))
-    moved = (way > STILL * distance).nonzero()[:, 0]
+    moved = (way > MIN_MOTION * distance).nonzero()[:, 0]
     if len(moved) == 0:
         return torch.zeros_like(slot, dtype=torch.bool)
     begin = int(moved[0])

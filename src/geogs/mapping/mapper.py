@@ -41,15 +41,15 @@ if TYPE_CHECKING:
     from geogs.mapping.training.trainer_choice import MapTrainer
 
 CARVE_EVERY = 10
-"""Keyframes between votes of all keyframes around against disks in free space: bounds the time."""
-# Keyframes that say how the map moves with a correction, at most: neighbours say the same.
+"""Keyframes between votes of all keyframes around against disks in free space, which take time."""
+# Most keyframes by which the map follows a correction: neighbours move alike.
 _COVISIBLE = 256
 SEARCHED = 0.4
-"""Part of the time of a search of all depths and the training after it that the search takes."""
+"""Fraction of the time for depths and training that the search of all depths takes."""
 
 
 def never_pause() -> None:
-    """Nobody is let go first."""
+    """Give way to nobody."""
 
 
 class Mapper:
@@ -68,7 +68,7 @@ class Mapper:
         sensor: DepthSensorConfig | None = None,
         table: MapTable | None = None,
     ):
-        """Goes on with the map of a ``table`` whose keyframes are given; without, it has none yet.
+        """Continue the map of a ``table``, whose keyframes are given, or begin an empty one.
 
         Raises:
             InputError: the table is incomplete, or of other keyframes.
@@ -83,22 +83,19 @@ class Mapper:
         self.table = table
         self.views = KeyframeViews(ViewArrays(table, keyframes, self.cameras, config.loss))
         engine = depth_engine(
-            table.disks.device,
-            render,
-            self.cameras.working,
-            config.depth,
+            table.disks.device, render, self.cameras.working, config.depth,
             keyframes.arrays.resident,
-        )
+        )  # fmt: skip
         self.depths = KeyframeDepths(engine, self.views, sensor, config.depth.bare_planes)
         self.partners = Partners(self.views, table, config.photo)
         self.growth = DiskGrowth(table, self.depths, config)
         self._trainer: MapTrainer | None = None
         self.pause: Callable[[], None] = never_pause
-        """Called between the parts of the work on a keyframe, where others may go first."""
+        """Called between the parts of the work on a keyframe, to give way to other threads."""
 
     @property
     def trainer(self) -> "MapTrainer":
-        """What changes the disks, once a keyframe is mapped."""
+        """The trainer of the disks, made when a keyframe is mapped."""
         if self._trainer is None:
             if self.table.unit is None:
                 self.table.unit = _unit(self.views[self.table.mapped[0]])
@@ -109,26 +106,23 @@ class Mapper:
         return self._trainer
 
     def settle(self) -> None:
-        """Bring the table up to date with what is in memory alone, so that it can be packed."""
+        """Write to the table what is in memory alone, so that it can be packed."""
         self.views.arrays.settle()
         self.table.random.settle()
 
     def move_to(self, keyframes: KeyframeTable) -> None:
-        """Go on with other keyframes, which are what its own are."""
+        """Replace the keyframes by equal ones."""
         self.keyframes = self.views.arrays.keyframes = keyframes
 
     # --- keyframe by keyframe --------------------------------------------------------------
 
     def observe(self, keyframe_id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
-        """A final keyframe, from now on available for matching.
-
-        Outside a mask, of the size of its image, it has no depth.
-        """
+        """Add a final keyframe for matching; it has no depth outside a mask of its image's size."""
         view = self.views.add(keyframe_id, mask)
         self.depths.engine.observe(view.depth_view)
 
     def see_anew(self, masks: Mapping[int, Bool[np.ndarray, "h w"] | None]) -> None:
-        """Take the images of all keyframes as they are now, and the masks that they have."""
+        """Use the present images of all keyframes, and new masks."""
         for id, mask in masks.items():
             if mask is not None:
                 self.views.arrays.put_mask(id, mask)
@@ -139,9 +133,9 @@ class Mapper:
     def take_over(
         self, disks: MapSnapshot, masks: Mapping[int, Bool[np.ndarray, "h w"]], ids: Sequence[int]
     ) -> None:
-        """Begin with a saved map, and the keyframes that it was made from.
+        """Begin with a saved map and its keyframes.
 
-        Their depths are what the map shows from them, inside ``masks``, and are not searched again.
+        Their depths are rendered from the map, inside ``masks``, and are not searched again.
         """
         parameters, rules = DiskParameters.of(disks), SurfaceRules.of(self.config)
         for i in ids:
@@ -160,7 +154,7 @@ class Mapper:
         view, table, disk = self.views[keyframe_id], self.table, self.config.disk
         random, mapped = table.random.of_numpy, [*table.mapped, keyframe_id]
         drawn = draw_views(mapped, self.config.iterations, self.config, random)
-        # Old ones have to be read from a file; meanwhile the depth is searched.
+        # Old views are read from a file while the depth is searched.
         self.views.arrays.read_ahead({i for ids in drawn for i in ids if i != keyframe_id})
         self.depths.estimate(self._due(keyframe_id), lambda _: self.pause())
         self.pause()
@@ -216,7 +210,7 @@ class Mapper:
         self.table.mapped = sorted({*self.table.mapped, *keyframe_ids})
 
     def check_depths(self) -> None:
-        """Let the depths of all mapped keyframes revise each other, once per search."""
+        """Check the depths of all mapped keyframes by each other, once per search."""
         self.depths.check(self._searched())
 
     def grow(self) -> None:
@@ -228,8 +222,8 @@ class Mapper:
             self.growth.insert(view, self.config.disk.insert_confidence)
 
     def refine(self, progress: Progress = silent) -> None:
-        """Train over all mapped keyframes, which there must be, with the final poses, after
-        searching their depths again."""
+        """Train over all mapped keyframes, at least one, with the final poses, after searching
+        their depths again if the settings say so."""
         searched, start = self._searched(), SEARCHED if self.config.final_depth else 0.0
         if self.config.final_depth and searched:
             self.depths.estimate(searched, lambda fraction: progress(SEARCHED * fraction))
@@ -245,10 +239,10 @@ class Mapper:
         until: float | None = None,
         goes_on: bool = False,
     ) -> None:
-        """Single-view steps over all mapped keyframes; disks that none has seen go.
+        """Single-view steps over all mapped keyframes; disks that none has seen are removed.
 
-        Fewer steps where they would last beyond ``until``, a time of ``time.perf_counter``. A
-        training that was cut off ``goes_on`` from where it was.
+        Fewer steps where they would last beyond ``until``, a time of ``time.perf_counter``. With
+        ``goes_on`` an interrupted training is continued.
         """
         if not goes_on:
             self.table.place, self.table.order = TrainingPlace(), []
@@ -263,10 +257,10 @@ class Mapper:
     def renders(
         self, disks: MapSnapshot | None = None, of: Sequence[int] | None = None
     ) -> Sequence[RenderedKeyframe]:
-        """The map, or other disks in its frame, seen from every mapped keyframe, or from some.
+        """The map, or other disks in its frame, rendered from all mapped keyframes, or from some.
 
-        Rendered now, from a snapshot, so that disks that were written show the same; of a long
-        video most are read from a temporary file when they are asked for.
+        Rendered now, from a snapshot, as disks in a file would be; of a long video most renderings
+        are read from a temporary file when they are asked for.
 
         Raises:
             OutputError: the disk is full, or cannot be written.
@@ -280,15 +274,14 @@ class Mapper:
         return OnDemand(stored, StoredRender.load)
 
     def renderer(self, frame: MapFrame = WORLD) -> MapRenderer:
-        """What shows the map as it is now from anywhere, asked in the coordinates of a world."""
+        """A renderer of the present map from any pose in the coordinates of a world."""
         rules = SurfaceRules.of(self.config)
         return MapRenderer(self.table.disks.snapshot(), frame, self.cameras.render, rules)
 
     def depth_maps(self, of: Sequence[int] | None = None) -> Sequence[RenderedKeyframe]:
-        """The dense depths of the mapped keyframes, or of some, weighted by confidence: no disk is
-        in them.
+        """The dense depths of all mapped keyframes, or of some, weighted by confidence.
 
-        Each is read when it is asked for, as it is at that time.
+        They are not rendered; each is read, as it is then, when it is asked for.
         """
         return OnDemand(self._mapped(of), partial(searched_keyframe, camera=self.cameras.render))
 
@@ -301,9 +294,9 @@ class Mapper:
         return self._mapped([i for i in self.table.mapped if i not in self.table.given])
 
     def _due(self, keyframe_id: int) -> list[MapView]:
-        """The keyframe and its next ones, whose depths are searched now and then check each other.
+        """The keyframe and its successors whose depths are searched now, to check each other.
 
-        The tracker's own depths are taken as they are now, of the window around, too.
+        The tracker's own depths are taken anew, those of the window, too.
         """
         later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
         if self.config.depth.engine == "tracker":

@@ -1,4 +1,4 @@
-"""Which keyframes check each other by their images, and the exposure and noise of these."""
+"""Selection of the photometric partners of keyframes, and compensation of their exposure."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from geogs.depth.sweep_neighbors import view_pairs
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
-from geogs.losses.light import noise_between, relative_light, same_light
+from geogs.losses.exposure import identity_exposure, noise_between, relative_exposure
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.world.map import MapTable
 
@@ -21,17 +21,17 @@ BEST_PARALLAX_DEG = 8.0
 MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 2.0, 25.0
 """Least and largest parallax of partners."""
 CANDIDATES = 128
-"""Nearest keyframes among which those are looked for that match or check one."""
+"""Nearest keyframes among which neighbours and partners are chosen."""
 _STRIDE = 4
-"""Every fourth pixel of a dense depth, in both directions, is compared."""
+"""Stride over the pixels of a dense depth that are compared, in both directions."""
 _CONFIDENT = 0.3
 """Least confidence of its depth."""
 _DARK, _BRIGHT = 0.02, 0.98
-"""Grey values beyond which a sensor says no more than that."""
+"""Grey values beyond which a sensor is saturated."""
 
 
 class Partners:
-    """Chooses the photometric partners of mapped views and compensates the exposure of these."""
+    """Chooses the photometric partners of mapped views and compensates their exposure."""
 
     def __init__(self, views: KeyframeViews, table: MapTable, config: PhotoConfig) -> None:
         self._views, self._table, self._config = views, table, config
@@ -44,7 +44,7 @@ class Partners:
             self._compensate(view)
 
     def _choose(self, view: MapView) -> None:
-        """Partners of a view; it becomes a candidate for those before it."""
+        """Choose the partners of a view, which becomes a candidate of theirs."""
         near = self._views.near(view, self._table.mapped, CANDIDATES)
         view.row.partners = choose_partners(view, near, self._config)
         for i in view.row.partners:
@@ -54,7 +54,7 @@ class Partners:
             other.row.partners = choose_partners(other, pool, self._config)
 
     def _compensate(self, view: MapView) -> None:
-        """Give a view's grey values the exposure of the partners where that is known."""
+        """Bring a view to the exposure of those partners whose exposure is known."""
         if view.row.exposure is not None or not self._config.compensate_exposure:
             return
         partners = [self._views[i] for i in view.row.partners]
@@ -67,8 +67,8 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
     others = [o for o in others if o.id != view.id]
     if not others:
         return []
-    places, camera = [o.place for o in others], view.arrays.cameras.render
-    pairs = view_pairs(view.place, places, view.typical_depth, camera)
+    poses, camera = [o.view_pose for o in others], view.arrays.cameras.render
+    pairs = view_pairs(view.view_pose, poses, view.typical_depth, camera)
     usable = pairs.usable(MIN_PARALLAX_DEG, MAX_PARALLAX_DEG, config.max_view_angle)
     scores = pairs.misfit(BEST_PARALLAX_DEG)
     scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
@@ -82,7 +82,7 @@ def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
     are in them. Gain 1, offset 0 and the usual noise where there is nothing to compare with.
     """
     if not others:
-        return same_light(view.dense.depth.device)
+        return identity_exposure(view.dense.depth.device)
     points, confident = _sparse_points(view)
     (mine, texture), (inside, _) = _sampled(
         torch.stack([view.photo.grey, view.photo.texture]),
@@ -98,13 +98,13 @@ def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "3"]:
     gain, offset, _ = torch.stack([other.exposure for other in others])[..., None].unbind(1)
     common = (usable & inside & _is_exposed((theirs - offset) / gain)).flatten()
     mine, texture = mine.repeat(len(others)), texture.repeat(len(others))
-    gain, offset = relative_light(mine, theirs.flatten(), common)
+    gain, offset = relative_exposure(mine, theirs.flatten(), common)
     noise = noise_between(gain * mine + offset, theirs.flatten(), texture, common)
     return torch.stack([gain, offset, noise])
 
 
 def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Points of every fourth pixel of a view in its camera, and which depth is confident."""
+    """Points in a view's camera of every ``_STRIDE``-th pixel, and whether each is confident."""
     depth = view.dense
     rays = view.arrays.cameras.render.rays(device=depth.depth.device)[::_STRIDE, ::_STRIDE]
     points = rays * depth.depth[::_STRIDE, ::_STRIDE, None]
@@ -115,7 +115,7 @@ def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n
 def _sampled(
     greys: Float[Tensor, "k h w"], camera: Camera, points: Float[Tensor, "k n 3"]
 ) -> tuple[Float[Tensor, "k n"], Bool[Tensor, "k n"]]:
-    """What each image shows of points in its camera, and where it does."""
+    """Grey value of each image at points in its camera, and whether they are inside."""
     ahead = points[..., 2] > 1e-6
     pixels, _ = camera.project(points)
     edges = (camera.width - 1, camera.height - 1)

@@ -1,4 +1,4 @@
-"""The depths of images with known poses, and the training after them, in the time there is."""
+"""Depths of images with known poses, and the training after them, within a time budget."""
 
 import time
 from collections.abc import Callable
@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 
 from geogs.config import SearchConfig
-from geogs.depth.sweep_neighbors import RANGE_MARGIN
 from geogs.mapping import known_poses as known
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.map_all import group_size, search_depths, spread_order
@@ -15,15 +14,14 @@ from geogs.mapping.time_budget import TimeBudget
 from geogs.mapping.training.full import seconds_per_step
 
 More = Callable[[Callable[[], int]], None]
-"""Adds at most as many further images as what it is given says, once it is asked."""
+"""Adds further images, at most as many as its argument returns when it is called."""
 
-# Steps after which the next ones are expected to take as long.
+# Steps whose mean time is that of the next ones.
 _ENOUGH_STEPS = 100
 
 
 class PosedMapping:
-    """Decides for a mapper of images with known poses where depths are searched, of how many images
-    and how often, and for how long is trained."""
+    """Searches depths of images with known poses, once or twice, and trains, in a time budget."""
 
     def __init__(self, mapper: Mapper, search: SearchConfig, budget: TimeBudget, seed: int) -> None:
         self._mapper = mapper
@@ -32,15 +30,15 @@ class PosedMapping:
         self._random = np.random.default_rng(seed)
 
     def first_points(self, progress: Callable[[float], None]) -> np.ndarray:
-        """Points of the scene that a few small images show. Raises InputError without any."""
+        """Points of the scene from a few small images. Raises InputError without any."""
         views = list(self._mapper.views.values())
 
         def image_at(index: int) -> SmallImage:
             mask = views[index].mask
             return views[index].keyframe.image, None if mask is None else mask.cpu().numpy()
 
-        places = [view.place for view in views]
-        return first_points(places, image_at, self._mapper.cameras.working, progress)
+        poses = [view.view_pose for view in views]
+        return first_points(poses, image_at, self._mapper.cameras.working, progress)
 
     def search(
         self,
@@ -49,24 +47,24 @@ class PosedMapping:
         more: More | None,
         in_order: bool,
     ) -> None:
-        """Depths of the images; twice if time allows, the second time where the first found it.
+        """Search the depths of the images; if time allows, again in the ranges of the first result.
 
-        Of fewer images where time is short: the first ones ``in_order``, else evenly spread.
+        Where time is short, of fewer images: the first ones ``in_order``, else evenly spread ones.
         """
         search, mapper, budget = self._search, self._mapper, self._budget
         camera = mapper.cameras.working
-        known.expect_depths(mapper.views.values(), points, camera, RANGE_MARGIN)
+        known.expect_depths(mapper.views.values(), points, camera)
         part = 0.5 if search.repeat else 1.0
         if more is not None and budget.training_end is not None:
             searched, seconds = self._try_depths()
             more(lambda: budget.further_views(search, searched, seconds))
             new = [v for v in mapper.views.values() if v.row.search is None]
-            known.expect_depths(new, points, camera, RANGE_MARGIN)
+            known.expect_depths(new, points, camera)
         ids = [*mapper.views] if in_order else spread_order([*mapper.views])
         wanted = budget.views or len(ids)
         start, end, before = time.perf_counter(), budget.training_end, len(mapper.table.mapped)
         until = None if end is None else start + search.depth_ratio * (end - start)
-        if until is not None:  # each that is searched beyond those is paid for in the mesh, too
+        if until is not None:  # images beyond those in the budget take time in the mesh, too
             until -= budget.output_cost.a_view * group_size()
         order = [i for i in ids if not mapper.views[i].has_depth]
         search_depths(mapper, order, lambda f: progress(part * f), until)
@@ -78,13 +76,13 @@ class PosedMapping:
             mapper.check_depths()
             found = known.dense_points(views, mapper.cameras.render, self._random)
             if len(found) >= known.FEWEST_POINTS:
-                known.expect_depths(views, found, camera, RANGE_MARGIN)
+                known.expect_depths(views, found, camera)
             search_depths(mapper, mapped, lambda f: progress(part + part * f))
         budget.views = len(mapper.table.mapped)
         progress(1.0)
 
     def train(self, progress: Callable[[float], None], goes_on: bool = False) -> None:
-        """As many training steps as the time allows, or the usual number where none is given."""
+        """Train as many steps as time allows, or the usual number without a budget."""
         end = self._budget.training_end
         self._mapper.train(self._steps(end, goes_on), progress, end, goes_on)
 
@@ -104,9 +102,9 @@ class PosedMapping:
         return int(np.clip(done + left / seconds, 1, search.most_steps_per_view * views))
 
     def _try_depths(self) -> tuple[int, float]:
-        """Search some depths to see how long that takes: how many, and seconds for each.
+        """Search some depths to measure the time: their number, and seconds for each.
 
-        In two groups, as the first one makes ready what is needed but once.
+        In two groups, as the first one warms up.
         """
         group, ids = group_size(), list(self._mapper.views)
         groups = [g for g in (ids[:group], ids[group : 2 * group]) if g]

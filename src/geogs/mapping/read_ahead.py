@@ -1,4 +1,4 @@
-"""What threads bring back into memory before it is asked for."""
+"""Values that threads read into memory before they are used."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,22 +11,21 @@ from geogs.threads import worker_count
 V = TypeVar("V")
 
 THREADS = 4
-"""Most threads; one is mostly waiting for a disk, or for a GPU."""
+"""Most threads; each mostly waits for a disk or a GPU."""
 Basis = tuple[object, ...]
-"""All that is ever replaced of what a value is made from."""
+"""The replaceable objects that a value is made from."""
 
 
 class ReadAhead(Generic[V]):
-    """Reads values by id in threads; who takes one gets what reading it now would give.
+    """Reads values by id in threads; ``take`` returns what reading now would.
 
-    What its owner changes meanwhile makes what was read worthless, and it is read again.
+    Values whose ``Basis`` has changed since are discarded.
     """
 
     def __init__(
         self, load: Callable[[int], V], basis: Callable[[int], Basis], device: torch.device
     ) -> None:
-        """``load`` brings a value back; it is called by several threads at once. Of a GPU it is
-        called in the stream in which its values are used."""
+        """``load`` reads a value; several threads call it, on a GPU in the stream of ``begin``."""
         self._load = load
         self._basis = basis
         self._device = device
@@ -34,8 +33,7 @@ class ReadAhead(Generic[V]):
         self._threads: ThreadPoolExecutor | None = None
 
     def begin(self, ids: Iterable[int]) -> None:
-        """Begin to read some values; of those that were read before and are not among them, nothing
-        is kept."""
+        """Begin to read some values, and discard those of the last call that are not among them."""
         before, self._readings = self._readings, {}
         stream = torch.cuda.current_stream() if self._device.type == "cuda" else None
         for id in ids:
@@ -47,7 +45,7 @@ class ReadAhead(Generic[V]):
             left.cancel()
 
     def take(self, id: int) -> V | None:
-        """A value that was read, or soon will be; None if it was not, or has changed since."""
+        """A value that was or is being read; None if it was not, or its basis has changed since."""
         reading = self._readings.pop(id, None)
         if reading is None:
             return None

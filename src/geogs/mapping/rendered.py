@@ -1,4 +1,4 @@
-"""Depth maps of keyframes for a surface: rendered from disks, or as searched before any disk."""
+"""Depth maps of keyframes for surface fusion: rendered from disks, or as searched."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -22,11 +22,11 @@ from geogs.types import MapSnapshot, RenderedKeyframe
 from geogs.world.disks import DiskParameters
 
 _RADIUS = 3
-"""Pixels around, whose tangent planes a depth is averaged over."""
+"""Radius in pixels of the tangent planes that a depth is averaged over."""
 
 
 class SurfaceMaps(NamedTuple):
-    """A surface seen from one place."""
+    """A surface rendered from one pose."""
 
     depth: Float[Tensor, "h w"]
     """0 where the map is too thin to say."""
@@ -38,7 +38,7 @@ class SurfaceMaps(NamedTuple):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class RenderedView(ShortRepr):
-    """A map seen from one place, for programs."""
+    """A map rendered from one pose, as NumPy arrays."""
 
     depth: Float[np.ndarray, "h w"]
     """z in map units; 0 where the map is too thin to say."""
@@ -50,7 +50,7 @@ class RenderedView(ShortRepr):
 
 @dataclass(frozen=True)
 class SurfaceRules:
-    """What counts as surface where disks are blended."""
+    """Thresholds that make a surface of blended disks."""
 
     min_alpha: float
     """Opacity above which the map hides what lies behind."""
@@ -60,15 +60,15 @@ class SurfaceRules:
 
     @staticmethod
     def of(config: MappingConfig) -> "SurfaceRules":
-        """Those of a run's settings."""
+        """The rules of a run's settings."""
         return SurfaceRules(MIN_ALPHA, config.max_spread)
 
 
 @dataclass(frozen=True, eq=False)
 class MapRenderer:
-    """Shows a map from anywhere, as the run showed it from its keyframes.
+    """Renders a map from any pose, as the run rendered it from its keyframes.
 
-    Disks are in the map's own frame and unit, what is asked and given in the world's.
+    Disks are in the map's own frame and unit, poses and results in the world's.
     """
 
     disks: MapSnapshot
@@ -105,7 +105,7 @@ def rendered_surface(
     camera: Camera,
     T_cw: Float[Tensor, "4 4"],
     rules: SurfaceRules,
-    mask: Bool[Tensor, "h w"] | None = None,
+    mask: Bool[Tensor, "h w"] | None,
 ) -> SurfaceMaps:
     """Disks seen from a pose inside a mask, with the weight of each depth for fusion."""
     output = render(disks, camera, T_cw)
@@ -126,7 +126,7 @@ def rendered_surface(
 
 
 def shown_depth(maps: SurfaceMaps) -> DenseDepth:
-    """What a map shows from a keyframe, as if that had been searched there."""
+    """A rendered surface as the dense depth of a keyframe."""
     known = maps.depth > 0
     shown = maps.depth[known]
     typical = shown.median() if len(shown) else maps.depth.new_ones(())

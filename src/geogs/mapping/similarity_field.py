@@ -1,9 +1,9 @@
 """A similarity for every disk, smooth over each surface: the blended map update.
 
-After a correction every keyframe says how what it sees has to move. A disk is moved by all those
-that see it where it lies: its place is the work of the keyframes that trained it, not of the one
-that made it alone. A disk that a drifting loop has put in double is seen in place by the keyframes
-of its own visit only, and goes with these. Then neighbours are evened out unless they have to part.
+A correction gives each keyframe a similarity by which its surface moves. A disk moves with all
+keyframes on whose depth it lies: they trained it, not only the one that made it. Of a surface that
+a drifting loop has doubled, each layer lies on the depths of its own visit and moves with these.
+Then the similarities are smoothed between neighbours, but not across layers that have to part.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from geogs.geometry.neighbors import nearest_neighbors
 from geogs.gpu.transfer import to_device
 
 _AGREEMENT = 0.03
-"""Relative deviation from a keyframe's depth at which a disk counts as its surface no more."""
+"""Relative standard deviation of disks around the depth of a keyframe whose surface they are on."""
 _OWN = 0.1
 """Weight of the keyframe that made a disk; another's is at most one."""
 _BORDER = 8.0
@@ -29,12 +29,12 @@ _ROUNDS = 4
 _SPREAD = 1.5
 """Width of the smoothing, in distances to the middle one of the neighbours."""
 _PARTING = 0.2
-"""Difference of two neighbours' ways at which they belong to different layers, in that width."""
+"""Difference of the displacements of neighbours of different layers, in that width."""
 
 
 @dataclass(frozen=True, eq=False)
 class CovisibleKeyframe:
-    """What a keyframe saw before the correction, on the device of the map."""
+    """Depth of a keyframe before the correction, on the device of the map."""
 
     keyframe_id: int
     camera: Camera

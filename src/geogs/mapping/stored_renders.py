@@ -1,4 +1,4 @@
-"""Renderings of the keyframes of a long video, which do not fit into memory all at once."""
+"""Renderings of keyframes in a file, as those of a long video do not fit into memory."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class StoredRender:
     T_cw: Float[Tensor, "4 4"]
     depth: Archived
     normal: Archived
-    """With half the digits; nobody measures with them."""
+    """In half precision."""
     weight: Archived
     image: Archived
     timestamp: float

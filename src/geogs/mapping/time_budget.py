@@ -1,4 +1,4 @@
-"""How the time for a reconstruction from known poses is divided: how many images it lasts for."""
+"""Division of the time for a reconstruction from known poses, and the number of images that fit."""
 
 import time
 from dataclasses import dataclass
@@ -7,44 +7,43 @@ import numpy as np
 
 from geogs.config import SearchConfig
 
-# What checking depths and growing disks take, as a part of one search of the depths.
+# Time to check depths and grow disks, over that of one search of the depths.
 _GROWING = 0.6
 
-# Images for each that is to get a depth, where these are few, and how many are not few.
+# Images to read for each that gets a depth, up to a total.
 _HELPERS, _FEW = 4, 100
-# Part of the time that is left which reading such helpers may take.
+# Fraction of the time left for reading images that get no depth.
 _HELP = 0.05
 
 
 @dataclass(frozen=True)
 class ViewCost:
-    """What an image costs, seconds."""
+    """Seconds for an image."""
 
     reading: float
-    """Until it is there to be matched with."""
+    """To read it."""
     search: float
-    """One search of its depth."""
+    """To search its depth once."""
     output: float
     """In the mesh and the files."""
 
 
 def rounds(search: SearchConfig) -> float:
-    """Searches of the depths that are to be paid for, what they are made of after it included."""
+    """Time before the training, with checks and growth, over that of one search of the depths."""
     return _GROWING + (2.0 if search.repeat else 1.0)
 
 
 def affordable_views(
     seconds: float, cost: ViewCost, search: SearchConfig, searched: int = 0, read: int = 0
 ) -> int:
-    """How many images a time lasts for, so that what they cost before the training is a part of it.
+    """Number of images whose time before the training is a given fraction of the time.
 
-    The part is ``search.depth_ratio`` of what is left when the mesh and the files of that many
-    images have been paid for.
+    It is ``search.depth_ratio`` of the time less that for their mesh and files.
 
     Args:
-        seconds: left, but for what mesh and files cost however many images there are.
+        seconds: time left, less that for mesh and files however many images there are.
         cost: of an image.
-        search: whether depths are searched twice, and the part.
+        search: whether depths are searched twice, and the fraction.
         searched: images whose depth has been searched once by now.
         read: images that have been read by now.
     """
@@ -54,7 +53,7 @@ def affordable_views(
 
 
 def helpers(views: int, seconds: float, cost: ViewCost) -> int:
-    """How many more images to read than get a depth, so that there are some to match these with.
+    """Number of images to read beyond those that get a depth, to match these with.
 
     Args:
         views: that get a depth.
@@ -67,12 +66,12 @@ def helpers(views: int, seconds: float, cost: ViewCost) -> int:
 
 @dataclass(frozen=True)
 class OutputCost:
-    """What the mesh and the files are going to take, seconds."""
+    """Seconds for the mesh and the files."""
 
     once: float
-    """However many images make the map."""
+    """For any number of images."""
     a_view: float
-    """For each of them."""
+    """For each image of the map."""
 
     def of(self, views: int) -> float:
         """Seconds for so many images."""
@@ -80,43 +79,42 @@ class OutputCost:
 
 
 class TimeBudget:
-    """Seconds for a reconstruction, counted from now on; without a limit there is no end."""
+    """A time limit, or none, for a reconstruction that begins now."""
 
     def __init__(self, seconds: float | None, output_ratio: float) -> None:
         self._deadline = None if seconds is None else time.perf_counter() + seconds
         self._read: list[float] = []
         self.views = 0
-        """Images that make the map, once that is decided."""
+        """Number of images of the map, once that is decided."""
         self.output_cost = OutputCost(output_ratio * (seconds or 0.0), 0.0)
-        """What comes after the training: a part of the budget until somebody knows better."""
+        """Time after the training: a fraction of the budget until it is known."""
 
     @property
     def left(self) -> float:
-        """Seconds for all that is still to be done."""
+        """Seconds until the limit."""
         return np.inf if self._deadline is None else self._deadline - time.perf_counter()
 
     @property
     def training_end(self) -> float | None:
-        """When training must have ended for what comes after it."""
+        """Time at which training has to end, in ``time.perf_counter``'s seconds."""
         if self._deadline is None:
             return None
         return self._deadline - self.output_cost.of(self.views or len(self._read))
 
     def count_image(self) -> None:
-        """An image has been read."""
+        """Count an image that has been read."""
         self._read.append(time.perf_counter())
 
     def count_spent(self, seconds: float) -> None:
-        """So many seconds were spent before."""
+        """Take off seconds spent before."""
         if self._deadline is not None:
             self._deadline -= seconds
 
     def further_views(self, search: SearchConfig, searched: int, seconds: float) -> int:
-        """How many more images to read, of which some have been searched already in so many seconds
-        each.
+        """Number of further images to read, given how many were searched, and seconds for each.
 
-        As many as the time lasts for; where these are few, so that none may stand next to another,
-        some that only help to find the depths of these.
+        As many as time allows; where these are few, and perhaps far from each other, some more only
+        to match them with.
         """
         read = self._read
         reading = (read[-1] - read[0]) / max(len(read) - 1, 1)

@@ -1,4 +1,4 @@
-"""What is large of the keyframes that mapping sees: in memory while it is used, else in a file."""
+"""Image-sized data of the keyframes of mapping: in memory while it is used, else in a file."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,15 +15,15 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.jumps import DepthJumps, depth_jumps
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
-from geogs.mapping.dense_depths import get_depth, put_depth
 from geogs.mapping.read_ahead import Basis, ReadAhead
+from geogs.world.arrays import ArrayTable
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from geogs.world.lru import LruCache
-from geogs.world.map import MapTable
+from geogs.world.map import MapTable, SearchedDepth
 
 DEPTHS_ON_GPU = 512
-"""Most depths that a GPU keeps of views that are not in use, as bringing one there takes longer
-than using it; at 320 x 180 pixels with normals they take 600 MB."""
+"""Most depths of unused views that stay on a GPU, as an upload takes longer than their use; at
+320 x 180 pixels with normals they take 600 MB."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class MapCameras:
 
 @dataclass(eq=False)
 class LoadedView:
-    """What is as large as an image: all but the depths follows from the keyframe's image."""
+    """Image-sized data of a view; all but the depths follows from the keyframe's image."""
 
     image: UInt8[np.ndarray, "wh ww 3"]
     photo: PhotoView
-    """With the exposure compensated, on the map's device; its pose was the keyframe's once."""
+    """With the exposure compensated, on the map's device; its pose may be outdated."""
     normal: Float[Tensor, "h w 3"] | None
     """A prior's normals at the render size, on the map's device."""
     depth: DenseDepth | None = None
@@ -66,12 +66,12 @@ class LoadedView:
     is_render_written: bool = True
 
 
-SURE = 0.5
+CONFIDENT = 0.5
 """Least confidence of depths whose jumps count as edges."""
 
 
 class ViewArrays:
-    """Images, depths and constants of the views of a map; those used last are in memory.
+    """Images, depths and constants of the views of a map; the last used are in memory.
 
     Depths follow the scale of their keyframes.
     """
@@ -85,7 +85,7 @@ class ViewArrays:
         self.loss = loss
         self.device = table.disks.device
         self.loaded: LruCache[int, LoadedView] = LruCache(keyframes.arrays.resident, self._write)
-        """Those in memory; whoever asks uses ``load``."""
+        """The views in memory; ``load`` reads others."""
         self._ahead = ReadAhead(
             lambda id: self._with_constants(id, self._load(id)), self._basis, self.device
         )
@@ -94,26 +94,26 @@ class ViewArrays:
             self.loaded.put(id, self._load(id, as_written=True))
 
     def put_mask(self, id: int, mask: Bool[np.ndarray, "h w"]) -> None:
-        """What counts of a keyframe, by a mask of the size of its image."""
+        """Set the mask of a keyframe, of the size of its image."""
         size = (self.cameras.render.width, self.cameras.render.height)
         ratio = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         self.table.arrays.put("mask", id, ratio > 0.5)
         self.table.arrays.recent("mask there").drop(id)
 
     def read_ahead(self, ids: Iterable[int]) -> None:
-        """Let threads bring some views back that will soon be asked for, and forget the views of
-        the last such call that were not."""
+        """Read some views in threads before they are used, and discard those of the last call that
+        were not."""
         self._ahead.begin([i for i in ids if i not in self.loaded])
 
     def settle(self) -> None:
-        """Write what has changed, which stays in memory, and note what is there."""
+        """Write changes to the table, and the ids of the views in memory."""
         loaded = self.loaded.items()
         for id, view in loaded:
             self._write(id, view)
         self.table.resident = [id for id, _ in loaded]
 
     def forget_images(self) -> None:
-        """Begin anew with the images of all keyframes, as they have been replaced."""
+        """Discard what was made of the images of keyframes, which have been replaced."""
         self.settle()
         self._ahead.begin([])
         self.loaded = LruCache(self.loaded.limit, self._write)
@@ -121,7 +121,7 @@ class ViewArrays:
             self.table.arrays.recent("bare segments").drop(id)
 
     def load(self, id: int) -> LoadedView:
-        """Everything in memory, brought back if need be."""
+        """A view's data, read if it is not in memory."""
         loaded = self.loaded.get(id, lambda: self._ahead.take(id) or self._load(id))
         return self._at_scale(id, loaded)
 
@@ -135,7 +135,7 @@ class ViewArrays:
         )
 
     def depth(self, id: int) -> DenseDepth:
-        """The dense depth, where there must be one."""
+        """The dense depth, which there must be."""
         loaded = self.loaded.peek(id)
         if loaded is None:
             return self._read_depth(id, self.keyframes[id].scale)
@@ -144,11 +144,11 @@ class ViewArrays:
         return depth
 
     def set_depth(self, id: int, depth: DenseDepth) -> None:
-        """Take over a dense depth, on which the losses' constants then live."""
+        """Set the dense depth, and the losses' constants that depend on it."""
         keyframe, mask, render = self.keyframes[id], self.mask(id), self.cameras.render
         if keyframe.moving is not None:
             moving = keyframe.grid.enlarged(keyframe.moving, render.width, render.height)
-            depth = depth.unsure_where(moving)
+            depth = depth.unknown_in(moving)
         if mask is not None:
             depth = depth.within(mask)
         loaded = self.loaded.peek(id)
@@ -163,9 +163,11 @@ class ViewArrays:
                 prior_normal=normal,
             )  # fmt: skip
 
-    def constants(self, id: int) -> ViewConstants | None:
-        """What the single-view losses need; None until the keyframe has a depth."""
-        return self._with_constants(id, self.load(id)).constants
+    def constants(self, id: int) -> ViewConstants:
+        """Constants of the single-view losses; the keyframe must have a depth."""
+        constants = self._with_constants(id, self.load(id)).constants
+        assert constants is not None, f"keyframe {id} has no depth yet"
+        return constants
 
     # --- from and to the file --------------------------------------------------------------
 
@@ -178,7 +180,7 @@ class ViewArrays:
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
         )
         if row.exposure is not None:
-            photo = photo.in_light(row.exposure)
+            photo = photo.with_exposure(row.exposure)
         normal = None
         if loss.normal_weight:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)
@@ -199,7 +201,7 @@ class ViewArrays:
         return loaded
 
     def _basis(self, id: int) -> Basis:
-        """All that is ever replaced of what a view is loaded from."""
+        """The objects that are replaced when what a view is loaded from changes."""
         keyframe, row = self.keyframes[id], self.table.views[id]
         rendered = self.table.arrays.pieces.get("rendered depth", {}).get(id)
         return keyframe, keyframe.scale, row.exposure, row.depth, rendered
@@ -244,7 +246,7 @@ class ViewArrays:
         """Depth, its weight in L_d, and normals: a prior's, else those that came with the depth."""
         is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
         weight = depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
-        at_edges = sure_jumps(depth).around(self.loss.edge_reach)
+        at_edges = confident_jumps(depth).around(self.loss.edge_reach)
         prior = depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE)
         return (
             prior if depth.sky is None else torch.where(depth.sky, OUTSIDE, prior),
@@ -253,9 +255,43 @@ class ViewArrays:
         )
 
 
-def sure_jumps(depth: DenseDepth) -> DepthJumps:
+def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> SearchedDepth:
+    """Write the depth of a keyframe that has a scale now.
+
+    Raises:
+        OutputError: the disk is full, or cannot be written.
+    """
+    maps = depth.arrays()
+    arrays.put("depth", id, maps.depth)
+    arrays.put("confidence", id, maps.confidence)
+    # Nobody measures with the normals.
+    normal = None if depth.normal is None else depth.normal.half()
+    for name, values in (("depth normal", normal), ("sky", depth.sky)):
+        if values is None:
+            arrays.drop(name, id)
+        else:
+            arrays.put(name, id, values.cpu().numpy())
+    return SearchedDepth(depth.typical, scale)
+
+
+def get_depth(
+    arrays: ArrayTable, id: int, stored: SearchedDepth, scale: float, device: torch.device
+) -> DenseDepth:
+    """Read the depth of a keyframe at another scale of it."""
+    depth, confidence = (torch.from_numpy(arrays.load(n, id)) for n in ("depth", "confidence"))
+    if scale != stored.scale:
+        depth = depth * (scale / stored.scale)
+    normal, sky = arrays.get("depth normal", id), arrays.get("sky", id)
+    return DenseDepth(
+        depth.to(device), confidence.to(device), torch.tensor(stored.typical_at(scale)),
+        normal=None if normal is None else torch.from_numpy(normal).float().to(device),
+        sky=None if sky is None else torch.from_numpy(sky).to(device),
+    )  # fmt: skip
+
+
+def confident_jumps(depth: DenseDepth) -> DepthJumps:
     """Jumps between depths that are known fairly well."""
-    return depth_jumps(torch.where(depth.confidence >= SURE, depth.depth, 0.0))
+    return depth_jumps(torch.where(depth.confidence >= CONFIDENT, depth.depth, 0.0))
 
 
 def _shrunk_normal(

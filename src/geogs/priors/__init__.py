@@ -1,1 +1,1 @@
-"""Depth and normals that a network guesses from one image, and what their numbers mean."""
+"""Priors: networks on single images, depth sensors, odometry."""

@@ -1,4 +1,4 @@
-"""From any kind of prior to a positive inverse depth in the tracker's unit."""
+"""Alignment of a prior of any kind with the tracker: positive inverse depth in its unit."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,7 +13,7 @@ MIN_CELLS = 32
 FARTHEST = 0.05
 """Aligned inverse depth below this fraction of its median counts as unknown (sky, a bad shift)."""
 _BINS = 12
-"""Parts of the cells, by their value, of whose medians lines are tried."""
+"""Bins of the cells, by their value, between whose medians lines are tried."""
 _ROUNDS = 8
 _CUT = 2.0
 """Deviations at which a cell counts a quarter (Geman and McClure's weight)."""
@@ -25,9 +25,8 @@ def align_inverse_depth(
     inverse_depth: Float[Tensor, "p"],
     weight: Float[Tensor, "p"],
 ) -> Float[Tensor, "p"] | None:
-    """The prior as inverse depth in the tracker's unit; 0 where unknown.
-
-    With that scale (and shift, where its kind has one) that fits the tracker best.
+    """The prior as inverse depth in the tracker's unit, fitted by a scale (and a shift, if its kind
+    has one); 0 where unknown.
 
     A scale alone is the weighted median ratio. Scale and shift minimise the weighted relative
     error by reweighted least squares (Geman and McClure), begun at the best line through the
@@ -108,7 +107,7 @@ def _best_of_medians(
 
 
 def _without_far(inverse_depth: Float[Tensor, "p"]) -> Float[Tensor, "p"]:
-    """Zero where inverse depth is not positive or next to nothing beside its median."""
+    """Inverse depth, 0 where it is not positive or below ``FARTHEST`` times its median."""
     positive: Bool[Tensor, "p"] = inverse_depth > 0
     if not bool(positive.any()):
         return torch.zeros_like(inverse_depth)

@@ -1,4 +1,4 @@
-"""A card: what a network's file wants and what its numbers mean, as a small YAML file."""
+"""Cards: small YAML files on the input and output of a network's file."""
 
 import re
 from dataclasses import MISSING, dataclass, fields
@@ -18,7 +18,7 @@ Number = Annotated[float, Range(-1e6, 1e6)]
 
 @dataclass(frozen=True)
 class PriorCard:
-    """What goes into a network and what comes out. Images are RGB unless ``channels`` says BGR."""
+    """Input and output of a network. Images are RGB unless ``channels`` says BGR."""
 
     name: str
     source: str

@@ -1,17 +1,17 @@
-"""The noise of a depth sensor: what a measured depth says of inverse depth, and where nothing.
+"""The noise model of a depth sensor, for inverse depth.
 
-Triangulating sensors (structured light, stereo) measure a disparity, so that inverse depth errs
-alike everywhere, and depth with its square. Beside that a fraction of the depth is wrong in common
-(calibration, temperature), and a depth may belong to a pixel nearby, which counts where the surface
-is slanted:
+Triangulating sensors (structured light, stereo) measure a disparity, so that the error of inverse
+depth is the same everywhere, that of depth grows with its square. There is a common relative error
+(calibration, temperature), and a depth may belong to a pixel nearby, which matters on slanted
+surfaces:
 
     sigma^2 = deviation^2 + (ratio d)^2 + (lateral |grad d|)^2 .
 
-What is wrong in common is the scale's error, which no comparison of depths shows; the ratio stands
-for what it leaves behind from place to place.
+The common error is one of scale, which no comparison of depths shows; the ratio stands for its
+variation over the image.
 
-At edges a sensor averages both sides or shows the wrong one, and holes eat into what is around
-them: pixels next to either are not believed. After Khoshelham and Elberink, "Accuracy and
+At edges a sensor averages both sides or shows the wrong one, and pixels around holes are wrong:
+pixels next to either are dropped. After Khoshelham and Elberink, "Accuracy and
 resolution of Kinect depth data", Sensors 2012, and Nguyen et al., "Modeling Kinect sensor noise",
 3DIMPVT 2012.
 """
@@ -27,46 +27,45 @@ from torch import Tensor
 from geogs.config import DepthSensorConfig
 
 LATERAL = 0.5
-"""Pixels of the working image by which a depth may belong to another place."""
+"""Lateral error of a depth, pixels of the working image."""
 EDGE = 0.04
-"""Relative step of depth between neighbouring pixels that is an edge, where nothing is believed,
-nor on the next pixels."""
+"""Relative step of depth between neighbouring pixels that is an edge."""
 NEAR, FAR = 0.1, 10.0
-"""Metres between which depths are believed: sensors measure hardly anything nearer or farther."""
+"""Range of depths, metres: sensors measure hardly anything nearer or farther."""
 _EVERYWHERE = np.ones((3, 3), np.uint8)
 _STEPS = 4.0
-"""Deviations of the sensor that a step between neighbouring pixels exceeds at an edge, too."""
+"""Least step at an edge in standard deviations of the sensor."""
 INDEPENDENT = 9.0
-"""Independent measurements that 25 neighbouring pixels amount to."""
+"""Effective number of independent measurements in 25 neighbouring pixels."""
 _MARGIN = 1
-"""Pixels beside a hole or an edge that are not believed."""
+"""Pixels beside a hole or an edge that are dropped."""
 
 
 @dataclass(frozen=True)
 class SensorDepth:
-    """Inverse depth as it was measured."""
+    """Measured inverse depth."""
 
     inverse_depth: Float32[np.ndarray, "h w"]
-    """Per metre; 0 where nothing is believed."""
+    """Per metre; 0 where unknown."""
     deviation: Float32[np.ndarray, "h w"]
-    """Its standard deviation; infinite where nothing is believed."""
+    """Its standard deviation; infinite where unknown."""
 
     def at_cells(self, offset: int, stride: int, height: int, width: int) -> "SensorDepth":
         """At every ``stride``-th pixel from ``offset`` on, the mean of the pixels around.
 
-        On a plane the mean is what the pixel itself would show without noise; neighbours err
-        partly alike, so that 25 of them count as ``INDEPENDENT``.
+        On a plane the mean is the pixel's own value without noise; the errors of neighbours are
+        correlated, so that 25 of them count as ``INDEPENDENT``.
         """
         known = (self.inverse_depth > 0).astype(np.float32)
-        share, total, worst = (
+        count, total, worst = (
             cv2.boxFilter(m, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
             for m in (known, self.inverse_depth, np.where(known > 0, self.deviation, 0))
         )
-        is_known = (known > 0) & (share > 12)
-        count = np.maximum(share, 1)
-        inverse = np.where(is_known, total / count, 0)
-        fewer = np.maximum(INDEPENDENT * share / 25, 1)
-        deviation = np.where(is_known, worst / count / np.sqrt(fewer), np.inf)
+        is_known = (known > 0) & (count > 12)
+        divisor = np.maximum(count, 1)
+        inverse = np.where(is_known, total / divisor, 0)
+        independent = np.maximum(INDEPENDENT * count / 25, 1)
+        deviation = np.where(is_known, worst / divisor / np.sqrt(independent), np.inf)
         rows = slice(offset, offset + stride * height, stride)
         columns = slice(offset, offset + stride * width, stride)
         return SensorDepth(
@@ -77,26 +76,26 @@ class SensorDepth:
     def resized(self, width: int, height: int) -> "SensorDepth":
         """Averages over the pixels of a smaller image; unknown where most of them are.
 
-        The deviation is the pixels' own: what they err in common does not average.
+        The deviation is the pixels' own: their common error does not average out.
         """
         known = (self.inverse_depth > 0).astype(np.float32)
         if (width, height) == known.shape[::-1]:
             return self
-        share, inverse, deviation = (
+        fraction, inverse, deviation = (
             cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA)
             for m in (known, self.inverse_depth, np.where(known > 0, self.deviation, 0))
         )
-        is_known = share > 0.5
-        count = np.where(is_known, share, 1)
+        is_known = fraction > 0.5
+        divisor = np.where(is_known, fraction, 1)
         return SensorDepth(
-            np.where(is_known, inverse / count, 0).astype(np.float32),
-            np.where(is_known, deviation / count, np.inf).astype(np.float32),
+            np.where(is_known, inverse / divisor, 0).astype(np.float32),
+            np.where(is_known, deviation / divisor, np.inf).astype(np.float32),
         )
 
     def tensors(
         self, device: torch.device | str
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """Inverse depth and its information 1 / sigma^2, 0 where nothing is believed."""
+        """Inverse depth and its information 1 / sigma^2, 0 where unknown."""
         information = np.where(self.inverse_depth > 0, self.deviation, np.inf) ** -2.0
         return (
             torch.from_numpy(self.inverse_depth).to(device),
@@ -105,7 +104,7 @@ class SensorDepth:
 
 
 def sensor_depth(metres: Float32[np.ndarray, "h w"], config: DepthSensorConfig) -> SensorDepth:
-    """What a picture of depth z, 0 where the sensor saw nothing, says of every pixel."""
+    """Inverse depth and its deviation from a depth image z, 0 where the sensor saw nothing."""
     known = (metres >= NEAR) & (metres <= FAR)
     z = np.where(known, metres, 1.0).astype(np.float32)
     d = np.where(known, 1 / z, 0).astype(np.float32)

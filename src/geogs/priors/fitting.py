@@ -1,4 +1,4 @@
-"""Images brought to the size that a network takes, and its maps brought back."""
+"""Images at the size that a network takes, and its maps at that of the image."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What a monocular prior gives, and what its numbers mean."""
+"""The maps of a monocular prior, and the meaning of their numbers."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class DepthKind(Enum):
-    """What stands between a network's numbers x and the depth z along the optical axis."""
+    """Relation of a network's numbers x to the depth z along the optical axis."""
 
     METRIC = "metric"
     """z = x metres, as far as the network is right about the camera; the tracker's unit is not
@@ -30,7 +30,7 @@ class DepthKind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class PriorMaps:
-    """What a prior says of one image, at the size of that image; either part may be missing."""
+    """Maps of a prior for one image, at its size; either may be missing."""
 
     kind: DepthKind = DepthKind.SCALE_FREE
     """What the numbers of ``depth`` mean."""

@@ -1,4 +1,4 @@
-"""Motions by another tracker: their noise, and the scale by which those of the images fit them."""
+"""Motions measured by another tracker: their noise, and the scale of the images' motions."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from geogs.geometry.lie import se3_inverse, so3_log
 ROTATION_DEG = 0.15
 """Deviation of an orientation from one keyframe to the next, however near."""
 FIT = 16.8
-"""Squared deviations (six numbers) up to which two motions fit: 99 % of those that do."""
+"""Largest squared normalised difference (six degrees of freedom) of motions that fit: 99 %."""
 PROPOSALS = 256
 """Scales that are tried at most, evenly chosen along the path."""
 ROUNDS = 10
@@ -22,12 +22,12 @@ ROUNDS = 10
 
 @dataclass(frozen=True)
 class ScaleVote:
-    """What pairs of motions, of the images and measured, say of the scale between them."""
+    """Scale between motions of the images and measured ones."""
 
     scale: float
     """Metres to the unit of the images' motions."""
     deviation: float
-    """Standard deviation of the scale, as a part of it; infinite where nothing tells."""
+    """Relative standard deviation of the scale; infinite where it is unknown."""
     fits: Bool[Tensor, "m"]
     """Which motions fit at that scale."""
 
@@ -40,9 +40,9 @@ class ScaleVote:
 def information_of(motion: Float[Tensor, "m 4 4"], config: OdometryConfig) -> Float[Tensor, "m 6"]:
     """Inverse variances of translation (metres) and rotation (radians) of measured motions."""
     distance = motion[:, :3, 3].norm(dim=1, keepdim=True)
-    place = config.deviation**2 + (config.drift * distance) ** 2
-    turn = math.radians(1) ** 2 * (ROTATION_DEG**2 + (config.rotation_drift * distance) ** 2)
-    return torch.cat([1 / place.expand(-1, 3), 1 / turn.expand(-1, 3)], 1)
+    translation = config.deviation**2 + (config.drift * distance) ** 2
+    rotation = math.radians(1) ** 2 * (ROTATION_DEG**2 + (config.rotation_drift * distance) ** 2)
+    return torch.cat([1 / translation.expand(-1, 3), 1 / rotation.expand(-1, 3)], 1)
 
 
 def vote_on_scale(
@@ -57,15 +57,15 @@ def vote_on_scale(
     linear, beside the least-squares loop. Rotations have to fit, too.
     """
     information = information_of(measured, config)
-    turned = so3_log(measured[:, :3, :3].mT @ seen[:, :3, :3])
-    turn = (information[:, 3:] * turned.square()).sum(1)
-    # Places of the targets in the sources: how the targets are turned does not count twice.
+    rotation_error = so3_log(measured[:, :3, :3].mT @ seen[:, :3, :3])
+    rotation = (information[:, 3:] * rotation_error.square()).sum(1)
+    # Positions of the targets in the sources: rotations must not count twice.
     t, t_measured = se3_inverse(seen)[:, :3, 3], se3_inverse(measured)[:, :3, 3]
     precision = information[:, 0]
 
     def misfit(scale: Float[Tensor, "*s"]) -> Float[Tensor, "*s m"]:
-        away = scale[..., None, None] * t - t_measured
-        return turn + precision * away.square().sum(-1)
+        difference = scale[..., None, None] * t - t_measured
+        return rotation + precision * difference.square().sum(-1)
 
     lengths = t.norm(dim=1)
     moved = lengths > 0
@@ -80,6 +80,6 @@ def vote_on_scale(
         weight = precision / (1 + misfit(scale) / FIT) ** 2
         scale = (weight * (t * t_measured).sum(1)).sum() / (weight * lengths.square()).sum()
     fits = misfit(scale) <= FIT
-    told = float((precision * lengths.square())[fits].sum())
-    deviation = 1 / (float(scale) * math.sqrt(told)) if told > 0 and scale > 0 else math.inf
+    known = float((precision * lengths.square())[fits].sum())
+    deviation = 1 / (float(scale) * math.sqrt(known)) if known > 0 and scale > 0 else math.inf
     return ScaleVote(float(scale), deviation, fits)

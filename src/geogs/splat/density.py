@@ -1,4 +1,4 @@
-"""Where the map needs disks, and which disks it can do without."""
+"""Selection of pixels that need disks, and of disks that can be removed."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,7 +12,7 @@ INSERT_ALPHA = 0.4
 INSERT_BEHIND = 0.05
 """... or where the map lies this fraction of the depth behind a confident depth."""
 PRUNE_OPACITY = 0.05
-"""Disks below this opacity are removed: they hardly show."""
+"""Disks below this opacity are removed."""
 
 
 def candidate_pixels(
@@ -38,10 +38,10 @@ def spread_candidates(
     edge_stride: int,
     generator: torch.Generator,
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """Rows and columns of some needed pixels, and how many pixels these are apart.
+    """Rows and columns of some needed pixels, and the spacing of each.
 
-    That is ``stride``, at the edges of things ``edge_stride`` if that is less: a disk is about as
-    large as its distance to others, and a large one overhangs the edge.
+    It is ``stride``, at depth edges ``edge_stride`` if that is less: a disk is about as large as
+    its spacing, and a large one would overhang the edge.
     """
     found = []
     height, width = needed.shape
@@ -61,10 +61,10 @@ def unexplained(
     depth: Float[Tensor, "h w"],
     confidence: Float[Tensor, "h w"],
 ) -> Bool[Tensor, "h w"]:
-    """Pixels whose known depth the map does not show: too transparent, or behind a confident depth.
+    """Pixels with a depth where the map is transparent or behind a confident depth.
 
-    A map in front of the depth is no reason for a disk: it would be hidden, and made again from
-    every keyframe. What stands in front wrongly is carved instead.
+    Where the map is in front of the depth, a disk would be hidden, and made again from every
+    keyframe; wrong disks in front are carved instead.
     """
     empty = render.alpha < INSERT_ALPHA
     behind = render.depth - depth > INSERT_BEHIND * depth

@@ -1,4 +1,4 @@
-"""How disks start: in local planes (paper, Sec. "Local-plane driven initialization"), or anyhow."""
+"""Initial disks: in local planes (paper, Sec. "Local-plane driven initialization") or random."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,9 @@ from geogs.world.disks import DiskParameters
 
 NEIGHBOURS = 12
 """Points of the local plane fit: enough for noise to average, few enough to follow edges."""
-# Part of the extent of some points within which their neighbours are looked for at first.
+MIN_COSINE = 0.15
+"""Least cosine of a disk's normal to its own camera: one that is seen edge-on gets no gradient."""
+# Margin around some points, over their extent, in which neighbours are searched first.
 _MARGIN = 0.05
 
 
@@ -59,7 +61,7 @@ def _neighbourhoods(
 ) -> tuple[Float[Tensor, "n j"], Float[Tensor, "n j 3"]]:
     """Distances and positions of the k + 1 nearest of points and context, float64.
 
-    Of a large context only what lies around the points is searched, as long as that is enough.
+    Of a large context only the points nearby are searched, if they are enough.
     """
     low, high = points.amin(0), points.amax(0)
     margin = _MARGIN * (high - low).norm()
@@ -82,17 +84,16 @@ def fit_local_planes_on_gpu(
 
 
 def face_camera(
-    normal: Float[Tensor, "n 3"], to_camera: Float[Tensor, "n 3"], min_cosine: float
+    normal: Float[Tensor, "n 3"], to_camera: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Flip normals to the camera; lean those seen edge-on towards it until they can be seen.
+    """Flip normals to the camera; lean those seen edge-on towards it, up to about ``MIN_COSINE``.
 
-    A disk that its own camera sees edge-on receives no gradient, so one whose cosine to
-    ``to_camera`` (unit) is below ``min_cosine`` is turned just that far.
+    ``to_camera`` is a unit vector.
     """
     cosine = (normal * to_camera).sum(-1, keepdim=True)
     normal = torch.where(cosine < 0, -normal, normal)
     cosine = cosine.abs()
-    lean = (min_cosine - cosine).clamp(min=0)
+    lean = (MIN_COSINE - cosine).clamp(min=0)
     normal = normal + lean * to_camera
     return normal / normal.norm(dim=-1, keepdim=True)
 
@@ -117,7 +118,7 @@ def initialise_disks(
     plane = fit_local_planes(points, existing, NEIGHBOURS)
     to_camera = camera_centre - points
     to_camera = to_camera / to_camera.norm(dim=-1, keepdim=True)
-    normal = face_camera(plane.normal, to_camera, min_cosine=0.15)
+    normal = face_camera(plane.normal, to_camera)
     tangent = plane.tangent - (plane.tangent * normal).sum(-1, keepdim=True) * normal
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     rotation = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)
@@ -132,7 +133,7 @@ def initialise_disks(
     )
 
 
-def turned_at_random(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
+def randomly_oriented(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
     """The same disks, of the same scales, with orientations uniform over all rotations."""
     # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
     quaternion = torch.randn(len(disks.position), 4, generator=random).to(disks.position)

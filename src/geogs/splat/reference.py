@@ -16,7 +16,7 @@ from geogs.geometry.lie import quaternion_to_matrix
 from geogs.world.disks import DiskParameters
 
 MIN_ALPHA = 1 / 255
-"""A disk is not blended into a pixel where its opacity is below this."""
+"""Least opacity at a pixel for a disk to be blended."""
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
 """Blending stops before the disk that would leave less light than this."""
@@ -35,7 +35,7 @@ _CHUNK_ELEMENTS = 4_000_000
 
 
 class ProjectedDisks(NamedTuple):
-    """What the pixels need to know about the disks in front of the camera, nearest centre first.
+    """Disks in front of the camera, nearest centre first.
 
     Camera frame; every field has one row per disk.
     """

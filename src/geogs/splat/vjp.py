@@ -1,4 +1,4 @@
-"""Rendering whose gradients are asked for by a call, not by autograd."""
+"""Rendering with an explicit vector-Jacobian product, without autograd."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ class RenderGradients:
     """Gradients of a loss of one rendering, on the disks' device."""
 
     disks: DiskParameters
-    """By the numbers of every disk, before activation; zero for disks that are not visible."""
+    """With respect to every disk, before activation; zero for disks that are not visible."""
     T_cw: Float64[Tensor, "4 4"]
-    """By the entries of the pose; the last row is zero."""
+    """With respect to the entries of the pose; the last row is zero."""
 
 
 @dataclass(frozen=True, slots=True)

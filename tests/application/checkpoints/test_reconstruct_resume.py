@@ -92,7 +92,7 @@ def test_a_restored_mapper_is_the_same(half):
     for a, b in zip(first.mapper.views.values(), second.mapper.views.values(), strict=True):
         assert a.row.partners == b.row.partners
         assert a.row.search == b.row.search
-        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+        assert torch.equal(a.constants.prior_depth, b.constants.prior_depth)
     for a, b in zip(
         first.mapper.table.disks.parameters, second.mapper.table.disks.parameters, strict=True
     ):

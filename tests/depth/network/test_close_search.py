@@ -27,7 +27,7 @@ def test_modes_equal_a_loop():
                 first, second, share = modes_by_hand(p, planes[b].tolist())
                 assert float(found.first[b, i, j]) == pytest.approx(first, abs=1e-5)
                 assert float(found.second[b, i, j]) == pytest.approx(second, abs=1e-4)
-                assert float(found.share[b, i, j]) == pytest.approx(share, abs=1e-5)
+                assert float(found.probability[b, i, j]) == pytest.approx(share, abs=1e-5)
 
 
 def modes_by_hand(p: list[float], planes: list[float]) -> tuple[float, float, float]:
@@ -54,7 +54,7 @@ def test_a_mode_is_one_of_two_surfaces_and_not_between_them():
     found = plane_modes(logits[..., None, None], planes)
     assert float(found.first) == pytest.approx(0.5, abs=0.01)
     assert float(found.second) == pytest.approx(1.5, abs=0.01)
-    assert float(found.share) == pytest.approx(1 / 1.7, abs=0.02)
+    assert float(found.probability) == pytest.approx(1 / 1.7, abs=0.02)
 
 
 def test_what_is_tried_lies_around_and_on_either_side():

@@ -41,7 +41,7 @@ def test_the_norm_is_that_of_groups():
 
 def test_upsampling_is_a_convex_combination_of_nine():
     x, logits = torch.randn(1, 2, 3, 4), torch.randn(1, 36, 3, 4)
-    found = upsampled(x, logits)
+    found = upsampled(x, logits, torch.inf)
     for row, column in ((0, 0), (5, 7), (2, 3), (3, 6)):
         i, j, sub = row // 2, column // 2, 2 * (row % 2) + column % 2
         weights = [math.exp(float(logits[0, 4 * k + sub, i, j])) for k in range(9)]
@@ -57,7 +57,7 @@ def test_upsampling_averages_nothing_across_an_edge():
     x = torch.stack([x, 10 * x])[None]  # what lies beside follows the depth
     logits = torch.randn(1, 36, 3, 3, generator=torch.Generator().manual_seed(1))
     found = upsampled(x, logits, 0.04)
-    blended = upsampled(x, logits)
+    blended = upsampled(x, logits, torch.inf)
     assert ((blended[0, 0] > 0.05) & (blended[0, 0] < 0.95)).sum() > 5
     for row in range(6):
         for column in range(6):

@@ -14,7 +14,7 @@ from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.revision import far_side
-from geogs.depth.revision.far_side import APART, REACH, FarSideSearch
+from geogs.depth.revision.far_side import MIN_GAP, REACH, FarSideSearch
 from geogs.depth.revision.photo_vote import CONTRAST, DEVIATIONS, LEAST_DEVIATION, RADIUS
 from geogs.geometry.camera import Camera
 from oracles.revision_reference import (
@@ -106,7 +106,7 @@ def test_the_images_speak_for_the_true_depth():
 
 
 def asked_of(scene):
-    """Two depths of each pixel, where they are the same, and where something is asked."""
+    """Two depths of each pixel, where they are the same, and a mask of where they differ."""
     depth = torch.from_numpy(scene.truth[0]).clone()
     depth[20:40, 30:60] *= 0.8
     depth[:, :4] = 0
@@ -119,15 +119,15 @@ def asked_of(scene):
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_compiled_loops_say_the_same(everywhere):
     scene = make_scene()
-    depths, same, asked = asked_of(scene)
-    views, asked = (scene.views[0], scene.views[1:]), None if everywhere else asked
-    expected = photo_costs(*views, depths, same, RENDER, asked)
-    found = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, asked)
+    depths, same, mask = asked_of(scene)
+    views, mask = (scene.views[0], scene.views[1:]), None if everywhere else mask
+    expected = photo_costs(*views, depths, same, RENDER, mask)
+    found = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, mask)
     assert float((expected[0] - expected[1]).abs().max()) > 0.3
     assert float((found - expected).abs().max()) < 2e-3
     if not everywhere:
         assert not found[:, ~(depths[0] != depths[1])].any()
-    again = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, asked)
+    again = CpuDepthEngine(RENDER, WORKING, 8).photo_costs(*views, depths, same, mask)
     assert torch.equal(found, again)  # whatever was in memory
 
 
@@ -140,12 +140,12 @@ def test_a_gpu_says_the_same(device, everywhere, monkeypatch):
     elif not torch.cuda.is_available():
         pytest.skip("needs an NVIDIA GPU")
     scene = make_scene()
-    depths, same, asked = asked_of(scene)
-    views, asked = (scene.views[0], scene.views[1:]), None if everywhere else asked
-    expected = photo_costs(*views, depths, same, RENDER, asked)
+    depths, same, mask = asked_of(scene)
+    views, mask = (scene.views[0], scene.views[1:]), None if everywhere else mask
+    expected = photo_costs(*views, depths, same, RENDER, mask)
     engine = CudaDepthEngine(torch.device(device), RENDER, WORKING, 128, 8)
-    asked = None if asked is None else asked.to(device)
-    found = engine.photo_costs(*views, depths.to(device), same.to(device), asked)
+    mask = None if mask is None else mask.to(device)
+    found = engine.photo_costs(*views, depths.to(device), same.to(device), mask)
     assert float((found.cpu() - expected).abs().max()) < 2e-3
 
 
@@ -170,11 +170,11 @@ def test_the_same_surfaces_go_on(seed, reach, where, monkeypatch):
     expected = farther_surface(depth, reach)
     if where == "emulated":
         use_emulator(monkeypatch, cuda_far_side)
-        found = cuda_far_side.farther_surface(depth, reach, APART)
+        found = cuda_far_side.farther_surface(depth, reach)
     elif where == "cpu":
-        found = far_side.farther_surface(depth, reach, APART)
+        found = far_side.farther_surface(depth, reach)
     elif torch.cuda.is_available():
-        found = cuda_far_side.farther_surface(depth.cuda(), reach, APART).cpu()
+        found = cuda_far_side.farther_surface(depth.cuda(), reach).cpu()
     else:
         pytest.skip("needs an NVIDIA GPU")
     assert 0.02 < float((expected > 0).float().mean()) < 0.6
@@ -192,7 +192,7 @@ def test_a_farther_plane_goes_on_beneath_the_foreground():
     beneath = (slice(6, -6), slice(15, 20))
     assert found[beneath].numpy() == pytest.approx(floor[beneath].numpy(), rel=1e-4)
     assert not farther_surface(1 / (0.25 + 0.001 * u), 5).any()  # a slanted plane has none
-    assert (found[found > 0] > depth[found > 0] / (1 - 0.9 * APART)).all()
+    assert (found[found > 0] > depth[found > 0] / (1 - 0.9 * MIN_GAP)).all()
 
 
 class _Grown(AlternativeSearch):

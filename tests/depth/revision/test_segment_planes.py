@@ -7,14 +7,14 @@ import torch
 
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.depth.revision import segment_plane_kernels as kernels
-from geogs.depth.revision.bare_segments import LEAST, bare_segments
-from geogs.depth.revision.segment_plane_kernels import PlaneRules, segment_planes
+from geogs.depth.revision.bare_segments import MIN_AREA, bare_segments
+from geogs.depth.revision.segment_plane_kernels import PlaneRules
 from geogs.depth.revision.segment_planes import (
-    ALIKE,
     CONFIDENCE,
-    LEAST_SHARE,
+    CORRELATED,
+    MIN_EXPLAINED,
+    MIN_ON_PLANE,
     MOST_PLANES,
-    MOSTLY,
     TOLERANCE,
     on_planes,
     planar_depth,
@@ -66,7 +66,7 @@ def test_bare_parts_are_found_at_any_size():
         assert (found[24:96, 34:126] == 1).all()
         assert not found[~bare].any()
     small = box(70, 77, 50, 57)
-    assert small.sum() < LEAST * small.size
+    assert small.sum() < MIN_AREA * small.size
     assert not bare_segments(image_with(small)).any()
 
 
@@ -169,7 +169,7 @@ def test_normals_are_those_of_the_plane(slopes):
     assert not planar.normal[0, 0].any()
 
 
-RULES = PlaneRules(2, TOLERANCE, LEAST_SHARE, MOSTLY, ALIKE, 40, 750, 4)
+RULES = PlaneRules(2, TOLERANCE, MIN_EXPLAINED, MIN_ON_PLANE, CORRELATED, 40, 750, 4)
 
 
 def slow_planes(x, y, value, weight, rng):
@@ -182,31 +182,46 @@ def slow_planes(x, y, value, weight, rng):
         tried = np.linalg.solve(at[drawn], v[drawn][..., None])[..., 0]
         ons = np.abs(tried @ at.T - v) < TOLERANCE * v
         on = ons[np.argmax((ons * w).sum(1))]
-        for _ in range(RULES.rounds):
+        for _ in range(RULES.refits):
             root = np.sqrt(w[on])
             plane = np.linalg.lstsq(at[on] * root[:, None], v[on] * root, rcond=None)[0]
             fitted, on = on, np.abs(at @ plane - v) < TOLERANCE * v
-        if w[on].sum() < LEAST_SHARE * weight.sum():
+        if w[on].sum() < MIN_EXPLAINED * weight.sum():
             break
         information = (at[fitted] * w[fitted, None]).T @ at[fitted]
         deviation = TOLERANCE / 2 * v[on].mean()
-        planes.append((plane, ALIKE * deviation**2 * np.linalg.inv(information), left[on]))
+        planes.append((plane, CORRELATED * deviation**2 * np.linalg.inv(information), left[on]))
         left = left[~on]
     return planes
 
 
-@pytest.mark.system  # compiles what is kept nowhere by itself
+def planes_of_image(value: np.ndarray, weight: np.ndarray, known: np.ndarray, seed: int = 0):
+    """Planes of an image that is one segment; the places, values and weights of the pixels used."""
+    shape = value.shape
+    depth, weight = (1 / value).astype(np.float32), weight.astype(np.float32)
+    box, draws = np.array([0, 0, *shape]), np.random.default_rng(seed).random((MOST_PLANES, 64, 3))
+    parts, marked = np.zeros((2, *shape), np.int32)
+    planes, covariances, tried, some, of = kernels.planes_of_segment(
+        np.ones(shape, np.int32), np.int64(1), box, ~known, known, depth, weight, draws, RULES,
+        parts, marked,
+    )  # fmt: skip
+    v, u = np.unravel_index(some, shape)
+    x, y = (u + 0.5) / shape[1] - 0.5, (v + 0.5) / shape[0] - 0.5
+    known_depth, known_weight = (m.ravel()[some].astype(np.float64) for m in (depth, weight))
+    return planes, covariances, tried, of, (x, y, 1 / known_depth, known_weight)
+
+
 def test_planes_are_those_of_the_slow_fit():
     """A corner with noise and outliers, weighted unevenly."""
     random = np.random.default_rng(5)
-    x, y = random.uniform(-0.5, 0.5, (2, 700))
+    y, x = (np.mgrid[:25.0, :28.0] + 0.5) / np.array([25, 28])[:, None, None] - 0.5
     value = np.where(x < 0.05, 0.4 + 0.3 * x + 0.05 * y, 0.45 - 0.5 * x)
-    value *= 1 + 0.005 * random.standard_normal(700)
-    value[::29] *= random.uniform(0.5, 2, len(value[::29]))
-    weight = random.uniform(0.7, 1, 700)
-    draws = np.random.default_rng(6).random((MOST_PLANES, 64, 3))
-    planes, covariances, of, tried = segment_planes(x, y, value, weight, draws, RULES)
-    expected = slow_planes(x, y, value, weight, np.random.default_rng(6))
+    value *= 1 + 0.005 * random.standard_normal(value.shape)
+    value.ravel()[::31] *= random.uniform(0.5, 2, value.ravel()[::31].shape)
+    weight = random.uniform(0.7, 1, value.shape)
+    planes, covariances, tried, of, given = planes_of_image(value, weight, value > 0, 6)
+    assert len(of) == value.size
+    expected = slow_planes(*given, np.random.default_rng(6))
     assert (len(planes), tried) == (2, 2)
     assert len(expected) == 2
     for k, (plane, covariance, on) in enumerate(expected):
@@ -230,30 +245,29 @@ def test_rims_and_parts_are_those_of_opencv(seed):
     known = kernels.rim_pixels(labels, 1, boxes[0], 2, sure)
     assert np.array_equal(known, np.flatnonzero(near & sure))
     depth[:, 40:] = 2  # of which the plane is none
-    planes, rules = np.array([[0.0, 0.0, 1.0]]), RULES._replace(least=12)
-    parts, told = np.zeros((2, 60, 80), np.int32)
-    kernels.told_by_rim(labels, 1, boxes[0], unsure, sure, depth, planes, rules, parts, told)
+    planes, rules = np.array([[0.0, 0.0, 1.0]]), RULES._replace(min_pixels=12)
+    parts, marked = np.zeros((2, 60, 80), np.int32)
+    kernels.mark_supported(labels, 1, boxes[0], unsure, sure, depth, planes, rules, parts, marked)
     count, numbers = cv2.connectedComponents((segment & unsure).astype(np.uint8))
     expected = np.zeros((60, 80), bool)
     for number in range(1, count):
         part = numbers == number
         around = (cv2.dilate(part.astype(np.uint8), rim) > 0) & sure
-        if part.sum() >= 12 and (around & (depth == 1)).sum() >= MOSTLY * max(1, around.sum()):
+        least = MIN_ON_PLANE * max(1, around.sum())
+        if part.sum() >= 12 and (around & (depth == 1)).sum() >= least:
             expected |= part
     assert expected.any()
-    assert np.array_equal(told > 0, expected)
+    assert np.array_equal(marked > 0, expected)
 
 
-@pytest.mark.system  # compiles what is kept nowhere by itself
 def test_no_plane_of_too_little():
-    inverse, random = wall().ravel(), np.random.default_rng(0)
-    x, y = (U / 160 - 0.5).ravel(), (V / 120 - 0.5).ravel()
-    confidence, draws = np.full(len(inverse), 0.9), random.random((MOST_PLANES, 64, 3))
-    few = (m[:35] for m in (x, y, inverse, confidence))
-    assert not len(segment_planes(*few, draws, RULES)[0])
-    (plane,), (covariance,), of, _ = segment_planes(x, y, inverse, confidence, draws, RULES)
-    places = np.stack([x, y, np.ones_like(x)], -1)
-    assert places @ plane == pytest.approx(inverse, rel=1e-6)
+    inverse, confidence = wall(), np.full(U.shape, 0.9)
+    few = np.zeros(U.shape, bool)
+    few[60, 60:95] = True
+    assert not len(planes_of_image(inverse, confidence, few)[0])
+    (plane,), (covariance,), _, of, given = planes_of_image(inverse, confidence, inverse > 0)
     assert (of == 1).all()
+    places = np.stack([*given[:2], np.ones(len(of))], -1)
+    assert places @ plane == pytest.approx(given[2], rel=1e-6)
     variance = np.einsum("ni,ij,nj->n", places, covariance, places)
-    assert float((np.sqrt(variance) / inverse).max()) < 0.02
+    assert float((np.sqrt(variance) / given[2]).max()) < 0.02

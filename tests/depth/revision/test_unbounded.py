@@ -11,7 +11,7 @@ from depth_scene import RENDER, WORKING, make_scene
 from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.depth_engine import AlternativeSearch, DepthTask
 from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, depth_images
-from geogs.depth.revision.unbounded import FAR, SkySearch, unbounded
+from geogs.depth.revision.unbounded import FAR_RATIO, SkySearch, unbounded
 from geogs.geometry.camera import Camera
 
 ENGINE = CpuDepthEngine(RENDER, WORKING, 8)
@@ -87,7 +87,7 @@ def test_a_wall_that_was_found_too_far_away_is_no_sky():
 
 def test_where_nothing_is_far_nothing_is_asked():
     views, depth, _ = outside()
-    near = np.minimum(depth, 0.99 * FAR * np.median(depth)).astype(np.float32)
+    near = np.minimum(depth, 0.99 * FAR_RATIO * np.median(depth)).astype(np.float32)
     assert unbounded(views[0], views[1:], dense(near), ENGINE) is None
     assert unbounded(views[0], [], dense(depth), ENGINE) is None
 

@@ -1,4 +1,4 @@
-"""Keyframe depths on the GPU that holds the map."""
+"""The classical search on the GPU that holds the map."""
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from geogs.depth.completion import complete_grid, edge_weights, known_cells
-from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.edges import resolve_edges
 from geogs.depth.cuda.far_side import farther_surface
 from geogs.depth.cuda.fusion import check, vote
+from geogs.depth.cuda.grid_completion import can_complete, complete
 from geogs.depth.cuda.images import KeyframeImages, image_pixels, packed
 from geogs.depth.cuda.photo_vote import photo_costs
 from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, PlaneSlots, sweep
@@ -29,6 +28,7 @@ from geogs.depth.depth_view import (
     relative_poses,
 )
 from geogs.depth.evidence import prior_weight, relative_precision
+from geogs.depth.grid_completion import complete_grid, edge_weights, known_cells
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.geometry.camera import Camera
@@ -42,7 +42,7 @@ _BATCH = 32
 
 @dataclass(frozen=True, eq=False)
 class SearchPlan:
-    """What the CPU works out before a keyframe's depth is searched."""
+    """Input of a keyframe's search that the CPU computes."""
 
     grids: Float32[np.ndarray, "3 gh gw"]
     """The tracker's inverse depth, its information, and the weights of smoothness."""
@@ -128,19 +128,17 @@ class CudaDepthEngine:
         others: Sequence[DepthView],
         depths: Float[Tensor, "2 h w"],
         same: Bool[Tensor, "h w"],
-        asked: Bool[Tensor, "h w"] | None = None,
+        mask: Bool[Tensor, "h w"] | None = None,
     ) -> Float[Tensor, "2 h w"]:
         """As in the protocol; at most 16 others are used."""
         others = others[:MAX_NEIGHBOURS]
         images = [self._images_of(v) for v in others]
         own, poses = self._images_of(view), relative_poses(view, others)
-        return photo_costs(own, images, poses, depths, same, self.render, asked)
+        return photo_costs(own, images, poses, depths, same, self.render, mask)
 
-    def farther_surface(
-        self, depth: Float[Tensor, "h w"], reach: int, apart: float
-    ) -> Float[Tensor, "h w"]:
+    def farther_surface(self, depth: Float[Tensor, "h w"], reach: int) -> Float[Tensor, "h w"]:
         """As in the protocol."""
-        return farther_surface(depth, reach, apart)
+        return farther_surface(depth, reach)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""

@@ -1,4 +1,4 @@
-"""The test at depth edges of ``edges.py`` on a GPU."""
+"""The edge-aware correction of ``edges.py`` on a GPU."""
 
 from pathlib import Path
 
@@ -7,18 +7,9 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from geogs.depth import edges as cpu
 from geogs.depth.cuda.plane_sweep import SweptDepth
 from geogs.depth.cuda.refinement import SlantedMaps
-from geogs.depth.edges import (
-    APART,
-    CONTRAST,
-    COST_TRUST,
-    MEAN_SHIFTS,
-    MOVED_CONFIDENCE,
-    PASSES,
-    WIDTH,
-    reach_of,
-)
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import upload
 
@@ -34,14 +25,15 @@ def resolve_edges(
     """As ``geogs.depth.edges.resolve_edges``; ``colours`` is the image in [0, 1]."""
     h, w = confidence.shape
     planes = swept.planes
-    constants = np.array([CONTRAST, APART, WIDTH, COST_TRUST, MOVED_CONFIDENCE], np.float32)
-    settings = upload(constants, confidence.device)
+    constants = (cpu.CONTRAST, cpu.MIN_GAP, cpu.WIDTH, cpu.COST_TRUST, cpu.MOVED_CONFIDENCE)
+    settings = upload(np.array(constants, np.float32), confidence.device)
     maps = [refined.inverse_depth, refined.slope_x, refined.slope_y, confidence]
-    for _ in range(PASSES):
+    for _ in range(cpu.PASSES):
         out = [torch.empty_like(confidence) for _ in maps]
         kernels_for(SOURCE, confidence.device)["resolve_edges"](
             (-(-w // 32), -(-h // 4)), (32, 4), *maps, colours, swept.costs, settings, planes.per,
-            planes.count, planes.first, planes.spacing, reach_of((h, w)), MEAN_SHIFTS, h, w, *out,
+            planes.count, planes.first, planes.spacing, cpu.reach_of((h, w)), cpu.MEAN_SHIFTS, h, w,
+            *out,
         )  # fmt: skip
         maps = out
     rho, slope_x, slope_y, confidence = maps

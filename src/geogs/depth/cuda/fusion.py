@@ -29,7 +29,7 @@ def check(own: PosedDepth, others: Sequence[PosedDepth], camera: Camera) -> tupl
     both = np.concatenate([to_others, np.linalg.inv(to_others)])
     matrices = upload(packed(both[:, :3, :3], both[:, :3, 3]), device).view(2, n, 12)
     maps = upload(_addresses(others), device)
-    settings = upload(np.array(CHECK, np.float32), device)
+    settings = upload(np.array(CheckSettings(), np.float32), device)
     lens, kernels = (camera.fx, camera.fy, camera.cx, camera.cy), kernels_for(SOURCE, device)
     seen = torch.full((n, h, w), -1, dtype=torch.int64, device=device)
     kernels["splat_depths"](
@@ -49,10 +49,7 @@ def vote(
     depths: Sequence[PosedDepth],
     camera: Camera,
 ) -> Bool[Tensor, "n"]:
-    """World points that do not stand in the free space of the views (``carve.vote``).
-
-    Not all depths are on the GPU at once.
-    """
+    """World points outside the free space of the views (``carve.vote``), some views at a time."""
     device = points.device
     keep = torch.empty(len(points), dtype=torch.bool, device=device)
     votes = torch.zeros(len(points), 2, dtype=torch.int32, device=device)
@@ -87,21 +84,14 @@ def _skies(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n"]:
 class CheckSettings(NamedTuple):
     """The struct of this name in ``reprojection.cu``."""
 
-    average_reach: float
-    agreement_reach: float
-    violation_distance: float
-    repair_below: float
-    repair_votes: float
-    repair_confidence: float
-    occlusion_penalty: float
-    bias: float
-    own: float
-    support: float
-    violation: float
-
-
-CHECK = CheckSettings(
-    fusion.AVERAGE_REACH, fusion.AGREEMENT_REACH, fusion.VIOLATION_DISTANCE, fusion.REPAIR_BELOW,
-    fusion.REPAIR_VOTES, fusion.REPAIR_CONFIDENCE, fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
-)  # fmt: skip
-"""Those of the check, and the weights of its logistic regression."""
+    average_reach: float = fusion.AVERAGE_REACH
+    agreement_reach: float = fusion.AGREEMENT_REACH
+    violation_distance: float = fusion.VIOLATION_DISTANCE
+    repair_below: float = fusion.REPAIR_BELOW
+    repair_votes: float = fusion.REPAIR_VOTES
+    repair_confidence: float = fusion.REPAIR_CONFIDENCE
+    occlusion_penalty: float = fusion.OCCLUSION_PENALTY
+    bias: float = fusion.BIAS
+    own: float = fusion.OWN
+    support: float = fusion.SUPPORT
+    violation: float = fusion.VIOLATION

@@ -1,4 +1,4 @@
-"""What the depth kernels read of a keyframe's image."""
+"""A keyframe's images for the depth kernels."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ class KeyframeImages:
 
 
 def image_pixels(view: DepthView) -> Float32[np.ndarray, "n"]:
-    """Everything that ``KeyframeImages`` holds, in a row."""
+    """The pixels of ``KeyframeImages`` in one array."""
     h, w = view.grey.shape
     small = cv2.resize(view.image, (w, h), interpolation=cv2.INTER_AREA)
     colours = small.transpose(2, 0, 1).astype(np.float32) * np.float32(1 / 255)

@@ -1,4 +1,4 @@
-"""What the images say of depths, on a GPU."""
+"""The photometric costs of ``revision/photo_vote.py`` on a GPU."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,14 +24,14 @@ def photo_costs(
     depths: Float32[Tensor, "2 h w"],
     same: Bool[Tensor, "h w"],
     camera: Camera,
-    asked: Bool[Tensor, "h w"] | None = None,
+    mask: Bool[Tensor, "h w"] | None = None,
 ) -> Float32[Tensor, "2 h w"]:
     """As :func:`geogs.depth.revision.photo_vote.photo_costs`; ``poses`` take the frame of the
-    depths to that of the others, of which there are at most 16."""
+    depths to those of the others, at most 16."""
     device, n = depths.device, len(others)
     h, w = depths.shape[1:]
-    if asked is not None:
-        depths = torch.stack([depths[0], torch.where(asked, depths[1], depths[0])])
+    if mask is not None:
+        depths = torch.stack([depths[0], torch.where(mask, depths[1], depths[0])])
     kernels = kernels_for(SOURCE, device)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     numbers = np.concatenate([lens, poses[:, :3].ravel()]).astype(np.float32)
@@ -42,19 +42,21 @@ def photo_costs(
         (*tiles, 2 * n), (32, 4), own.grey, torch.stack([o.grey for o in others]), T, lens,
         depths.contiguous(), n, h, w, differences,
     )  # fmt: skip
-    light, most = light_and_noise(differences[0], same)
+    offset, limit = offset_and_limit(differences[0], same)
     costs, means = torch.empty_like(depths), torch.empty_like(depths)
-    kernels["pixel_costs"]((-(-h * w // 128), 2), (128,), differences, light, most, n, h * w, costs)
+    kernels["pixel_costs"](
+        (-(-h * w // 128), 2), (128,), differences, offset, limit, n, h * w, costs
+    )
     kernels["average_costs"](tiles, (32, 4), costs, own.colours, RADIUS, -1 / CONTRAST, h, w, means)
-    return means if asked is None else torch.where(asked, means, 0.0)
+    return means if mask is None else torch.where(mask, means, 0.0)
 
 
-def light_and_noise(
+def offset_and_limit(
     differences: Float[Tensor, "n h w"], same: Bool[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Median difference of each neighbour where there is one depth, and the deviation from it that
-    counts in full."""
+    """Median grey difference of each neighbour where both depths are the ``same``, and the
+    deviation from it at which differences are cut."""
     known = torch.where(same, differences, torch.nan).flatten(1)
-    light = known.nanmedian(1).values.nan_to_num()
-    deviation = (known - light[:, None]).abs().nanmedian(1).values.nan_to_num()
-    return light, DEVIATIONS * deviation.clamp(min=LEAST_DEVIATION)
+    offset = known.nanmedian(1).values.nan_to_num()
+    deviation = (known - offset[:, None]).abs().nanmedian(1).values.nan_to_num()
+    return offset, DEVIATIONS * deviation.clamp(min=LEAST_DEVIATION)

@@ -17,7 +17,7 @@ MATCHING = Path(__file__).with_name("matching.cu")
 AGGREGATION = Path(__file__).with_name("aggregation.cu")
 
 MAX_PLANES = 256
-"""More than that do not fit the registers of a warp."""
+"""Most planes that fit into the registers of a warp."""
 MAX_NEIGHBOURS = 16
 _PLANES_PER_LANE = (1, 3, 4, 5, 8)
 _TILE_W, _TILE_H, _SLOT_GROUP = 32, 8, 8
@@ -48,7 +48,7 @@ class PlaneSlots:
         rho = np.full(32 * per, -1.0, np.float32)
         rho[:count] = planes
         rho = np.ascontiguousarray(rho.reshape(32, per).T).ravel()
-        spacing = (planes[-1] - planes[0]) / np.float32(max(count - 1, 1))
+        spacing = (planes[-1] - planes[0]) / np.float32(count - 1)
         return PlaneSlots(upload(rho, device), per, count, float(planes[0]), float(spacing))
 
 
@@ -61,7 +61,7 @@ class SweptDepth:
     margin: Float32[Tensor, "h w"]
     planes: PlaneSlots
     costs: Float32[Tensor, "h w s"]
-    """By slot."""
+    """One value a slot."""
 
 
 def match_planes(

@@ -8,25 +8,11 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from geogs.depth import refinement as cpu
 from geogs.depth.confidence import WEIGHTS
 from geogs.depth.cuda.images import KeyframeImages
 from geogs.depth.cuda.plane_sweep import SweptDepth
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
-from geogs.depth.refinement import (
-    FIT_DEVIATION,
-    FIT_RADIUS,
-    FIT_STIFFNESS,
-    FIT_TOLERANCE,
-    FLOOR_DEVIATION,
-    FULL_SUPPORT,
-    GUIDE_CONTRAST,
-    PATCH_CONTRAST,
-    PATCH_REACH,
-    PHOTO_DEVIATION,
-    PLANE_DEVIATION,
-    REFINE_STEPS,
-    STEP_LIMIT,
-)
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import upload
@@ -37,7 +23,7 @@ SOURCE = Path(__file__).with_name("refinement.cu")
 
 @dataclass(frozen=True, eq=False)
 class PixelPositions:
-    """Where render pixels lie on the tracker's grid, and their patch samples in the fine image."""
+    """Positions of render pixels on the tracker's grid, and of patch samples in the fine image."""
 
     grid_columns: Float32[Tensor, "w"]
     grid_rows: Float32[Tensor, "h"]
@@ -46,18 +32,18 @@ class PixelPositions:
 
     @staticmethod
     def of(render: Camera, working: Camera, device: torch.device) -> "PixelPositions":
-        """Those of two sizes of a camera."""
-        reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)[:, None]
+        """Positions for two sizes of a camera."""
+        reach = np.arange(-cpu.PATCH_REACH, cpu.PATCH_REACH + 1, dtype=np.float32)[:, None]
         u = (np.arange(render.width) - render.cx + reach) * (working.fx / render.fx) + working.cx
         v = (np.arange(render.height) - render.cy + reach) * (working.fy / render.fy) + working.cy
-        columns, rows = (u[PATCH_REACH] - OFFSET) / STRIDE, (v[PATCH_REACH] - OFFSET) / STRIDE
+        columns, rows = ((x[cpu.PATCH_REACH] - OFFSET) / STRIDE for x in (u, v))
         positions = (columns, rows, u, v)
         return PixelPositions(*(upload(x.astype(np.float32), device) for x in positions))
 
 
 @dataclass(frozen=True, eq=False)
 class TrackerMaps:
-    """What the tracker knows, at the render size."""
+    """``TrackerEvidence`` on the device."""
 
     inverse_depth: Float32[Tensor, "h w"]
     prior_weight: Float32[Tensor, "h w"]
@@ -88,7 +74,7 @@ class SlantedMaps:
 
 
 def choose_start(tracker: TrackerMaps, swept: SweptDepth) -> tuple[Tensor, Tensor]:
-    """The inverse depth to refine, and how much each pixel counts in the first plane fits."""
+    """As ``evidence.choose_start``."""
     rho, confidence = torch.empty_like(swept.cost), torch.empty_like(swept.cost)
     kernels_for(SOURCE, rho.device)["choose_start"](
         -(-rho.numel() // 256), 256, tracker.inverse_depth, tracker.prior_weight,
@@ -102,7 +88,7 @@ def gather_patches(
 ) -> Float32[Tensor, "25 h w"]:
     """The fine reference image around every render pixel."""
     h, w = len(positions.grid_rows), len(positions.grid_columns)
-    samples = fine.new_empty((2 * PATCH_REACH + 1) ** 2, h, w)
+    samples = fine.new_empty((2 * cpu.PATCH_REACH + 1) ** 2, h, w)
     kernels_for(SOURCE, fine.device)["gather_patches"](
         (-(-w // 128), h, len(samples)), 128, fine, positions.fine_columns, positions.fine_rows,
         *fine.shape, h, w, samples,
@@ -120,15 +106,15 @@ def photometric_step(
 ) -> tuple[Tensor, Tensor]:
     """Move ``state`` one step, averaged with the tracker; returns precision and plane weight.
 
-    Of the samples of a patch ``every`` so many-th is compared.
+    Every ``every``-th sample of a patch is compared.
     """
     h, w = state.inverse_depth.shape
     data, precision, confidence = (torch.empty_like(state.inverse_depth) for _ in range(3))
     kernels_for(SOURCE, samples.device)["photometric_step"](
         (-(-w // 32), h), (32, len(images)), samples, images, homographies, state.inverse_depth,
         state.slope_x, state.slope_y, tracker.inverse_depth, tracker.precision, h, w,
-        *images.shape[1:], every, PATCH_CONTRAST, 0.5 * VARIANCE_FLOOR, STEP_LIMIT,
-        PHOTO_DEVIATION**2, FLOOR_DEVIATION**2, FIT_DEVIATION**2, data, precision,
+        *images.shape[1:], every, cpu.PATCH_CONTRAST, 0.5 * VARIANCE_FLOOR, cpu.STEP_LIMIT,
+        cpu.PHOTO_DEVIATION**2, cpu.FLOOR_DEVIATION**2, cpu.FIT_DEVIATION**2, data, precision,
         confidence,
     )  # fmt: skip
     state.inverse_depth = data
@@ -149,8 +135,8 @@ def fit_planes(
     out = [torch.empty_like(confidence) for _ in range(4)]
     kernels_for(SOURCE, confidence.device)["fit_planes"](
         (-(-w // 32), -(-h // 4)), (32, 4), state.inverse_depth, state.slope_x, state.slope_y,
-        confidence, colours, precision, h, w, radius, GUIDE_CONTRAST, tolerance, stiffness,
-        FULL_SUPPORT, 1.0 / PLANE_DEVIATION**2, *out,
+        confidence, colours, precision, h, w, radius, cpu.GUIDE_CONTRAST, tolerance, stiffness,
+        cpu.FULL_SUPPORT, 1.0 / cpu.PLANE_DEVIATION**2, *out,
     )  # fmt: skip
     state.inverse_depth, state.slope_x, state.slope_y, state.support = out
 
@@ -168,16 +154,16 @@ def refine(
     samples = gather_patches(reference.fine, positions)
     zero = torch.zeros_like(rho)
     state = SlantedMaps(rho, zero, zero, zero)
-    for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
+    for radius, tolerance in ((2, 0.05), (cpu.FIT_RADIUS, 0.03)):
         fit_planes(state, confidence, reference.colours, radius, tolerance, 0.0)
     state.inverse_depth = rho
-    for every in REFINE_STEPS:
+    for every in cpu.REFINE_STEPS:
         precision, confidence = photometric_step(
             state, samples, images, homographies, tracker, every
         )
         fit_planes(
-            state, confidence, reference.colours, FIT_RADIUS, FIT_TOLERANCE,
-            FIT_STIFFNESS, precision,
+            state, confidence, reference.colours, cpu.FIT_RADIUS, cpu.FIT_TOLERANCE,
+            cpu.FIT_STIFFNESS, precision,
         )  # fmt: skip
     return state
 
@@ -189,14 +175,14 @@ def judge(
     near: float,
     far: float,
 ) -> Float32[Tensor, "h w"]:
-    """Hold the inverse depth within half of 1 / ``far`` and twice 1 / ``near``; its confidence."""
+    """Clamp inverse depth to 0.5 / ``far`` and 2 / ``near``; returns its confidence."""
     h, w = margin.shape
-    held, confidence = torch.empty_like(margin), torch.empty_like(margin)
+    bounded, confidence = torch.empty_like(margin), torch.empty_like(margin)
     weights = upload(np.array(WEIGHTS, np.float32), margin.device)
     kernels_for(SOURCE, margin.device)["judge_depth"](
         (-(-w // 32), -(-h // 4)), (32, 4), refined.inverse_depth, margin, refined.support,
-        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, held,
+        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, bounded,
         confidence,
     )  # fmt: skip
-    refined.inverse_depth = held
+    refined.inverse_depth = bounded
     return confidence

@@ -1,7 +1,7 @@
-"""The second search: few depths in every cell at 1/2, near what the planes at 1/4 say.
+"""The second search: a few depths in every cell at 1/2, near those of the planes at 1/4.
 
-Around an edge a coarse cell shows two surfaces. So the depths on either side are tried beside the
-cell's own, and what the planes think next likely, and one of them is chosen, not their mean.
+Around an edge a coarse cell shows two surfaces. So the depths on either side and the second mode of
+the planes are tried beside the cell's own, and one of them is chosen, not their mean.
 """
 
 from dataclasses import dataclass
@@ -14,28 +14,28 @@ from torch.nn import functional
 from geogs.depth.network.plane_views import TriedDepths
 
 CLOSE = (-0.6, -0.2, 0.2, 0.6)
-"""Depths tried around the cell's own, steps between planes."""
+"""Depths tried around the cell's own, in steps between planes."""
 COUNT = len(CLOSE) + 3
-"""Those, the nearest and the farthest depth around, and the second likeliest of the planes."""
+"""``CLOSE``, the nearest and the farthest depth around, and the second mode of the planes."""
 ONE_SURFACE = 1.0
-"""Steps within which depths that are tried are of one surface."""
+"""Steps within which tried depths are of one surface."""
 _MODE = 2
-"""Planes to either side of the likeliest that belong to it."""
+"""Planes to either side of the likeliest that belong to its mode."""
 _FAR_ASIDE = 5.0
-"""Bound of what a network is told of distances, steps."""
+"""Bound of the distances that the network sees, steps."""
 _PIXELS = 2
 
 
 @dataclass(frozen=True)
 class PlaneModes:
-    """What the planes say of each cell at 1/4; logarithms of depth over the typical depth."""
+    """The two modes of each cell's planes at 1/4; logarithms of depth over the typical depth."""
 
     first: Float[Tensor, "b h w"]
     """Mean around the likeliest plane."""
     second: Float[Tensor, "b h w"]
     """The same around the likeliest of the others."""
-    share: Float[Tensor, "b h w"]
-    """Probability of the first."""
+    probability: Float[Tensor, "b h w"]
+    """Of the first mode."""
 
 
 def plane_modes(logits: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d"]) -> PlaneModes:
@@ -46,20 +46,20 @@ def plane_modes(logits: Float[Tensor, "b d h w"], log_planes: Float[Tensor, "b d
     z = log_planes[:, :, None, None]
     likeliest = _peak(p)
     near = p * ((place - likeliest).abs() <= _MODE)
-    share = near.sum(1)
-    first = (near * z).sum(1) / share
+    probability = near.sum(1)
+    first = (near * z).sum(1) / probability
     rest = p * ((place - likeliest).abs() > _MODE + 1)
     near = rest * ((place - _peak(rest)).abs() <= _MODE)
     total = near.sum(1)
     second = (near * z).sum(1) / total.clamp_min(1e-9)
-    return PlaneModes(first, torch.where(total > 1e-9, second, first), share)
+    return PlaneModes(first, torch.where(total > 1e-9, second, first), probability)
 
 
 def close_depths(
     modes: PlaneModes, at_half: Float[Tensor, "b h2 w2"], step: Float[Tensor, "b"]
 ) -> tuple[TriedDepths, Float[Tensor, "b 4 h2 w2"]]:
-    """What is tried at 1/2, and numbers that say how: steps from ``at_half`` to the nearest, the
-    farthest and the second depth, and the probability of the first.
+    """Depths to try at 1/2, and inputs of the network beside them: steps from ``at_half`` to the
+    nearest, the farthest and the second depth, and the probability of the first.
 
     ``at_half`` is the cell's own depth; ``step`` that between planes. No gradient goes to either.
     """
@@ -70,7 +70,7 @@ def close_depths(
     others = [_twice(x) for x in (nearest, farthest, modes.second.detach())]
     tried = torch.stack([own + c * wide for c in CLOSE] + others, 1)
     aside = [((x - own) / wide).clamp(-_FAR_ASIDE, _FAR_ASIDE) for x in others]
-    about = torch.stack([*aside, _twice(modes.share)], 1)
+    about = torch.stack([*aside, _twice(modes.probability)], 1)
     label = torch.cat([step.new_full((len(step), 1), c) for c in (*CLOSE, 0.0, 0.0, 0.0)], 1)
     spacing = (CLOSE[1] - CLOSE[0]) * step
     return TriedDepths(tried.flatten(2), label, spacing, _PIXELS), about
@@ -81,7 +81,7 @@ def chosen(
     log_depth: Float[Tensor, "b d h w"],
     step: Float[Tensor, "b"],
 ) -> Float[Tensor, "b h w"]:
-    """The mean of the depths that are of one surface with the likeliest, weighted by a softmax."""
+    """Softmax mean of the depths that are of one surface with the likeliest."""
     best = log_depth.gather(1, logits.argmax(1, keepdim=True))
     beside = (log_depth - best).abs() <= ONE_SURFACE * step[:, None, None, None]
     weight = logits.softmax(1) * beside
@@ -89,7 +89,7 @@ def chosen(
 
 
 def _peak(p: Float[Tensor, "b d h w"]) -> Tensor:
-    """Index of the plane around which there is most, of three."""
+    """Index of the plane whose sum with its two neighbours is largest."""
     return functional.avg_pool3d(p[:, None], (3, 1, 1), 1, (1, 0, 0)).argmax(2)
 
 

@@ -18,11 +18,11 @@ from geogs.depth.network.surface_normals import normals_of
 from geogs.depth.network.volume import PlaneVolume
 
 MOST_RESIDUAL = 1.0
-"""Steps between planes by which a depth may be moved away from what was chosen."""
-APART = 0.04
-"""Relative distance of depths from which on they are of two surfaces, and not averaged."""
+"""Largest residual on the chosen depth, steps between planes."""
+SURFACE_GAP = 0.04
+"""Relative difference above which depths are of two surfaces, and not averaged."""
 _ABOUT = 5
-"""Numbers beside the scores of the depths tried at 1/2."""
+"""Channels beside the scores of the depths tried at 1/2."""
 LEAST_LOG_SCALE, MOST_LOG_SCALE = -6.5, 0.0
 """Bounds of the logarithm of the Laplace scale of log depth."""
 MOST_CONCENTRATION = 500.0
@@ -31,7 +31,7 @@ _LIKELY = -3.0
 
 
 class VolumeNetwork(nn.Module):
-    """A U-Net over plane scores, the channels, that joins the context at every scale."""
+    """A U-Net over the plane scores, its channels, with the context at every scale."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -62,8 +62,7 @@ class VolumeNetwork(nn.Module):
 
 
 class DepthReadout(nn.Module):
-    """Reads the result off the features of the volume at 1/4 and the context at 1/2, with a second
-    search there."""
+    """Heads on the volume's features at 1/4 and the context at 1/2, with a second search there."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -91,14 +90,14 @@ class DepthReadout(nn.Module):
         views: StereoViews,
         scores: Float[Tensor, "b d h4 w4"],
     ) -> DepthPrediction:
-        """``fine`` is what is matched at 1/2: that of the keyframe first."""
+        """``fine`` are the matching features at 1/2, the keyframe's first."""
         with torch.autocast(features.device.type, enabled=False):
             step = plane_step(log_planes)
         logits = self.planes(features).float()
         to_half = self.to_half(features)
         with torch.autocast(features.device.type, enabled=False):
             modes = plane_modes(logits, log_planes)
-            coarse = upsampled(modes.first[:, None], to_half, APART)
+            coarse = upsampled(modes.first[:, None], to_half, SURFACE_GAP)
             tried, about = close_depths(modes, coarse[:, 0], step)
             found = self.close(fine[:, 0], fine[:, 1:], views, tried)
         local = coarse - functional.avg_pool2d(coarse, 5, 1, 2, count_include_pad=False)
@@ -107,7 +106,7 @@ class DepthReadout(nn.Module):
         raw = self.depth(x).float()
         with torch.autocast(features.device.type, enabled=False):
             depths = tried.log_depth.unflatten(2, coarse.shape[-2:])
-            # What was searched passes no gradient on; what it was searched around learns here.
+            # The tried depths have no gradient; the coarse depth that they lie around gets it here.
             depths = depths + (coarse - coarse.detach())
             aside = MOST_RESIDUAL * step[:, None, None] * raw[:, 0].tanh()
             at_half = chosen(choice, depths, step) + aside
@@ -138,8 +137,7 @@ class DepthReadout(nn.Module):
         raw: Float[Tensor, "b 2 h2 w2"],
         intrinsics: Float[Tensor, "b 4"],
     ) -> Float[Tensor, "b 7 h w"]:
-        """Log depth, what scale and outliers are read from, normal, and what its concentration is,
-        at the image's size."""
+        """Log depth, raw scale and outlier logit, normal and its raw concentration at full size."""
         height, width = at_half.shape[-2:]
         rays = cell_rays(intrinsics, height, width, 2).unflatten(2, (height, width))
         with torch.autocast(x.device.type, enabled=False):
@@ -149,7 +147,7 @@ class DepthReadout(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             normal = facing(tilt[:, :3] + bent, rays)
             numbers = torch.cat([at_half[:, None], raw, normal, tilt[:, 3:]], 1)
-            return upsampled(numbers, to_full, APART)
+            return upsampled(numbers, to_full, SURFACE_GAP)
 
 
 def bounded(raw: Tensor) -> Tensor:
@@ -166,7 +164,7 @@ def concentration(raw: Tensor) -> Tensor:
 def facing(
     vector: Float[Tensor, "b 3 h w"], rays: Float[Tensor, "b 3 h w"]
 ) -> Float[Tensor, "b 3 h w"]:
-    """Unit vectors; what points away from the camera is laid down across its ray (after DSINE)."""
+    """Unit vectors; the part along the ray of those that would face away is cut (after DSINE)."""
     ray = functional.normalize(rays, dim=1)
     away = (vector * ray).sum(1, keepdim=True)
     bent = vector - (away + 0.02).clamp_min(0) * ray

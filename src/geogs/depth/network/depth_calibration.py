@@ -1,4 +1,4 @@
-"""What turns the network's own words into deviations and confidences that hold."""
+"""Calibration of the network's deviations and confidences."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class DepthCalibration:
-    """Numbers that were fitted on rooms that the training did not show."""
+    """Parameters fitted on rooms that the training did not show."""
 
     scale: float = 1.0
     """Factor on Laplace scales."""
     gain: float = 1.0
     """Factor on the logit of the chance that a depth is right."""
     offset: float = 0.0
-    """Added to it."""
+    """Added to that logit."""
 
     def deviation(self, log_scale: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-        """Standard deviation of log depth of what is no outlier."""
+        """Standard deviation of log depth of inliers."""
         return 2**0.5 * self.scale * log_scale.exp()
 
     def confidence(
@@ -35,6 +35,6 @@ class DepthCalibration:
 def right_logit(
     log_scale: Float[Tensor, "*n"], outlier: Float[Tensor, "*n"]
 ) -> Float[Tensor, "*n"]:
-    """Logit of the chance that a depth is right, as the network's distribution says."""
+    """Logit of the chance that a depth is right by the network's distribution."""
     inside = 1 - (-TOLERANCE * (-log_scale).exp()).exp()
     return torch.logit((-outlier).sigmoid() * inside, 1e-4)

@@ -1,4 +1,4 @@
-"""What single images say: features to match, and the keyframe's own context."""
+"""Encoders of single images: features to match, and the keyframe's context."""
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from geogs.depth.network.plane_views import cell_rays
 
 
 class MatchingEncoder(nn.Module):
-    """Features of one length at 1/4, and others at 1/2, alike in all views."""
+    """Matching features of unit scale at 1/4 and 1/2, the same network for all views."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class MatchingEncoder(nn.Module):
 
 
 class ContextEncoder(nn.Module):
-    """Features of the keyframe at 1/2, 1/4, ... that see its rays, too."""
+    """Features of the keyframe and its rays at 1/2, 1/4, ..."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class ContextEncoder(nn.Module):
 
 
 def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Each colour of each image without its mean, and all by the image's contrast."""
+    """Images less the mean of each colour, over the contrast of all."""
     centred = images - images.mean((2, 3), keepdim=True)
     return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
 

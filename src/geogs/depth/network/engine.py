@@ -12,7 +12,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.completion import known_cells
 from geogs.depth.depth_engine import (
     AlternativeSearch,
     DepthEngine,
@@ -22,6 +21,7 @@ from geogs.depth.depth_engine import (
     silent,
 )
 from geogs.depth.depth_view import DenseDepth, DepthView, dense_depths, relative_poses
+from geogs.depth.grid_completion import known_cells
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
@@ -32,14 +32,14 @@ from geogs.gpu.transfer import to_device, upload
 from geogs.world.lru import LruCache
 
 EDGE = 512
-"""Longest edge of the images that the network sees, pixels: as large as it was trained on."""
+"""Longest edge of the network's images, pixels, as in its training."""
 MOST_NEIGHBOURS = 8
-"""The training shows no more; they come best first."""
+"""Most neighbours, as in the training; the best are used."""
 MOST_ANGLE = math.radians(15)
-"""Expected error of a normal from which on it counts as unknown."""
+"""Expected error of a normal from which it is unknown."""
 _EDGE = 0.02
-"""Relative distance from the nearest pixel's depth from which on an interpolated depth hangs
-between two surfaces."""
+"""Relative difference to the nearest pixel's depth above which an interpolated depth lies between
+two surfaces."""
 
 
 class NetworkDepthEngine(AlternativeSearch):
@@ -74,8 +74,8 @@ class NetworkDepthEngine(AlternativeSearch):
 
     @torch.no_grad()
     def _warm_up(self) -> None:
-        """Run it on nothing once: cuDNN is loaded and chooses its kernels for a second, which the
-        first keyframe need not wait for. Who uses it says what fails."""
+        """Run the network on a black image, so that the first keyframe need not wait a second for
+        cuDNN to be loaded and to choose its kernels. Failures are reported at the first use."""
         stream = torch.cuda.Stream(self.device)
         with contextlib.suppress(RuntimeError), torch.cuda.stream(stream):
             black = torch.zeros(1, 3, self.seen.height, self.seen.width, device=self.device)
@@ -161,9 +161,9 @@ class NetworkDepthEngine(AlternativeSearch):
 
 
 def resampled(maps: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Tensor, "b c h2 w2"]:
-    """Bilinear values at another size of the same image, the first the logarithm of depth.
+    """Bilinear values at another size of the same image; the first map is the logarithm of depth.
 
-    Where two surfaces would be mixed all is that of the nearest pixel.
+    Where two surfaces would be mixed, all values are those of the nearest pixel.
     """
     if tuple(maps.shape[-2:]) == size:
         return maps

@@ -1,4 +1,4 @@
-"""The classical search and the network: both where they agree, else the one the images back."""
+"""The classical search and the network: their mean where they agree, else one by the images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,18 +13,18 @@ from geogs.depth.depth_view import DenseDepth, dense_depths
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""
 VOTE = (14.0, 0.8)
-"""Logit of the chance that the network is right where one of them is: from the images' vote and a
-constant."""
-AGREE, APART = (0.74, 0.53, 0.28), (0.57, -0.23, 0.41, -0.85)
-"""Logit of the chance that the result is right, where both agree: from the larger and the smaller
-of their logits and a constant; and where not: from those of what was chosen and of the other, the
-logit of the choice and a constant. All are logistic regressions on eight keyframes of four rendered
-rooms."""
+"""Coefficients of the logit of the chance that of two depths the network's is right: of the images'
+vote, and a constant."""
+AGREE, DIFFER = (0.74, 0.53, 0.28), (0.57, -0.23, 0.41, -0.85)
+"""Coefficients of the logit of the chance that the result is right. Where both agree: of the larger
+and the smaller of their logits, and a constant; where not: of the logits of what was chosen and of
+the other, of the choice, and a constant. All are logistic regressions on eight keyframes of four
+rendered rooms."""
 _BOUND = 0.02
 
 
 class JointDepthEngine(AlternativeSearch):
-    """Searches with both engines, and takes of each what it knows; normals are the network's."""
+    """Searches with both engines and joins their depths; normals are the network's."""
 
     def __init__(self, network: DepthEngine, classical: DepthEngine) -> None:
         super().__init__(classical)
@@ -54,10 +54,10 @@ def agreement(first: DenseDepth, second: DenseDepth) -> Bool[Tensor, "h w"]:
 def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) -> DenseDepth:
     """One depth of two; normals are the second's.
 
-    Where they agree it is the mean of their logarithms, weighted by the squared precision of normal
-    errors that are below 2 % with the chance that the confidences say; elsewhere that which the
-    ``vote`` of the images makes likelier: how much less the second costs by ``photo_costs``.
-    Squared, because the most confident are more precise than a chance tells.
+    Where they agree it is the mean of their logarithms, weighted by the squared precision of a
+    normal error that is below 2 % with the chance of their confidence: squared, as the most
+    confident are more precise than that. Elsewhere it is the likelier one by the ``vote`` of the
+    images, the first one's ``photo_costs`` less the second's.
     """
     confidence = torch.stack([first.confidence, second.confidence])
     logs = torch.stack([first.depth, second.depth]).log()
@@ -70,6 +70,6 @@ def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) ->
     logit = bounded.logit()
     chosen, other = torch.where(take, logit, logit.flip(0))
     both = AGREE[0] * logit.amax(0) + AGREE[1] * logit.amin(0) + AGREE[2]
-    alone = APART[0] * chosen + APART[1] * other + APART[2] * choice.abs() + APART[3]
+    alone = DIFFER[0] * chosen + DIFFER[1] * other + DIFFER[2] * choice.abs() + DIFFER[3]
     (found,) = dense_depths([(depth, torch.where(agree, both, alone).sigmoid())])
     return replace(found, normal=second.normal)

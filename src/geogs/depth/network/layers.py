@@ -1,4 +1,4 @@
-"""Convolutions that the parts of the depth network are made of."""
+"""Building blocks of the depth network."""
 
 import torch
 from jaxtyping import Float
@@ -7,7 +7,7 @@ from torch.nn import functional
 
 
 class Norm(nn.Module):
-    """Normalises groups of eight channels over the image; stays in the precision of its input."""
+    """Group norm of eight channels each, in the precision of its input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -27,7 +27,7 @@ class Norm(nn.Module):
 
 
 class Block(nn.Sequential):
-    """Convolution, norm, ReLU; a kernel of even size halves the resolution, cell on cell."""
+    """Convolution, norm, ReLU; a kernel of even size halves the resolution, aligned to cells."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
         stride = 1 if kernel % 2 else 2
@@ -53,28 +53,27 @@ class Residual(nn.Module):
 
 
 def doubled(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
-    """Bilinear, cell on cells."""
+    """Twice the resolution, bilinear, aligned to cells."""
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def upsampled(
-    x: Float[Tensor, "b c h w"], logits: Float[Tensor, "b 36 h w"], apart: float = torch.inf
+    x: Float[Tensor, "b c h w"], logits: Float[Tensor, "b 36 h w"], gap: float
 ) -> Float[Tensor, "b c h2 w2"]:
     """Twice the resolution: each fine cell is a convex combination of the nine coarse ones around.
 
     ``logits`` are those of the nine cells, row by row, for each of the four fine cells of a cell.
-    Those whose first number differs by more than ``apart`` from that of the likeliest do not
+    Those whose first number differs by more than ``gap`` from that of the likeliest do not
     count, so that nothing is averaged across an edge.
     """
     b, c, h, w = x.shape
     padded = functional.pad(x, (1, 1, 1, 1), mode="replicate")
     around = [padded[:, :, k // 3 : k // 3 + h, k % 3 : k % 3 + w] for k in range(9)]
     weight = logits.float().unflatten(1, (9, 4)).softmax(1)
-    if apart < torch.inf:
-        first = torch.stack([a[:, :1] for a in around], 1)
-        likeliest = first.expand_as(weight).gather(1, weight.argmax(1, keepdim=True))
-        weight = weight * ((first - likeliest).abs() <= apart)
-        weight = weight / weight.sum(1, keepdim=True)
+    first = torch.stack([a[:, :1] for a in around], 1)
+    likeliest = first.expand_as(weight).gather(1, weight.argmax(1, keepdim=True))
+    weight = weight * ((first - likeliest).abs() <= gap)
+    weight = weight / weight.sum(1, keepdim=True)
     total = x.new_zeros(b, c, 4, h, w)
     for k in range(9):
         total = total + around[k][:, :, None] * weight[:, k, None]

@@ -26,7 +26,7 @@ from geogs.depth.network.volume import PlaneVolume
 from geogs.networks.tensor_files import load_trained
 
 MULTIPLE = 32
-"""Images are padded to a multiple of so many pixels."""
+"""Pixels; images are padded to a multiple."""
 
 
 class DepthNetwork(nn.Module):
@@ -40,7 +40,7 @@ class DepthNetwork(nn.Module):
         super().__init__()
         self.options = options or DepthNetworkOptions()
         self.calibration = calibration or DepthCalibration()
-        """What makes its words hold; no part of what is trained."""
+        """Of deviations and confidences; not trained with the network."""
         self.matching = MatchingEncoder(self.options)
         self.context = ContextEncoder(self.options)
         self.volume = PlaneVolume(self.options)

@@ -1,4 +1,4 @@
-"""Planes at many depths in the views of neighbours: where they fall and how they look there.
+"""Planes at many depths in the views of neighbours: projections and samples.
 
 Everything here is float32: a coordinate in bfloat16 is wrong by pixels.
 """
@@ -24,9 +24,9 @@ class TriedDepths:
     log_depth: Float[Tensor, "b d #p"]
     """The same for all cells where they are planes."""
     label: Float[Tensor, "b d"]
-    """What a network is told of each."""
+    """Input of the network for each."""
     step: Float[Tensor, "b"]
-    """From one to the next, about."""
+    """About the difference from one to the next."""
     cell: int = CELL
     """Pixels per cell."""
 
@@ -38,7 +38,7 @@ class TriedDepths:
 
 @dataclass(frozen=True)
 class PlaneViews:
-    """The cells of keyframes, at every depth tried, as one neighbour each sees them."""
+    """The cells of keyframes, at every depth tried, in one neighbour each."""
 
     cells: Float[Tensor, "b d p 2"]
     """x, y among the neighbour's cells."""
@@ -53,7 +53,7 @@ class PlaneViews:
 
 
 def plane_step(log_planes: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:
-    """From one plane to the next, on average."""
+    """Mean difference from one plane to the next."""
     return torch.diff(log_planes, dim=1).mean(1)
 
 
@@ -85,7 +85,7 @@ def see_planes(
     height: int,
     width: int,
 ) -> PlaneViews:
-    """Where cells at these depths are in a neighbour with ``height`` x ``width`` cells.
+    """Cells at these depths in a neighbour of ``height`` x ``width`` cells.
 
     ``T`` takes points of the keyframe's camera to the neighbour's; its translation is over the
     typical depth.

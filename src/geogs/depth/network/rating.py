@@ -1,8 +1,7 @@
-"""The small network over all planes and cells at once: nearly all the memory that training moves.
+"""The small network over all planes and cells at once, which moves most of the memory in training.
 
-Its gradients are written out, because nothing but the three layers' inputs need be kept, in
-bfloat16 on a GPU, and because one product per plane of a batch keeps a GPU busy where one per
-batch does not.
+Its gradients are written out: then only the three layers' inputs are kept, in bfloat16 on a GPU,
+and one product per plane of a batch keeps a GPU busy where one per batch does not.
 """
 
 import torch
@@ -22,8 +21,8 @@ def rate_planes(
     plane: Float[Tensor, "b d y"],
     layers: list[Tensor],
 ) -> Float[Tensor, "b o d p"]:
-    """What three layers with ReLU between them make of the products of ``own`` and ``found``,
-    channel by channel, and of the numbers of voxels, pixels and planes, in this order.
+    """Output of three layers with ReLU between them for the products of ``own`` and ``found``,
+    channel by channel, and the inputs of voxels, pixels and planes, in this order.
 
     ``layers`` are a weight and a bias for each layer. Voxels and planes get no gradient. Layers
     are in bfloat16 on a GPU; the result is float32.

@@ -1,4 +1,4 @@
-"""Between which depths the network looks, from what a tracker knows: as in its training."""
+"""Depth range of the network's search from the tracker's depths, as in its training."""
 
 from dataclasses import dataclass
 
@@ -8,9 +8,9 @@ from jaxtyping import Float
 RATIO = (6.0, 60.0)
 """Bounds of far over near."""
 _FEW = 8
-"""Fewer depths than these say nothing."""
+"""Least number of known depths."""
 _BEYOND = 2.0
-"""Factor by which the search goes beyond the 5 % nearest and farthest depths."""
+"""Factor beyond the 5 % nearest and farthest depths."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ def search_range(
 ) -> SearchRange:
     """The range of a keyframe.
 
-    ``seen`` are the inverse depths that are known of what it sees, by any view, ``own`` those by
-    itself, of which the typical depth is the median. ``limits`` are the nearest and farthest depth
-    where somebody says them; they may be farther apart than ``RATIO``.
+    ``seen`` are the known inverse depths of what it sees, of all views, ``own`` its own, of which
+    the typical depth is the median. ``limits``, the nearest and farthest depth where they are
+    given, may exceed ``RATIO``.
     """
     if limits is not None:
         near, far = limits

@@ -1,4 +1,4 @@
-"""What the depth network is given, and what it says."""
+"""Input and output of the depth network."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ class StereoViews:
     T_nk: Float[Tensor, "b k 4 4"]
     """Takes points of the keyframe's camera to the neighbours'."""
     valid: Bool[Tensor, "b k"]
-    """Neighbours that there are; the others only fill the batch."""
+    """False for neighbours that only fill the batch."""
     near: Float[Tensor, "b"]
     """Nearest depth to search."""
     far: Float[Tensor, "b"]
@@ -35,12 +35,12 @@ class StereoViews:
 
 @dataclass(frozen=True)
 class DepthPrediction:
-    """What the network says of keyframes; logarithms are of depth over ``typical``."""
+    """Prediction for keyframes; logarithms are of depth over ``typical``."""
 
     log_depth: Float[Tensor, "b h w"]
     """Mean of every pixel."""
     log_scale: Float[Tensor, "b h w"]
-    """Logarithm of the Laplace scale of the logarithm of depth, where it is no outlier."""
+    """Logarithm of the Laplace scale of the logarithm of depth of inliers."""
     outlier: Float[Tensor, "b h w"]
     """Logit of the probability that it is an outlier, anywhere in the range."""
     normal: Float[Tensor, "b 3 h w"]
@@ -52,13 +52,13 @@ class DepthPrediction:
     at_quarter: Float[Tensor, "b h4 w4"]
     """``log_depth`` at 1/4 before it was refined."""
     tried: Float[Tensor, "b e h2 w2"]
-    """``log_depth`` that was tried at 1/2."""
+    """The depths tried at 1/2, as ``log_depth``."""
     tried_logits: Float[Tensor, "b e h2 w2"]
-    """Logits of these."""
+    """Their logits."""
     plane_logits: Float[Tensor, "b d h4 w4"]
     """Logits of the planes at 1/4."""
     plane_scores: Float[Tensor, "b d h4 w4"]
-    """The same as the neighbours' features alone have it."""
+    """The same from the neighbours' features alone."""
     log_planes: Float[Tensor, "b d"]
     """Logarithms of the planes' depths over ``typical``."""
 
@@ -67,5 +67,5 @@ class DepthPrediction:
         return self.log_depth.exp() * typical[:, None, None]
 
     def deviation(self) -> Float[Tensor, "b h w"]:
-        """Standard deviation of the logarithm of depth (relative), where it is no outlier."""
+        """Standard deviation of the logarithm of depth (relative) of inliers."""
         return 2**0.5 * self.log_scale.exp()

@@ -1,4 +1,4 @@
-"""How well each depth fits each cell of a keyframe: scores of all neighbours, by visibility."""
+"""Scores of each depth in each cell of a keyframe, over all neighbours by visibility."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,13 +16,13 @@ from geogs.depth.network.rating import rate_planes
 from geogs.depth.network.stereo_views import StereoViews
 
 VOXEL, PIXEL, PLANE = 4, 3, 3
-"""Numbers beside the correlations of a plane in a cell; of a cell; of a plane in a view."""
+"""Inputs beside the correlations of a plane in a cell; of a cell; of a plane in a view."""
 MOST_LOGIT = 10.0
 """Bound of the logarithm of a view's weight."""
 
 
 class PlaneScorer(nn.Module):
-    """Rates every plane of every cell in one neighbour: a score, and how much it counts.
+    """Rates every plane of every cell in one neighbour: a score and its weight.
 
     A small network sees the correlations and what geometry says: whether, how obliquely and how
     near the point is seen and how far it moves from plane to plane (after SimpleRecon's metadata).
@@ -109,7 +109,7 @@ def combined(
 
 
 def _roughness(features: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 p"]:
-    """Logarithm of how much features differ from those of the next cells."""
+    """Logarithm of the difference of features to those of the next cells."""
     across = torch.diff(features, dim=-1, append=features[..., -1:]).square().mean(1)
     down = torch.diff(features, dim=-2, append=features[..., -1:, :]).square().mean(1)
     return (across + down + 1e-3).log().flatten(1)[:, None]

@@ -1,1 +1,1 @@
-"""What is made of a searched depth by looking at it once more: edges, sky, bare planes."""
+"""Revisions of a searched depth: edges, sky, bare planes."""

@@ -1,4 +1,4 @@
-"""Compiled loops of the far side of edges: what lies beyond a pixel.
+"""Compiled loops of the farther surface beside a pixel.
 
 Arrays are float32 and C-contiguous; every kernel releases the interpreter lock.
 """
@@ -15,9 +15,9 @@ ZERO = np.float32(0)
 
 
 @njit(**_PART)
-def goes_on(planes, v, u, dy, dx, farthest, most):
-    """Inverse depth of the plane of pixel (v + dy, u + dx) at (v, u), or 0 where it is none that
-    lies between ``farthest`` and ``most``. ``planes`` (3, h, w): inverse depth and its slopes."""
+def extended(planes, v, u, dy, dx, farthest, most):
+    """Inverse depth at (v, u) of the plane of pixel (v + dy, u + dx); 0 unless it is between
+    ``farthest`` and ``most``. ``planes`` (3, h, w): inverse depth and its slopes."""
     y, x = v + dy, u + dx
     if y < 0 or x < 0 or y >= planes.shape[1] or x >= planes.shape[2] or planes[0, y, x] <= ZERO:
         return ZERO
@@ -26,12 +26,12 @@ def goes_on(planes, v, u, dy, dx, farthest, most):
 
 
 @njit(**_FAST)
-def farther_planes(planes, farthest, near_share, reach, found):
-    """Planes of farther surfaces within ``reach`` pixels, gone on from pixel to pixel.
+def farther_planes(planes, farthest, ratio, reach, found):
+    """Planes of farther surfaces within ``reach`` pixels, extended from pixel to pixel.
 
-    A surface is farther whose inverse depth at a pixel is below ``near_share`` of its own.
-    ``found`` (3, h, w), zero on entry, receives inverse depth and slopes. Round by round only what
-    the last one has found can add anything: all else has been asked.
+    A surface is farther if its inverse depth at a pixel is below ``ratio`` times the pixel's own.
+    ``found`` (3, h, w), zero on entry, receives inverse depth and slopes. Each round extends only
+    what the last one has found.
     """
     height, width = found.shape[1], found.shape[2]
     age = np.zeros((height, width), np.int32)
@@ -41,18 +41,18 @@ def farther_planes(planes, farthest, near_share, reach, found):
             for u in range(width):
                 if age[v, u] > 0:
                     continue
-                most = near_share * planes[0, v, u]
+                most = ratio * planes[0, v, u]
                 for step in range(9):
                     dy, dx = step // 3 - 1, step % 3 - 1
                     if step == 4:
                         continue
                     y, x = v + dy, u + dx
                     if round == 1:
-                        here, source = goes_on(planes, v, u, dy, dx, farthest, most), planes
+                        here, source = extended(planes, v, u, dy, dx, farthest, most), planes
                     else:
                         if y < 0 or x < 0 or y >= height or x >= width or age[y, x] != round - 1:
                             continue
-                        here, source = goes_on(found, v, u, dy, dx, farthest, most), found
+                        here, source = extended(found, v, u, dy, dx, farthest, most), found
                     if here > ZERO:
                         found[0, v, u] = here
                         found[1, v, u], found[2, v, u] = source[1, y, x], source[2, y, x]

@@ -1,7 +1,6 @@
-"""Compiled loops of what the images say of depths: costs of single pixels, and their means.
+"""Compiled loops of the photometric costs of depths: of single pixels, and their means.
 
-The same as :func:`geogs.depth.revision.photo_vote.photo_costs`, but of no pixel that is not asked
-about. Arrays are float32 and C-contiguous; every kernel releases the interpreter lock.
+Arrays are float32 and C-contiguous; every kernel releases the interpreter lock.
 """
 
 import numpy as np
@@ -17,8 +16,8 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @njit(**_PART)
 def project_row(T, lens, y, depth, place):
-    """Where a neighbour sees the pixels of row ``y`` of a depth map: ``place`` (2, w) receives u
-    and v, and NaN for both where that is behind the neighbour.
+    """Projections of row ``y`` of a depth map into a neighbour: ``place`` (2, w) receives u and v,
+    NaN behind the neighbour.
 
     ``T`` (3, 4) takes the reference's frame to the neighbour's; ``lens`` has fx, fy, cx, cy.
     """
@@ -54,8 +53,8 @@ def grey_at(image, u, v):
 
 @njit(**_FAST)
 def grey_differences(reference, images, T, lens, depth, differences):
-    """Grey value of each neighbour (n, h, w) where it sees a pixel, less the reference's; NaN where
-    it sees it not, or there is no depth."""
+    """Grey values of the neighbours (n, h, w) at each pixel's projection less the reference's; NaN
+    outside and where there is no depth."""
     place = np.empty((2, depth.shape[1]), np.float32)
     for n in range(images.shape[0]):
         for y in range(depth.shape[0]):
@@ -85,38 +84,36 @@ def better_half(costs, count):
 
 
 @njit(**_FAST)
-def pixel_costs(differences, light, most, asked, cost):
-    """How badly the images agree at each pixel that is ``asked`` about, of the grey differences
-    (n, h, w); 1 elsewhere.
-
-    ``light`` (n) is taken off, and ``most`` (n) counts as 1.
+def pixel_costs(differences, offset, limit, mask, cost):
+    """Costs of the pixels of a ``mask`` from grey differences (n, h, w) less ``offset`` (n), cut at
+    ``limit`` (n), which counts as 1; 1 outside the mask.
     """
     costs = np.empty(differences.shape[0], np.float32)
     for y in range(cost.shape[0]):
         for x in range(cost.shape[1]):
             count = 0
-            for n in range(differences.shape[0] if asked[y, x] else 0):
+            for n in range(differences.shape[0] if mask[y, x] else 0):
                 difference = differences[n, y, x]
                 if not np.isnan(difference):
-                    costs[count] = min(abs(difference - light[n]) / most[n], ONE)
+                    costs[count] = min(abs(difference - offset[n]) / limit[n], ONE)
                     count += 1
             cost[y, x] = better_half(costs, count)
 
 
 @njit(**_FAST)
-def average_costs(costs, asked, guide, radius, contrast, mean):
-    """Means of two costs (2, h, w) around each pixel that is ``asked`` about, by likeness in
-    colour; 0 elsewhere.
+def average_costs(costs, mask, guide, radius, contrast, mean):
+    """Means of two costs (2, h, w) around each pixel of a ``mask``, weighted by likeness in colour;
+    0 outside the mask.
 
-    ``guide`` (h, w, 3); the border repeats. A mean difference of the colours of ``contrast`` makes
-    a weight of 1 / e.
+    ``guide`` is (h, w, 3); the border repeats. A mean colour difference of ``contrast`` makes a
+    weight of 1 / e.
     """
-    height, width = asked.shape
+    height, width = mask.shape
     fall = -ONE / (np.float32(3) * contrast)
     for y in range(height):
         for x in range(width):
             mean[0, y, x], mean[1, y, x] = ZERO, ZERO
-            if not asked[y, x]:
+            if not mask[y, x]:
                 continue
             first, second, weights = ZERO, ZERO, ZERO
             for dy in range(-radius, radius + 1):

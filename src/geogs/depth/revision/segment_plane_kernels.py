@@ -15,27 +15,27 @@ from geogs.kernel_parts import inlined
 _EXACT = {"cache": True, "nogil": True, "error_model": "numpy"}
 _FAST_PART = inlined({**_EXACT, "fastmath": {"contract", "nsz", "reassoc"}})
 _PART = inlined(_EXACT)
-"""Of what contains one that is fast."""
+"""Options of functions that call one with ``fastmath``."""
 
 
 class PlaneRules(NamedTuple):
-    """What the planes of a segment are told by; in :mod:`geogs.depth.revision.segment_planes`."""
+    """Limits of the search for planes, as :mod:`geogs.depth.revision.segment_planes` has them."""
 
     reach: int
     """Pixels around a segment, or a part of it, that are its rim."""
     tolerance: float
-    least_share: float
-    mostly: float
-    alike: int
-    least: int
-    most: int
-    rounds: int
+    min_explained: float
+    min_on_plane: float
+    correlated: int
+    min_pixels: int
+    max_pixels: int
+    refits: int
 
 
 @njit(**_EXACT)
-def segment_boxes(labels, unsure, sky, boxes, counts):
-    """Of the segments from 1 on: their boxes, and how many pixels they have, of those how many that
-    are ``unsure`` and how many of ``sky``; ``boxes`` (n, 4), ``counts`` (n, 3)."""
+def segment_boxes(labels, uncertain, sky, boxes, counts):
+    """Boxes (n, 4) of the segments from 1 on, and counts (n, 3) of all their pixels, of those that
+    are ``uncertain`` and of those of the ``sky``."""
     height, width = labels.shape
     boxes[:, 0], boxes[:, 1] = height, width
     boxes[:, 2:], counts[:] = 0, 0
@@ -46,7 +46,7 @@ def segment_boxes(labels, unsure, sky, boxes, counts):
                 box[0], box[1] = min(box[0], v), min(box[1], u)
                 box[2], box[3] = max(box[2], v + 1), max(box[3], u + 1)
                 count[0] += 1
-                count[1] += unsure[v, u]
+                count[1] += uncertain[v, u]
                 count[2] += sky[v, u]
 
 
@@ -86,15 +86,15 @@ def near_part(parts, number, box, reach):
 
 
 @njit(**_EXACT)
-def rim_pixels(labels, label, box, reach, sure):
-    """Flat indices of what is ``sure`` within ``reach`` of a segment, row by row."""
+def rim_pixels(labels, label, box, reach, confident):
+    """Flat indices of the ``confident`` pixels within ``reach`` of a segment, row by row."""
     top, left, low, right = wide = widened(box, reach, labels.shape)
     near = near_part(labels, label, wide, reach)
     pixels, count = np.empty(near.size, np.int64), 0
     for v in range(top, low):
         for u in range(left, right):
             pixels[count] = v * labels.shape[1] + u
-            count += near[v - top, u - left] & sure[v, u]
+            count += near[v - top, u - left] & confident[v, u]
     return pixels[:count].copy()
 
 
@@ -106,10 +106,9 @@ def at_pixel(plane, v, u, shape):
 
 
 @njit(**_EXACT)
-def connected(labels, label, unsure, v0, u0, parts, number, pixels):
-    """Marks what is connected with a pixel, to the eight around, of what is ``unsure`` in a segment
-    by a ``number`` in ``parts``; returns the box of that and how many ``pixels``, flat indices,
-    that are."""
+def connected(labels, label, uncertain, v0, u0, parts, number, pixels):
+    """Write a ``number`` into ``parts`` at the 8-connected ``uncertain`` pixels of a segment around
+    one of them, and their flat indices into ``pixels``; returns their box and how many they are."""
     height, width = labels.shape
     parts[v0, u0], pixels[0] = number, v0 * width + u0
     done, found = 0, 1
@@ -120,54 +119,57 @@ def connected(labels, label, unsure, v0, u0, parts, number, pixels):
         top, left, low, right = min(top, v), min(left, u), max(low, v), max(right, u)
         for y in range(max(v - 1, 0), min(v + 2, height)):
             for x in range(max(u - 1, 0), min(u + 2, width)):
-                if parts[y, x] == 0 and labels[y, x] == label and unsure[y, x]:
+                if parts[y, x] == 0 and labels[y, x] == label and uncertain[y, x]:
                     parts[y, x], pixels[found] = number, y * width + x
                     found += 1
     return (top, left, low + 1, right + 1), found
 
 
 @njit(**_EXACT)
-def told_by_rim(labels, label, box, unsure, sure, depth, planes, rules, parts, told):
-    """Writes its label into ``told`` at the connected unsure parts of a segment, of ``least``
-    pixels, at whose own rim the part ``mostly`` of what is ``sure`` lies on one of its planes.
+def mark_supported(labels, label, box, uncertain, confident, depth, planes, rules, parts, marked):
+    """Write a segment's label into ``marked`` at its connected uncertain parts, of at least
+    ``min_pixels``, at whose own rim a fraction ``min_on_plane`` of the confident pixels lies on one
+    of its planes.
 
-    ``parts``, of the segment zero on entry, receives numbers of these that no others have.
+    ``parts``, which is 0 in the segment on entry, receives a number of its own for each part.
     """
     pixels, shape = np.empty((box[2] - box[0]) * (box[3] - box[1]), np.int32), labels.shape
     for v0 in range(box[0], box[2]):
         for u0 in range(box[1], box[3]):
-            if parts[v0, u0] != 0 or labels[v0, u0] != label or not unsure[v0, u0]:
+            if parts[v0, u0] != 0 or labels[v0, u0] != label or not uncertain[v0, u0]:
                 continue
             number = 1 + v0 * shape[1] + u0
-            own, count = connected(labels, label, unsure, v0, u0, parts, number, pixels)
-            if count < rules.least:
+            own, count = connected(labels, label, uncertain, v0, u0, parts, number, pixels)
+            if count < rules.min_pixels:
                 continue
             wide = widened(own, rules.reach, shape)
             near = near_part(parts, number, wide, rules.reach)
             around, on = 0, 0
             for v in range(wide[0], wide[2]):
                 for u in range(wide[1], wide[3]):
-                    if near[v - wide[0], u - wide[1]] and sure[v, u]:
+                    if near[v - wide[0], u - wide[1]] and confident[v, u]:
                         around += 1
                         value, is_on = 1 / np.float64(depth[v, u]), False
                         for plane in planes:
                             off = abs(at_pixel(plane, v, u, shape)[0] - value)
                             is_on |= off < rules.tolerance * value
                         on += is_on
-            if on >= rules.mostly * max(1, around):
+            if on >= rules.min_on_plane * max(1, around):
                 for k in range(count):
-                    told[pixels[k] // shape[1], pixels[k] % shape[1]] = label
+                    marked[pixels[k] // shape[1], pixels[k] % shape[1]] = label
 
 
 @njit(**_EXACT)
 def planes_of_segment(
-    labels, label, box, unsure, sure, depth, confidence, draws, rules, parts, told
+    labels, label, box, uncertain, confident, depth, confidence, draws, rules, parts, marked
 ):  # fmt: skip
-    """The planes (p, 3) of a segment, covariances of these, and how many were tried; ``told`` and
-    ``parts`` as in ``told_by_rim``. Also flat indices of some pixels that are known at the segment
-    and its rim, and the number of the plane, from 1 on, that each lies on."""
-    known = rim_pixels(labels, label, box, rules.reach, sure)
-    some = known[:: max(1, -(-len(known) // rules.most))]
+    """Planes (p, 3) of a segment, their covariances, and how many were tried; also flat indices of
+    some confident pixels at the segment and its rim, and the number, from 1 on, of their planes.
+
+    ``marked`` and ``parts`` are as in ``mark_supported``.
+    """
+    known = rim_pixels(labels, label, box, rules.reach, confident)
+    some = known[:: max(1, -(-len(known) // rules.max_pixels))]
     x, y, value, weight = np.empty((4, len(some)))
     for i in range(len(some)):
         v, u = some[i] // labels.shape[1], some[i] % labels.shape[1]
@@ -175,19 +177,21 @@ def planes_of_segment(
         value[i], weight[i] = 1 / np.float64(depth[v, u]), confidence[v, u]
     planes, covariances, of, tried = segment_planes(x, y, value, weight, draws, rules)
     if len(planes):
-        told_by_rim(labels, label, box, unsure, sure, depth, planes, rules, parts, told)
+        mark_supported(
+            labels, label, box, uncertain, confident, depth, planes, rules, parts, marked
+        )
     return planes, covariances, tried, some, of
 
 
 @njit(**_EXACT)
-def mark_stable(told, label, nearest, box, planes, covariances, most, first, which):
-    """Writes into ``which`` the numbers, from ``first`` on, of the planes ``nearest`` to the pixels
-    of a segment that are ``told``, where the relative deviation of these is below ``most``."""
+def mark_stable(marked, label, nearest, box, planes, covariances, most, first, which):
+    """Write into ``which`` the numbers, from ``first`` on, of the planes ``nearest`` to a segment's
+    ``marked`` pixels, where their relative deviation is below ``most``."""
     for v in range(box[0], box[2]):
         for u in range(box[1], box[3]):
-            if told[v, u] == label:
+            if marked[v, u] == label:
                 number = nearest[v, u]
-                own, x, y = at_pixel(planes[number], v, u, told.shape)
+                own, x, y = at_pixel(planes[number], v, u, marked.shape)
                 c = covariances[number]
                 mixed = c[0, 1] * x * y + c[0, 2] * x + c[1, 2] * y
                 variance = c[0, 0] * x * x + c[1, 1] * y * y + c[2, 2] + 2 * mixed
@@ -196,13 +200,13 @@ def mark_stable(told, label, nearest, box, planes, covariances, most, first, whi
 
 
 @njit(**_EXACT)
-def planar_pixels(which, planes, depth, confidence, unsure, farthest, pixels, found):
-    """Where the depth that was found is at most ``unsure`` and that of the plane of a pixel not so
-    many times nearer or farther: flat indices, and z of the plane; returns how many."""
+def planar_pixels(which, planes, depth, confidence, uncertain, farthest, pixels, found):
+    """Flat indices, and z on their planes, of pixels whose confidence is at most ``uncertain`` and
+    whose plane is not ``farthest`` times nearer or farther than their depth; returns how many."""
     count, shape = 0, which.shape
     for v in range(shape[0]):
         for u in range(shape[1]):
-            if which[v, u] == 0 or not confidence[v, u] <= unsure:
+            if which[v, u] == 0 or not confidence[v, u] <= uncertain:
                 continue
             value = at_pixel(planes[which[v, u] - 1], v, u, shape)[0]
             own = 1 / depth[v, u]
@@ -214,7 +218,7 @@ def planar_pixels(which, planes, depth, confidence, unsure, farthest, pixels, fo
 
 @njit(**_EXACT)
 def solved(sums, damping, x, y, z):
-    """What the symmetric matrix of six numbers, with more on its diagonal, takes to x, y and z."""
+    """Solution of the damped symmetric 3 x 3 system, six numbers of the matrix, for x, y and z."""
     a, b, c, d, e, f = sums
     a, d, f = a + damping, d + damping, f + damping
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
@@ -229,7 +233,7 @@ def solved(sums, damping, x, y, z):
 
 @njit(**_FAST_PART)
 def explained(x, y, value, weight, tolerance, a, b, c):
-    """Weight of what lies on the plane a x + b y + c."""
+    """Weight of the pixels on the plane a x + b y + c."""
     total = 0.0
     for i in range(len(value)):
         off = abs(a * x[i] + b * y[i] + c - value[i])
@@ -239,10 +243,10 @@ def explained(x, y, value, weight, tolerance, a, b, c):
 
 @njit(**_PART)
 def best_sample(x, y, value, weight, uniform, tolerance):
-    """The plane through three of the pixels on which most of the weight lies, and that weight,
+    """The plane through three pixels that explains most of the weight, and that weight; it is
     negative if there is none.
 
-    ``uniform`` (t, 3) draws the pixels, as likely as their weight says.
+    ``uniform`` (t, 3) draws the pixels in proportion to their weight.
     """
     chance = np.cumsum(weight / weight.sum())
     chance /= chance[-1]
@@ -264,14 +268,14 @@ def best_sample(x, y, value, weight, uniform, tolerance):
 
 @njit(**_PART)
 def fit_plane(x, y, value, weight, uniform, rules):
-    """The plane that most of the weight lies on, by samples of three, and fitted to that; what lies
-    on it; and xx, xy, x, yy, y and 1 summed over these by weight. Not one where they are too few.
+    """A plane by random samples of three pixels and a least-squares fit to its inliers, the
+    inliers, and their weighted sums of xx, xy, x, yy, y and 1; no inliers where they are too few.
     """
     (a, b, c), most = best_sample(x, y, value, weight, uniform, rules.tolerance)
     on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
     sums = np.zeros(6)
-    for _ in range(rules.rounds):
-        if most < 0 or np.count_nonzero(on) < rules.least:
+    for _ in range(rules.refits):
+        if most < 0 or np.count_nonzero(on) < rules.min_pixels:
             on[:] = False
             break
         sums[:] = 0.0
@@ -288,24 +292,23 @@ def fit_plane(x, y, value, weight, uniform, rules):
 
 @njit(**_PART)
 def segment_planes(x, y, value, weight, draws, rules):
-    """The planes that explain what is known of a segment, that of most first: coefficients of x, y
-    and 1 (p, 3) and covariances of these, the number of the plane, from 1 on, that each pixel lies
-    on, and how many were tried.
+    """Planes of a segment's pixels, the one of most weight first: coefficients of x, y and 1 (p, 3)
+    and their covariances, the number, from 1 on, of each pixel's plane, and how many were tried.
 
-    ``draws`` (n, t, 3) draw the samples of the at most n that are tried. What a plane is fitted to
-    deviates by half the tolerance, and of ``alike`` pixels one counts.
+    ``draws`` (n, t, 3) are the random numbers of at most n planes. Inliers are taken to deviate by
+    half the tolerance, and one in ``correlated`` of them to be independent.
     """
     planes, covariances = np.empty((len(draws), 3)), np.empty((len(draws), 3, 3))
     of, left, found, tried = np.zeros(len(x), np.int32), np.arange(len(x)), 0, 0
-    while tried < len(draws) and len(left) >= rules.least:
+    while tried < len(draws) and len(left) >= rules.min_pixels:
         plane, on, sums = fit_plane(
             x[left], y[left], value[left], weight[left], draws[tried], rules
         )  # fmt: skip
         tried += 1
         mine = left[on]
-        if len(mine) == 0 or weight[mine].sum() < rules.least_share * weight.sum():
+        if len(mine) == 0 or weight[mine].sum() < rules.min_explained * weight.sum():
             break
-        variance = rules.alike * (rules.tolerance / 2 * value[mine].mean()) ** 2
+        variance = rules.correlated * (rules.tolerance / 2 * value[mine].mean()) ** 2
         planes[found, 0], planes[found, 1], planes[found, 2] = plane
         for k, unit in enumerate(variance * np.eye(3)):
             row = solved(sums, 1e-9, unit[0], unit[1], unit[2])

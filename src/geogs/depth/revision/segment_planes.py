@@ -1,10 +1,9 @@
-"""Bare segments of an image as planes, told by what is known at their rims.
+"""Bare segments of an image as planes through the confident depths at their rims.
 
 Nothing can be matched on a bare wall or door, and what a search finds there is bowed, or of what
 the door reflects. What is around it, and its few marks, can be matched. Where most of that lies on
 one plane, the segment does, too (segment-based stereo: Tao, Sawhney and Kumar 2001; Bleyer and
-Gelautz 2005). What the search is sure of stays as it is, so that what is curved and seen is not
-flattened.
+Gelautz 2005). Confident depths stay, so that curved surfaces that were matched are not flattened.
 """
 
 from dataclasses import dataclass, replace
@@ -17,35 +16,35 @@ from jaxtyping import Bool, Float32, Float64, Int, Int32
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 
-RIM = 0.0125
-"""Long edges of the image around a segment that say where it lies."""
-SURE, UNSURE = 0.7, 0.5
-"""Confidence from which a pixel says so, and up to which it takes the plane's depth."""
+RIM_WIDTH = 0.0125
+"""Width of the rim around a segment, in long edges of the image."""
+CONFIDENT, UNCERTAIN = 0.7, 0.5
+"""Confidence above which a depth supports a plane, and up to which the plane's replaces it."""
 TOLERANCE = 0.02
 """Relative distance in inverse depth from a plane within which a pixel lies on it."""
-MOST_PLANES, LEAST_SHARE = 3, 0.35
-"""Planes of a segment, as of a wall around a corner, and the part of what is known (by confidence)
-that each explains at least."""
-MOSTLY = 0.6
-"""Part of what is sure at the rim of an unsure part that lies on a plane."""
-STABLE = 0.01
-"""Largest relative deviation with which a plane is gone on with."""
-ALIKE = 25
-"""Pixels that err alike: of so many one counts for the deviation."""
+MOST_PLANES, MIN_EXPLAINED = 3, 0.35
+"""Most planes of a segment, as of a wall around a corner, and the least fraction of the confident
+pixels, by confidence, that each explains."""
+MIN_ON_PLANE = 0.6
+"""Least fraction of the confident pixels at the rim of an uncertain part that lie on a plane."""
+MAX_DEVIATION = 0.01
+"""Largest relative standard deviation of a plane's inverse depth at a pixel that takes it."""
+CORRELATED = 25
+"""Neighbouring pixels whose errors count as one for the deviation."""
 CONFIDENCE = 0.5
-"""Of a depth that is a segment's plane, about as measured."""
-SKY = 0.2
-"""Part of a segment from which sky makes all of it none of these."""
-FARTHEST = 5.0
-"""Times nearer or farther than what was found a plane may be at a pixel."""
-_LEAST, _MOST, _TRIES, _ROUNDS = 40, 750, 64, 4
-"""Pixels that a fit needs and takes, triples of them that are tried, and fits of the inliers."""
+"""Confidence of a depth on a segment's plane, about as measured."""
+MAX_SKY = 0.2
+"""Fraction of sky above which a segment has no planes."""
+MAX_DEPTH_RATIO = 5.0
+"""Largest ratio, either way, of the depth that was found to that of a plane."""
+_MIN_PIXELS, _MAX_PIXELS, _SAMPLES, _REFITS = 40, 750, 64, 4
+"""Least and most pixels of a fit, samples of three that are tried, and fits of the inliers."""
 
 
 def planar_depth(
     labels: Int32[np.ndarray, "sh sw"], found: DenseDepth, camera: Camera, seed: int
 ) -> DenseDepth:
-    """A keyframe's depth, what it is unsure of in bare segments of the image being on their planes.
+    """A keyframe's depth with its uncertain pixels in bare segments of the image on their planes.
 
     Args:
         labels: ``bare_segments`` of the image.
@@ -70,16 +69,17 @@ def planar_depth(
 
 @dataclass(frozen=True)
 class PlanarDepth:
-    """Pixels on planes of segments that are known well, where the depth that was found is not."""
+    """Uncertain pixels of a depth that lie on well known planes of segments."""
 
     pixels: Int[np.ndarray, "n"]
     """Flat indices."""
     depth: Float32[np.ndarray, "n"]
-    """z of the planes there."""
+    """z on the planes."""
     plane: Int32[np.ndarray, "n"]
-    """Which that is."""
+    """Index of each pixel's plane."""
     coefficients: Float64[np.ndarray, "p 3"]
-    """Of inverse depth in x and y over the image's width and height, from its middle, and 1."""
+    """Coefficients of inverse depth in x, y and 1; x and y are fractions of the image's width and
+    height from its middle."""
 
     def normals(self, camera: Camera) -> Float32[np.ndarray, "n 3"]:
         """Unit normals, camera frame and facing it.
@@ -100,21 +100,14 @@ def on_planes(
     sky: Bool[np.ndarray, "h w"] | None,
     seed: int,
 ) -> PlanarDepth:
-    """Depth by the planes of segments.
-
-    Args:
-        found: depth and confidence.
-        labels: ``bare_segments`` of the image.
-        sky: where nothing is.
-        seed: of the samples that are tried.
-    """
+    """Pixels on planes of the segments ``labels``; ``planar_depth`` says what the others are."""
     from geogs.depth.revision.segment_plane_kernels import planar_pixels
 
     planes, which = _planes_of_segments(found, labels, sky, np.random.default_rng(seed))
     which = _resized(which, found.depth.shape)
     pixels, depth = np.empty(which.size, np.int64), np.empty(which.size, np.float32)
     count = planar_pixels(
-        which, planes, found.depth, found.confidence, UNSURE, FARTHEST, pixels, depth
+        which, planes, found.depth, found.confidence, UNCERTAIN, MAX_DEPTH_RATIO, pixels, depth
     )
     taken = pixels[:count]
     return PlanarDepth(taken, depth[:count], which.ravel()[taken] - 1, planes)
@@ -126,10 +119,9 @@ def _planes_of_segments(
     sky: Bool[np.ndarray, "h w"] | None,
     rng: np.random.Generator,
 ) -> tuple[Float64[np.ndarray, "p 3"], Int32[np.ndarray, "sh sw"]]:
-    """Planes, and which of them, from 1 on, the pixels of the segments lie on where that is known
-    well; 0 for none.
+    """Planes, and the number, from 1 on, of the plane of each pixel of the segments; 0 for none.
 
-    Of an unsure part at whose own rim most of what is sure lies on no plane nothing is known: a
+    An uncertain part has none where most of the confident pixels at its own rim lie on no plane: a
     segment may go on beyond an edge that is too faint to be seen.
     """
     from geogs.depth.revision import segment_plane_kernels as kernels
@@ -137,26 +129,29 @@ def _planes_of_segments(
     shape = labels.shape
     depth, confidence = (_resized(m, shape) for m in (found.depth, found.confidence))
     is_sky = np.zeros(shape, bool) if sky is None else _resized(sky.view(np.uint8), shape) > 0
-    unsure, sure = confidence <= UNSURE, confidence > SURE
+    uncertain, confident = confidence <= UNCERTAIN, confidence > CONFIDENT
     boxes, counts = (np.empty((int(labels.max(initial=0)), k), np.int64) for k in (4, 3))
-    kernels.segment_boxes(labels, unsure, is_sky, boxes, counts)
-    worth_it = np.flatnonzero((counts[:, 1] >= _LEAST) & (counts[:, 2] <= SKY * counts[:, 0]))
-    draws = rng.random((MOST_PLANES * len(worth_it), _TRIES, 3))
+    kernels.segment_boxes(labels, uncertain, is_sky, boxes, counts)
+    total, doubtful, of_sky = counts.T
+    worth_it = np.flatnonzero((doubtful >= _MIN_PIXELS) & (of_sky <= MAX_SKY * total))
+    draws = rng.random((MOST_PLANES * len(worth_it), _SAMPLES, 3))
     rules = kernels.PlaneRules(
-        max(1, round(RIM * max(shape))), TOLERANCE, LEAST_SHARE, MOSTLY, ALIKE, _LEAST, _MOST,
-        _ROUNDS,
+        max(1, round(RIM_WIDTH * max(shape))), TOLERANCE, MIN_EXPLAINED, MIN_ON_PLANE, CORRELATED,
+        _MIN_PIXELS, _MAX_PIXELS, _REFITS,
     )  # fmt: skip
-    which, parts, told, alone = np.zeros((4, *shape), np.int32)
+    which, parts, marked, alone = np.zeros((4, *shape), np.int32)
     planes, drawn = [np.empty((0, 3))], 0
     for label, box in zip(worth_it + 1, boxes[worth_it], strict=True):
         own, covariances, tried, known, of = kernels.planes_of_segment(
-            labels, label, box, unsure, sure, depth, confidence, draws[drawn : drawn + MOST_PLANES],
-            rules, parts, told,
+            labels, label, box, uncertain, confident, depth, confidence,
+            draws[drawn : drawn + MOST_PLANES], rules, parts, marked,
         )  # fmt: skip
         drawn += tried
         nearest = alone if len(own) < 2 else _nearest(len(own), known, of, shape)
         first = 1 + sum(map(len, planes))
-        kernels.mark_stable(told, label, nearest, box, own, covariances, STABLE, first, which)
+        kernels.mark_stable(
+            marked, label, nearest, box, own, covariances, MAX_DEVIATION, first, which
+        )
         planes.append(own)
     return np.concatenate(planes), which
 
@@ -164,7 +159,7 @@ def _planes_of_segments(
 def _nearest(
     count: int, known: Int[np.ndarray, "n"], of: Int32[np.ndarray, "n"], shape: tuple[int, ...]
 ) -> Int32[np.ndarray, "h w"]:
-    """On which plane that of the known pixels lies that is nearest to each pixel."""
+    """The plane, from 0 on, of the known pixel that is nearest to each pixel."""
     distances = []
     for number in range(1, count + 1):
         empty = np.ones(shape, np.uint8)
@@ -174,7 +169,7 @@ def _nearest(
 
 
 def _resized(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Those of the nearest pixels at another size of the same image."""
+    """Values of the nearest pixels at another size of the same image."""
     if values.shape == shape:
         return values
     return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_NEAREST)

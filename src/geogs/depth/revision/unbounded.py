@@ -9,27 +9,26 @@ from torch import Tensor
 from geogs.depth.depth_engine import DepthEngine, RevisedSearch
 from geogs.depth.depth_view import INFINITY, DenseDepth, DepthView, PosedDepth
 
-FAR = 2.0
-"""Times the median depth from which a pixel is asked: a bare wall nearby looks the same at any
-depth, and is none of these."""
-_ASKED = 0.005
-"""Least part of a view for which it is worth it."""
-WORSE = 0.03
-"""By how much the cost at infinity may exceed that of the depth found: their difference has so much
-noise where both are right."""
-AGREES = 0.3
-"""Cost up to which images agree: surfaces that are found right have 0.4, seen at infinity 0.9."""
-_SURE = 0.5
-"""Least confidence of depths from which noise and light are learned."""
+FAR_RATIO = 2.0
+"""Depth over the median depth from which a pixel may be sky: a bare wall nearby looks the same at
+any depth."""
+_MIN_FAR = 0.005
+"""Least fraction of far pixels for which a view is searched."""
+MAX_EXCESS = 0.03
+"""Largest cost at infinity less that at the depth found: their noise where both are right."""
+MAX_COST = 0.3
+"""Largest cost of the sky at infinity; that of a surface is 0.4 at its depth, 0.9 at infinity."""
+_CONFIDENT = 0.5
+"""Confidence above which depths say how images differ in noise and offset."""
 
 
 class SkySearch(RevisedSearch):
-    """A search that finds sky where the images agree as well at infinity."""
+    """Another search with sky where the images agree as well at infinity."""
 
     def revised(
         self, view: DepthView, others: Sequence[DepthView], searched: DenseDepth
     ) -> DenseDepth:
-        """With its sky."""
+        """The depth with its sky."""
         return searched.under(unbounded(view, others, searched, self.classical))
 
     def check(
@@ -43,20 +42,19 @@ class SkySearch(RevisedSearch):
 def unbounded(
     view: DepthView, others: Sequence[DepthView], found: DenseDepth, engine: DepthEngine
 ) -> Bool[Tensor, "h w"] | None:
-    """Far pixels where the other views agree at infinity, and not worse than at the depth found.
+    """Far pixels whose cost at infinity (rotations alone count) is no worse than at their depth.
 
-    At infinity only the rotations between the views count. What is asked is a mean over single
-    pixels of like colour (``photo_costs``), so that a roof says nothing of the sky beside it.
-    None where there are none, hardly a pixel is far, or there is nothing to compare with.
+    Costs are means over single pixels of like colour (``photo_costs``), so that a roof says nothing
+    of the sky beside it. None if there are none, few pixels are far, or there are no other views.
     """
-    sure = found.confidence > _SURE
-    if not others or not bool(sure.any()):
+    confident = found.confidence > _CONFIDENT
+    if not others or not bool(confident.any()):
         return None
-    typical = found.depth[sure].median()
-    is_far = found.depth > FAR * typical
-    if float(is_far.float().mean()) < _ASKED:
+    typical = found.depth[confident].median()
+    is_far = found.depth > FAR_RATIO * typical
+    if float(is_far.float().mean()) < _MIN_FAR:
         return None
     depths = torch.stack([found.depth, (INFINITY * typical).expand_as(found.depth)])
-    here, beyond = engine.photo_costs(view, others, depths, sure)
-    is_sky = is_far & (beyond < AGREES) & (beyond < here + WORSE)
+    here, beyond = engine.photo_costs(view, others, depths, confident)
+    is_sky = is_far & (beyond < MAX_COST) & (beyond < here + MAX_EXCESS)
     return is_sky if bool(is_sky.any()) else None

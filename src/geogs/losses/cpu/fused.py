@@ -1,7 +1,7 @@
 """The mapper's losses on a CPU: value and gradient in one go, compiled and cut over threads.
 
-In float32; held to the plain definitions in ``tests/oracles``. The gradient is made together with
-the value, so the backward pass only scales it. Results do not depend on the number of threads.
+In float32; tested against the plain definitions in ``tests/oracles``. The gradient is made with the
+value, so the backward pass only scales it. Results do not depend on the number of threads.
 """
 
 import functools
@@ -130,7 +130,7 @@ class _MultiView(torch.autograd.Function):
                 height,
             )
         total = float(loss.sum(dtype=np.float64))
-        # d loss / d warped: [0] from elsewhere, [1] in all; only held where someone needs it.
+        # d loss / d warped: [0] from elsewhere, [1] in all; empty unless needed.
         g_image = np.zeros((2, height, width) if with_pose else (2, 0, 0), np.float32)
         if config.ssim_weight > 0:
             g_image = np.zeros((2, height, width), np.float32)

@@ -15,17 +15,17 @@ ZERO, HALF, ONE, TWO, HUGE = (np.float32(v) for v in (0, 0.5, 1, 2, 1e30))
 
 
 @njit(**PART)
-def fetch_corners(image, us, vs, index, shares, corners):
-    """What a bilinear sample of a row of places needs: ``corners`` (4, w) receives the pixels at
-    the upper left, upper right, lower left and lower right, ``shares`` (2, w) the fractions.
+def fetch_corners(image, us, vs, index, parts, corners):
+    """Bilinear samples of a row of positions: ``corners`` (4, w) receives the pixels at the upper
+    left, upper right, lower left and lower right, ``parts`` (2, w) the fractions.
 
-    Places are held within the image. The copying of pixels is a loop of its own, so that the
-    others, which compute, are vectorised.
+    Positions are clamped to the image. Pixels are copied in a loop of their own, so that the others
+    are vectorised.
     """
     height, width = image.shape
     last_u, last_v = np.float32(width - 1), np.float32(height - 1)
     most_i, most_j = np.float32(width - 2), np.float32(height - 2)
-    fx, fy = shares[0], shares[1]
+    fx, fy = parts[0], parts[1]
     for x in range(us.shape[0]):
         u, v = min(max(us[x], ZERO), last_u), min(max(vs[x], ZERO), last_v)
         i, j = min(np.floor(u), most_i), min(np.floor(v), most_j)
@@ -41,7 +41,7 @@ def fetch_corners(image, us, vs, index, shares, corners):
 
 
 @njit(**PART)
-def hide_line(depth, lenses, tolerance, geometry, places, index, shares, corners):
+def hide_line(depth, lenses, tolerance, geometry, places, index, parts, corners):
     """Clears ``geometry[2]``, the depth in the target, where the target's depth map is nearer or
     farther by ``tolerance`` of it, or not known. The other arguments but ``lenses`` are scratch."""
     hx, hy = lenses[1, 2], lenses[1, 3]
@@ -51,8 +51,8 @@ def hide_line(depth, lenses, tolerance, geometry, places, index, shares, corners
     s, t = places[0], places[1]
     for x in range(us.shape[0]):
         s[x], t[x] = (us[x] - hx) * zoom_u + cx, (vs[x] - hy) * zoom_v + cy
-    fetch_corners(depth, s, t, index, shares, corners)
-    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], shares[0], shares[1]
+    fetch_corners(depth, s, t, index, parts, corners)
+    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], parts[0], parts[1]
     for x in range(us.shape[0]):
         p, q, r, last = p0[x], q0[x], r0[x], s0[x]
         upper, lower = p + (q - p) * fx[x], r + (last - r) * fx[x]
@@ -63,11 +63,11 @@ def hide_line(depth, lenses, tolerance, geometry, places, index, shares, corners
 
 
 @njit(**PART)
-def sample_line(y, geometry, shares, corners, reference, warped, slope, mask):
+def sample_line(y, geometry, parts, corners, reference, warped, slope, mask):
     """Row ``y`` of the warped image, its slope by depth and its mask from the corners of its
     samples; ``corners[2:]`` receive the image's derivatives along x and y."""
     zs, by_u, by_v = geometry[2], geometry[3], geometry[4]
-    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], shares[0], shares[1]
+    p0, q0, r0, s0, fx, fy = corners[0], corners[1], corners[2], corners[3], parts[0], parts[1]
     own, out, out_slope, out_mask = reference[y], warped[y], slope[y], mask[y]
     for x in range(zs.shape[0]):
         p, q, r, s = p0[x], q0[x], r0[x], s0[x]
@@ -82,24 +82,24 @@ def sample_line(y, geometry, shares, corners, reference, warped, slope, mask):
 
 
 @njit(**PART)
-def enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometry):
+def enlarge_line(depth, y, rows, row_part, columns, column_part, line, geometry):
     """Row ``y`` of the enlarged depth into ``geometry[5]``; 0 where a source pixel is unknown."""
-    i, k, f = rows[0, y], rows[1, y], row_share[y]
+    i, k, f = rows[0, y], rows[1, y], row_part[y]
     for x in range(depth.shape[1]):
         a, b = depth[i, x], depth[k, x]
         known = (a > ZERO) & (b > ZERO) & (a < HUGE) & (b < HUGE)
         line[x] = a + (b - a) * f if known else ZERO
     for x in range(geometry.shape[1]):
         a, b = line[columns[0, x]], line[columns[1, x]]
-        geometry[5, x] = a + (b - a) * column_share[x] if (a > ZERO) & (b > ZERO) else ZERO
+        geometry[5, x] = a + (b - a) * column_part[x] if (a > ZERO) & (b > ZERO) else ZERO
 
 
 @njit(**PART)
 def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
     """Where the pixels of row ``y`` fall in the target, from their depth in ``geometry[5]``.
 
-    ``min_depth_ratio``: least share of depth kept; ``last_u``, ``last_v``: largest u and v of the
-    target. ``geometry`` (6, w) receives u, v, z (0 where out of view), du/dd, dv/dd.
+    ``min_depth_ratio``: least fraction of depth kept; ``last_u``, ``last_v``: largest u and v of
+    the target. ``geometry`` (6, w) receives u, v, z (0 where out of view), du/dd, dv/dd.
     """
     fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
     gx, gy, hx, hy = lenses[1, 0], lenses[1, 1], lenses[1, 2], lenses[1, 3]
@@ -121,19 +121,19 @@ def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
 
 
 @njit(**PART)
-def share_of(texture, weak):
-    """What counts of a pixel by its texture: half at ``weak``, all where that is 0."""
+def weight_of(texture, weak):
+    """Weight of a pixel by its texture: 1/2 at ``weak``; 1 if that is 0."""
     return texture / (texture + weak) if weak > ZERO else ONE
 
 
 @njit(**KERNEL)
 def warp_rows(
-    first, last, depth, rows, row_share, columns, column_share, reference, texture, target,
+    first, last, depth, rows, row_part, columns, column_part, reference, texture, target,
     target_depth, lenses, T, settings, warped, slope, mask, extra, loss,
 ):  # fmt: skip
     """The target image through the reference's depth, rows ``first <= y < last``.
 
-    rows, columns (2, n) and their shares: source pixels of the bilinear enlargement; lenses (3, 4):
+    rows, columns (2, n) and their parts: source pixels of the bilinear enlargement; lenses (3, 4):
     fx, fy, cx, cy of the reference, of the target, and of the target at its depth map's size; T
     (3, 4) reference to target; settings: a record of ``PhotoSettings``. ``warped`` is filled from
     the reference where ``mask`` is 0; ``slope`` is d warped / d depth; ``extra`` (3, h, w), unless
@@ -147,17 +147,17 @@ def warp_rows(
     line = np.empty(depth.shape[1], np.float32)
     geometry = np.empty((6, count), np.float32)
     index, places = np.empty(count, np.uint32), np.empty((2, count), np.float32)
-    shares, corners = np.empty((2, count), np.float32), np.empty((4, count), np.float32)
+    parts, corners = np.empty((2, count), np.float32), np.empty((4, count), np.float32)
     for y in range(first, last):
         total = ZERO
-        enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometry)
+        enlarge_line(depth, y, rows, row_part, columns, column_part, line, geometry)
         project_line(y, lenses, T, settings.min_depth_ratio, last_u, last_v, geometry)
         if occluded:
             hide_line(
-                target_depth, lenses, settings.occlusion, geometry, places, index, shares, corners
+                target_depth, lenses, settings.occlusion, geometry, places, index, parts, corners
             )
-        fetch_corners(target, geometry[0], geometry[1], index, shares, corners)
-        sample_line(y, geometry, shares, corners, reference, warped, slope, mask)
+        fetch_corners(target, geometry[0], geometry[1], index, parts, corners)
+        sample_line(y, geometry, parts, corners, reference, warped, slope, mask)
         if with_extra:
             for x in range(count):
                 extra[0, y, x], extra[1, y, x] = corners[2, x], corners[3, x]
@@ -165,23 +165,22 @@ def warp_rows(
         for x in range(reference.shape[1]):
             size = min(abs(warped[y, x] - reference[y, x]), settings.cut)
             small = min(size, settings.huber)
-            total += share_of(texture[y, x], settings.texture) * small * (size - HALF * small)
+            total += weight_of(texture[y, x], settings.texture) * small * (size - HALF * small)
         loss[y] = settings.l1 / settings.huber * total
 
 
 @njit(**KERNEL)
 def correlate_rows(first, last, reference, texture, warped, mask, half, settings, fields, loss):
-    """L_ncc of windows centred in rows ``first <= y < last`` and what their pixels need of it.
+    """L_ncc of windows centred in rows ``first <= y < last``, added to ``loss[y]``; its gradient.
 
-    settings as in :func:`warp_rows`. The gradient
-    at a pixel q is the sum over the windows p around it of
-    ``fields[0, p] + reference[q] fields[1, p] + warped[q] fields[2, p]``. Adds to ``loss[y]``.
+    settings as in :func:`warp_rows`. The gradient at a pixel q is the sum over the windows p around
+    it of ``fields[0, p] + reference[q] fields[1, p] + warped[q] fields[2, p]``.
     """
     if half < 0:
         return
     height, width = reference.shape
     side = 2 * half + 1
-    share = ONE / np.float32(side * side)
+    norm = ONE / np.float32(side * side)
     line, sums = np.empty((6, width), np.float32), np.empty((6, width), np.float32)
     for y in range(first, last):
         for x in range(width):
@@ -207,18 +206,18 @@ def correlate_rows(first, last, reference, texture, warped, mask, half, settings
                     sums[c, x] += line[c, x + k]
         total = ZERO
         for x in range(inner):
-            mean_a, mean_b = share * sums[0, x], share * sums[2, x]
-            raw_a = max(share * sums[1, x] - mean_a * mean_a, ZERO)
-            raw_b = max(share * sums[3, x] - mean_b * mean_b, ZERO)
+            mean_a, mean_b = norm * sums[0, x], norm * sums[2, x]
+            raw_a = max(norm * sums[1, x] - mean_a * mean_a, ZERO)
+            raw_b = max(norm * sums[3, x] - mean_b * mean_b, ZERO)
             var_a, var_b = raw_a + settings.variance_floor, raw_b + settings.variance_floor
             inverse = ONE / np.sqrt(var_a * var_b)
-            ncc = (share * sums[4, x] - mean_a * mean_b) * inverse
+            ncc = (norm * sums[4, x] - mean_a * mean_b) * inverse
             used = (raw_a > settings.min_variance) & (ONE - ncc < settings.reject)
-            used = used & (share * sums[5, x] > settings.min_coverage - np.float32(1e-4))
-            w = settings.ncc * share_of(texture[y, x + half], settings.texture) if used else ZERO
+            used = used & (norm * sums[5, x] > settings.min_coverage - np.float32(1e-4))
+            w = settings.ncc * weight_of(texture[y, x + half], settings.texture) if used else ZERO
             total += w * (ONE - ncc)
-            cross = -w * share * inverse
-            own = w * share * ncc / var_b if raw_b > ZERO else ZERO
+            cross = -w * norm * inverse
+            own = w * norm * ncc / var_b if raw_b > ZERO else ZERO
             fields[0, y, x + half] = -cross * mean_a - own * mean_b
             fields[1, y, x + half] = cross
             fields[2, y, x + half] = own
@@ -249,7 +248,7 @@ def window_sums(y, fields, half, line, sums):
 
 @njit(**KERNEL)
 def depth_gradient_rows(
-    first, last, rows, row_share, columns, column_share, reference, texture, warped, slope, mask,
+    first, last, rows, row_part, columns, column_part, reference, texture, warped, slope, mask,
     half, settings, fields, g_image, g_depth,
 ):  # fmt: skip
     """d loss / d depth for the depth rows ``first <= y < last``: the enlargement's adjoint.
@@ -263,7 +262,7 @@ def depth_gradient_rows(
     sums = np.zeros((3, width), np.float32)
     pull = np.zeros((last - first, width), np.float32)
     for y in range(height):
-        i, k, f = rows[0, y] - first, rows[1, y] - first, row_share[y]
+        i, k, f = rows[0, y] - first, rows[1, y] - first, row_part[y]
         own_i, own_k = 0 <= i < last - first, 0 <= k < last - first
         if not (own_i or own_k):
             continue
@@ -272,7 +271,7 @@ def depth_gradient_rows(
             a, b = reference[y, x], warped[y, x]
             near = abs(b - a) < settings.cut
             push = min(max((b - a) / settings.huber, -ONE), ONE) if near else ZERO
-            push *= settings.l1 * share_of(texture[y, x], settings.texture)
+            push *= settings.l1 * weight_of(texture[y, x], settings.texture)
             sums[0, x] += a * sums[1, x] + b * sums[2, x] + push
         if g_image.shape[1] > 0:
             for x in range(width):
@@ -294,7 +293,7 @@ def depth_gradient_rows(
         for x in range(g_depth.shape[1]):
             g_depth[first + r, x] = ZERO
         for x in range(width):
-            f = column_share[x]
+            f = column_part[x]
             g_depth[first + r, columns[0, x]] += (ONE - f) * pull[r, x]
             g_depth[first + r, columns[1, x]] += f * pull[r, x]
 

@@ -78,7 +78,7 @@ def normal_terms(clean, r, normal, prior, y, settings, g_normal):
 
 @njit(**PART)
 def split_normals(normal, y, lines):
-    """The coordinates of row ``y``'s normals as rows of their own, what is not a number as 0."""
+    """The coordinates of row ``y``'s normals as three rows; 0 where they are not finite."""
     nx, ny, nz = lines[0], lines[1], lines[2]
     for x in range(normal.shape[1]):
         ax, ay, az = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]

@@ -1,4 +1,4 @@
-"""What the losses know of the keyframes, kept on a GPU by slot."""
+"""The keyframes' constants for the losses, on a GPU by slot."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -29,9 +29,9 @@ class ViewField(IntEnum):
 class ViewTable:
     """Maps and poses of keyframes on a device, one slot each, in any number.
 
-    The kernels find them through ``pointers`` and ``poses``, so a captured graph follows whatever
-    slots its input names. Adding slots beyond the capacity replaces what has a row for each by
-    larger ones and raises ``generation``: graphs captured before must be captured again.
+    Kernels find them through ``pointers`` and ``poses``, so a captured graph works with any slots.
+    Adding slots beyond the capacity replaces the tensors that have a row for each by larger ones
+    and raises ``generation``: graphs captured before must be captured again.
     """
 
     def __init__(
@@ -68,8 +68,8 @@ class ViewTable:
     def __len__(self) -> int:
         return len(self._maps)
 
-    def add(self, view: ViewConstants | None, photo: PhotoView) -> int:
-        """Take up a keyframe and return its slot; constants may follow later."""
+    def add(self, view: ViewConstants, photo: PhotoView) -> int:
+        """Add a keyframe and return its slot."""
         slot = len(self)
         if slot == len(self.pointers):
             self._grow()
@@ -87,12 +87,11 @@ class ViewTable:
             self.planes.append(torch.zeros_like(self.pointers))
         self._point(slot)
         self._set_noise(slot, photo)
-        if view is not None:
-            self.set_constants(slot, view)
+        self.set_constants(slot, view)
         self.set_poses([slot], photo.T_cw[None])
         return slot
 
-    def replace(self, slot: int, view: ViewConstants | None, photo: PhotoView) -> None:
+    def replace(self, slot: int, view: ViewConstants, photo: PhotoView) -> None:
         """Let a slot stand for another keyframe, whose rendering is not known yet.
 
         All maps stay where they are, so captured graphs remain valid.
@@ -101,22 +100,19 @@ class ViewTable:
         self._photos[slot].copy_(self._uploaded_photo(photo))
         self.rendered[slot : slot + 1].zero_()
         self._set_noise(slot, photo)
-        if view is not None:
-            self.set_constants(slot, view)
+        self.set_constants(slot, view)
         self.set_poses([slot], photo.T_cw[None])
 
     def set_constants(self, slot: int, view: ViewConstants) -> None:
         """Replace a keyframe's prior depth, confidence, prior normals and edges."""
         maps = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
         self._maps[slot][:4].copy_(self._upload(torch.stack([m.float() for m in maps])))
-        before = self._normals[slot]
-        if view.prior_normal is None:
-            self._normals[slot] = None
-        elif before is None:
-            self._normals[slot] = self._upload(view.prior_normal.permute(2, 0, 1))
-        else:
-            before.copy_(self._upload(view.prior_normal.permute(2, 0, 1)))
-        if (before is None) != (self._normals[slot] is None):
+        before, normal = self._normals[slot], view.prior_normal
+        planes = None if normal is None else self._upload(normal.permute(2, 0, 1))
+        if before is not None and planes is not None:
+            before.copy_(planes)
+        elif before is not planes:
+            self._normals[slot] = planes
             self._point(slot)
 
     def set_poses(self, slots: Sequence[int], T_cw: Float[Tensor, "k 4 4"]) -> None:

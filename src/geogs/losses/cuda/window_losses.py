@@ -28,7 +28,7 @@ _SSIM_HALF = 5
 
 
 class _Flags(IntFlag):
-    """What there is around a windowed measure; the bits of ``windows.cuh``."""
+    """Steps before and after a windowed measure; the bits of ``windows.cuh``."""
 
     ADD_EARLIER = 1
     FINISH = 2
@@ -90,8 +90,8 @@ class WindowLosses:
         size = (pairs if self._photo else 0, photo.height, photo.width)
         self._warped, self._pull = maps(*size), maps(*size)
         two_measures = c.ssim_weight > 0 and c.ncc_weight > 0 and not c.colour
-        held = self._photo and (self._with_pose or two_measures)
-        self._image_gradient = maps(*size) if held else None
+        keeps_gradient = self._photo and (self._with_pose or two_measures)
+        self._image_gradient = maps(*size) if keeps_gradient else None
 
     def launch(
         self,

@@ -22,13 +22,13 @@ from geogs.splat.render import RenderOutput, render
 from geogs.threads import thread_map
 from geogs.world.disks import DiskParameters, GaussianMap
 
-# Part of the map up to which an excerpt is trained rather than all of it.
+# Largest fraction of the map that is trained as an excerpt.
 _LARGE_EXCERPT = 0.7
 COARSE_PART = 0.5
-"""Part of a training over all keyframes for which half the resolution does: what is coarse is
-learned there, in half of the time."""
+"""Fraction of a training over all keyframes, its first, at half the resolution: coarse errors are
+corrected there in half of the time."""
 LEAST_COARSE = 100
-"""Long edge of such a rendering, below which all is trained at the full one."""
+"""Least long edge of a rendering at half the resolution."""
 # Standard deviations at which a disk of any opacity has faded below what the renderer shows.
 REACH = 3.4
 
@@ -46,7 +46,7 @@ def view_loss(
     Partners without a rendering yet are matched without occlusion test. The view may be rendered
     ``coarse``, at half the resolution.
     """
-    known = view.known.halved if coarse else view.known
+    known = view.constants.halved if coarse else view.constants
     loss = fused_single_view(
         output.depth, output.normal, output.alpha, output.distortion, known, config.loss, unit
     )
@@ -63,13 +63,13 @@ def view_loss(
 
 @dataclass(frozen=True)
 class _Pass:
-    """What a view adds to a step."""
+    """A view's contribution to a step."""
 
     gradients: list[Tensor]
     """Gradients of the disks' parameters."""
     loss: float
     depth: Float[Tensor, "h w"]
-    """As the view shows it, within its mask."""
+    """The rendered depth, within the view's mask."""
     visible: Bool[Tensor, "n"]
 
 
@@ -84,7 +84,7 @@ class CpuTrainer:
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
         is_large = cameras.render.long_edge // 2 >= LEAST_COARSE
         self.coarse_part = COARSE_PART if is_large else 0.0
-        """Part of a training over all keyframes, its first, that goes at half the resolution."""
+        """``COARSE_PART``, or 0 if renderings are too small for that."""
 
     def train(
         self,
@@ -94,9 +94,8 @@ class CpuTrainer:
     ) -> None:
         """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
 
-        At half the resolution if ``coarse``, which is only for trainers with a ``coarse_part``. On
-        an excerpt of the map where the views can see no more than that, which changes nothing but
-        rounding.
+        At half the resolution if ``coarse``, which needs a ``coarse_part``. If the views can only
+        see an excerpt of the map, only that is trained, which changes nothing but rounding.
         """
         whole, optimizer, seen = self.disks, self.optimizer, self._in_view(batches)
         if not 0 < len(seen) <= _LARGE_EXCERPT * len(whole):
@@ -121,7 +120,7 @@ class CpuTrainer:
         self.optimizer.learning_rates = learning_rates(self.config, self.unit)
 
     def _in_view(self, batches: Sequence[Batch]) -> Int[Tensor, "m"]:
-        """Disks that the views of some steps can see, or could after these steps."""
+        """Disks that the views can see before or after some steps."""
         views = {view.id: view for batch in batches for view, _ in batch}
         if self.config.photo.fresh:
             views |= {o.id: o for batch in batches for _, others in batch for o in others}
@@ -141,7 +140,7 @@ class CpuTrainer:
         return refine_poses(self.disks, active, views, self.cameras, config, self.unit)
 
     def forget_renders(self, views: Iterable[MapView]) -> None:
-        """What the views showed of the map counts no more: it was moved."""
+        """Discard the rendered depths of views, as the map was moved."""
         for view in views:
             view.rendered_depth = None
 
@@ -169,10 +168,10 @@ class CpuTrainer:
         return total
 
     def _pass(self, view: MapView, partners: list[MapView], coarse: bool) -> _Pass:
-        """One view forth and back; nothing that other views use is changed."""
+        """Forward and backward pass of one view; changes nothing that other views use."""
         parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))
         full = self.cameras.render
-        camera = view.known.halved.camera if coarse else full
+        camera = view.constants.halved.camera if coarse else full
         output = render(parameters, camera, view.T_cw)
         loss = view_loss(view, partners, output, self.config, self.unit, coarse)
         loss.backward()

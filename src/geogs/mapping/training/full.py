@@ -16,17 +16,17 @@ from geogs.world.map import MapTable, TrainingPlace
 if TYPE_CHECKING:
     from geogs.mapping.training.trainer_choice import MapTrainer
 
-# Steps between two reports of progress, at least.
+# Most steps between two reports of progress.
 _REPORTED_STEPS = 20
-# Steps from which the time of one is judged, if they take so many seconds; else so often again.
+# Steps that are timed, and again so often if they take less than so many seconds.
 _REHEARSED_STEPS, _ENOUGH_SECONDS, _REHEARSALS = 16, 0.2, 8
 
 
 class FullTraining:
     """Single-view steps over all mapped keyframes in random order, with falling learning rates.
 
-    The first go at half the resolution, where the trainer has it so. On the way the map is pruned
-    and filled.
+    The first are at half the resolution if the trainer has a coarse part. Meanwhile the map is
+    pruned and filled.
     """
 
     def __init__(
@@ -42,16 +42,16 @@ class FullTraining:
         self._mapped = [views[i] for i in table.mapped]
 
     def run(self, total: int, progress: Progress, until: float | None) -> None:
-        """Go on from the table's place to so many steps in all, or to a time of
-        ``time.perf_counter``: rates fall with the steps or with the time, whichever is nearer to
-        its end."""
+        """Continue from the table's ``place`` to ``total`` steps, or to a time of
+        ``time.perf_counter``; rates fall with the steps or the time, whichever is nearer its end.
+        """
         table, config = self._table, self._config
         begin, seconds_to_prune = time.perf_counter() - table.place.seconds, 0.0
         prunes = max(total // 4, 1)
         fills = {total // 3, 2 * total // 3}
         coarse = int(self._trainer.coarse_part * total)
         events = fills | set(range(prunes, total, prunes)) | {coarse} - {0}
-        # Where time is short steps are few and slow, so that it is looked at the clock more often.
+        # Where time is short, steps are few and slow, and the clock is read more often.
         at_once = _REPORTED_STEPS if until is None else min(_REPORTED_STEPS, max(total // 50, 1))
         stops = sorted(events | set(range(at_once, total, at_once)) | {total})
         done = table.place.steps
@@ -79,7 +79,7 @@ class FullTraining:
             progress(done / total)
 
     def _draw(self) -> list[tuple[MapView, list[MapView]]]:
-        """The view that comes next, each once before any comes again."""
+        """The next view, in random order, each once before any comes again."""
         table = self._table
         if not table.order:
             table.order = table.random.of_numpy.permutation(len(self._mapped)).tolist()
@@ -87,8 +87,8 @@ class FullTraining:
         return draw_batch([id], self._views, self._config, table.random.of_numpy)
 
     def _trained_lately(self, total: int) -> list[MapView]:
-        """The views around which the map may have changed in a training of so many steps: all, but
-        of more views than steps those that have been trained."""
+        """The views around which the map may have changed: all, or if there are more than steps,
+        those that have been trained."""
         if len(self._mapped) <= total:
             return self._mapped
         left = set(self._table.order)
@@ -98,8 +98,7 @@ class FullTraining:
 def seconds_per_step(
     table: MapTable, views: KeyframeViews, trainer: "MapTrainer", config: MappingConfig
 ) -> float:
-    """What a training step takes, from some of them at full rate: from more where these are
-    quick."""
+    """Seconds for a training step, measured on some at full rate, on more if these are quick."""
 
     def rehearse(steps: int) -> float:
         start = time.perf_counter()
@@ -108,7 +107,7 @@ def seconds_per_step(
         float(table.disks.position.detach().sum())  # waits for a GPU
         return time.perf_counter() - start
 
-    rehearse(2)  # makes ready what is needed but once
+    rehearse(2)  # warms up
     seconds = rehearse(_REHEARSED_STEPS)
     if seconds > _ENOUGH_SECONDS:
         return seconds / _REHEARSED_STEPS

@@ -1,4 +1,4 @@
-"""Which views take part in a step of training, and how far it goes."""
+"""Selection of the views of training steps, and learning rates."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,8 +12,7 @@ Batch = list[tuple[MapView, list[MapView]]]
 """The views of one step, each with the partners that check it by their images."""
 
 LR_QUATERNION, LR_SCALE, LR_OPACITY = 4e-3, 0.02, 0.05
-"""Adam steps of quaternions, log scales and opacity logits: how large a step is there depends on no
-scene, as for the position it does."""
+"""Adam steps of quaternions, log scales and opacity logits, which have no unit of length."""
 HISTORY = 2
 """Older keyframes drawn at random into each window, as in the paper, so that none is forgotten."""
 GRADIENT_LIMIT = 1e3
@@ -33,7 +32,7 @@ def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> L
 def draw_views(
     mapped: list[int], steps: int, config: MappingConfig, random: np.random.Generator
 ) -> list[list[int]]:
-    """Ids of the views of some training steps: from the recent window plus random older keyframes.
+    """Ids of the views of some training steps: of the recent window and random older keyframes.
 
     The older ones are drawn once for all steps, as they may have to be read from a file. With
     ``views_per_step`` 0 every step has the whole window and its history, as the paper sums them;

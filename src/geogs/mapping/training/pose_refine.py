@@ -1,4 +1,4 @@
-"""Pose-only refinement: the map stands still, the cameras move to agree with it (Eq. pose_loss)."""
+"""Pose-only refinement: poses are optimised against the fixed map (Eq. pose_loss)."""
 
 from collections.abc import Callable, Mapping
 
@@ -16,7 +16,7 @@ from geogs.splat.render import render
 from geogs.world.disks import DiskParameters, GaussianMap
 
 BETAS, EPSILON = (0.9, 0.999), 1e-8
-"""Of Adam: decay of both moments, and what is added to the root of the second."""
+"""Adam's decay of both moments, and the number added to the root of the second."""
 
 
 class TangentAdam:
@@ -48,7 +48,7 @@ Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
 def descend(
     start: Float[Tensor, "k 4 4"], config: MappingConfig, unit: float, evaluate: Evaluate
 ) -> Float[Tensor, "k 4 4"]:
-    """Poses of less loss near ``start``, the first of them fixed.
+    """Poses near ``start`` of less loss; the first is fixed.
 
     Adam on left perturbations [tau, phi], tau in units of the map's depth. The step with the least
     loss is returned; where no step lowered the loss the poses come back as they were.
@@ -107,7 +107,7 @@ def _pose_loss(
         output = render(disks, cameras.render, T_cw)
         total = total + fused_single_view(
             output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
-            view.known, loss_config, unit,
+            view.constants, loss_config, unit,
         )  # fmt: skip
         depth = output.shown_depth(MIN_ALPHA)
         for i in view.row.partners[:1]:

@@ -1,4 +1,4 @@
-"""One Adam step of the visible rows of a parameter, fused."""
+"""A fused Adam step of the visible rows of a parameter."""
 
 import math
 
@@ -18,7 +18,8 @@ def adam_rows(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """As :func:`geogs.splat.optimizer.adam_reference`, for float32 tensors on the CPU."""
+    """Step the visible rows in place by Adam, with bias ``corrections`` by each row's own count of
+    ``steps``; float32 on the CPU, as ``tests/oracles/adam_reference.py``."""
     n = len(p)
     width = p[0].numel() if n else 1
     x, g, m, v = (t.detach().reshape(n, width).numpy() for t in (p, grad, first, second))

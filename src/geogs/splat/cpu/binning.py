@@ -1,4 +1,4 @@
-"""Which tile sees which disks, in which order."""
+"""Lists of the disks in each tile, sorted by depth."""
 
 import math
 
@@ -6,21 +6,13 @@ import numba
 import numpy as np
 
 from geogs.kernel_parts import inlined
+from geogs.splat.cpu import layout as at
 from geogs.splat.cpu.layout import (
-    BLUR,
-    CENTER_X,
-    CENTER_Y,
-    HALF_X,
     MARGIN,
-    MIDDLE_X,
-    MIDDLE_Y,
     PER_DISK,
     ROWS_PER_RUN,
-    SIDE,
-    SLOPE,
     TILE_HEIGHT,
     TILE_WIDTH,
-    TOP,
 )
 
 DIGIT_BITS = 11
@@ -48,20 +40,20 @@ def sort_by_digit(keys, order, shift, starts, sorted_keys, sorted_order):
 def rows_within(outline, left, right):
     """Lowest and highest y of an outline's part with left <= x <= right."""
     lowest, highest = np.inf, -np.inf
-    middle_x, half_x = outline[MIDDLE_X], outline[HALF_X]
+    middle_x, half_x = outline[at.MIDDLE_X], outline[at.HALF_X]
     low, high = max(left - middle_x, -half_x), min(right - middle_x, half_x)
     if low <= high:
-        x = min(max(outline[TOP], low), high)
-        side = outline[SIDE] * math.sqrt(max(1 - x * x / (half_x * half_x), 0.0))
-        highest = outline[MIDDLE_Y] + outline[SLOPE] * x + side
-        x = min(max(-outline[TOP], low), high)
-        side = outline[SIDE] * math.sqrt(max(1 - x * x / (half_x * half_x), 0.0))
-        lowest = outline[MIDDLE_Y] + outline[SLOPE] * x - side
-    aside = max(left - outline[CENTER_X], outline[CENTER_X] - right, 0.0)
-    if aside < outline[BLUR]:
-        half = math.sqrt(outline[BLUR] * outline[BLUR] - aside * aside)
-        lowest = min(lowest, outline[CENTER_Y] - half)
-        highest = max(highest, outline[CENTER_Y] + half)
+        x = min(max(outline[at.TOP], low), high)
+        side = outline[at.SIDE] * math.sqrt(max(1 - x * x / (half_x * half_x), 0.0))
+        highest = outline[at.MIDDLE_Y] + outline[at.SLOPE] * x + side
+        x = min(max(-outline[at.TOP], low), high)
+        side = outline[at.SIDE] * math.sqrt(max(1 - x * x / (half_x * half_x), 0.0))
+        lowest = outline[at.MIDDLE_Y] + outline[at.SLOPE] * x - side
+    aside = max(left - outline[at.CENTER_X], outline[at.CENTER_X] - right, 0.0)
+    if aside < outline[at.BLUR]:
+        half = math.sqrt(outline[at.BLUR] * outline[at.BLUR] - aside * aside)
+        lowest = min(lowest, outline[at.CENTER_Y] - half)
+        highest = max(highest, outline[at.CENTER_Y] + half)
     return lowest - MARGIN, highest + MARGIN
 
 

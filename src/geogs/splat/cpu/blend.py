@@ -4,6 +4,7 @@ import numba
 import numpy as np
 
 from geogs.kernel_parts import inlined
+from geogs.splat.cpu import layout as at
 from geogs.splat.cpu.layout import (
     HALF,
     LANES,
@@ -11,31 +12,13 @@ from geogs.splat.cpu.layout import (
     MIN_ALPHA,
     MIN_HIT_RATIO,
     MIN_TRANSMITTANCE,
-    MX,
-    MY,
-    NX,
-    NY,
-    NZ,
     ONE,
-    OPACITY,
     PER_PIXEL,
     PLANE,
-    SAVED_LAST,
-    SAVED_LIGHT,
-    SAVED_MOMENT,
     TILE_HEIGHT,
     TILE_PIXELS,
     TILE_WIDTH,
     TWO,
-    UX,
-    UY,
-    VX,
-    VY,
-    WC,
-    WX,
-    WY,
-    Z_FURTHEST,
-    Z_NEAREST,
     ZERO,
     exp_minus,
 )
@@ -56,7 +39,7 @@ CHECK_EVERY = 16
 @numba.njit(**_PART)
 def reference_depth(records, lists, first, last):
     """Depth from which a tile's sums are measured, to keep their digits: the middle disk's."""
-    return ONE / records[lists[(first + last) // 2], WC]
+    return ONE / records[lists[(first + last) // 2], at.WC]
 
 
 @numba.njit(**_PART)
@@ -74,10 +57,10 @@ def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
     one, each pixel would have so long a chain of results to wait for that the processor would wait,
     too.
     """
-    mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
-    ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
-    nx, ny, nz = r[NX], r[NY], r[NZ]
-    nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
+    mx, my, opacity, wc = r[at.MX], r[at.MY], r[at.OPACITY], r[at.WC]
+    ux, uy, vx, vy, wx, wy = r[at.UX], r[at.UY], r[at.VX], r[at.VY], r[at.WX], r[at.WY]
+    nx, ny, nz = r[at.NX], r[at.NY], r[at.NZ]
+    nearest, furthest = r[at.Z_NEAREST], r[at.Z_FURTHEST]
     least = wc * MIN_HIT_RATIO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
@@ -187,6 +170,6 @@ def blend_tiles(
         if saved.shape[0] > 0:
             for j in range(TILE_PIXELS):
                 k = np.uint64(j)
-                saved[tile, SAVED_LIGHT, j] = abs(state[_LIGHT + k])
-                saved[tile, SAVED_MOMENT, j] = state[_MOMENT + k]
-                saved[tile, SAVED_LAST, j] = state[_LAST + k]
+                saved[tile, at.SAVED_LIGHT, j] = abs(state[_LIGHT + k])
+                saved[tile, at.SAVED_MOMENT, j] = state[_MOMENT + k]
+                saved[tile, at.SAVED_LAST, j] = state[_LAST + k]

@@ -4,53 +4,20 @@ import numba
 import numpy as np
 
 from geogs.kernel_parts import inlined
+from geogs.splat.cpu import layout as at
 from geogs.splat.cpu.blend import CHECK_EVERY, common_runs, reference_depth
 from geogs.splat.cpu.layout import (
-    G_CLAMPED,
-    G_MX,
-    G_MY,
-    G_NX,
-    G_NY,
-    G_NZ,
-    G_OPACITY,
-    G_U,
-    G_UX,
-    G_UY,
-    G_V,
-    G_VX,
-    G_VY,
-    G_W,
-    G_WX,
-    G_WY,
     LANES,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_HIT_RATIO,
-    MX,
-    MY,
-    NX,
-    NY,
-    NZ,
     ONE,
-    OPACITY,
     PER_PIXEL,
     PLANE,
-    SAVED_LAST,
-    SAVED_LIGHT,
-    SAVED_MOMENT,
     TILE_HEIGHT,
     TILE_PIXELS,
     TILE_WIDTH,
     TWO,
-    UX,
-    UY,
-    VX,
-    VY,
-    WC,
-    WX,
-    WY,
-    Z_FURTHEST,
-    Z_NEAREST,
     ZERO,
     exp_minus,
 )
@@ -74,9 +41,9 @@ def meet_disk(state, first, last, r, rank, inverse_near):
     plane and else 0; and where the Gaussian is that of the plane, z u in U, z v in V and z rho in
     BEND, else 0, and 1 in BLUR.
     """
-    mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
-    ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
-    nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
+    mx, my, opacity, wc = r[at.MX], r[at.MY], r[at.OPACITY], r[at.WC]
+    ux, uy, vx, vy, wx, wy = r[at.UX], r[at.UY], r[at.VX], r[at.VY], r[at.WX], r[at.WY]
+    nearest, furthest = r[at.Z_NEAREST], r[at.Z_FURTHEST]
     least = wc * MIN_HIT_RATIO
     for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
@@ -114,8 +81,8 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
     processor would wait, too.
     """
     meet_disk(state, first, last, r, rank, inverse_near)
-    mx, my, opacity = r[MX], r[MY], r[OPACITY]
-    nx, ny, nz = r[NX], r[NY], r[NZ]
+    mx, my, opacity = r[at.MX], r[at.MY], r[at.OPACITY]
+    nx, ny, nz = r[at.NX], r[at.NY], r[at.NZ]
     s_u = s_ux = s_uy = s_v = s_vx = s_vy = s_w = s_wx = s_wy = ZERO
     s_clamped = s_mx = s_my = s_opacity = s_nx = s_ny = s_nz = ZERO
     for j in range(first * _RUN, last * _RUN):
@@ -162,10 +129,11 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         s_nx += weight * h_x
         s_ny += weight * h_y
         s_nz += weight * h_z
-    g[G_U], g[G_UX], g[G_UY], g[G_V], g[G_VX], g[G_VY] = s_u, s_ux, s_uy, s_v, s_vx, s_vy
-    g[G_W], g[G_WX], g[G_WY], g[G_CLAMPED] = s_w, s_wx, s_wy, s_clamped
-    g[G_MX], g[G_MY], g[G_OPACITY] = s_mx, s_my, s_opacity / opacity
-    g[G_NX], g[G_NY], g[G_NZ] = s_nx, s_ny, s_nz
+    g[at.G_U], g[at.G_UX], g[at.G_UY] = s_u, s_ux, s_uy
+    g[at.G_V], g[at.G_VX], g[at.G_VY] = s_v, s_vx, s_vy
+    g[at.G_W], g[at.G_WX], g[at.G_WY], g[at.G_CLAMPED] = s_w, s_wx, s_wy, s_clamped
+    g[at.G_MX], g[at.G_MY], g[at.G_OPACITY] = s_mx, s_my, s_opacity / opacity
+    g[at.G_NX], g[at.G_NY], g[at.G_NZ] = s_nx, s_ny, s_nz
 
 
 @numba.njit(**_PART)
@@ -182,9 +150,9 @@ def load_state(state, saved, left, top, d_depth, d_normal, d_alpha, d_distortion
             j = np.uint64(row * TILE_WIDTH + col)
             x, y = left + col, top + row
             state[_X + j], state[_Y + j] = x, y
-            state[_LIGHT + j] = saved[SAVED_LIGHT, row * TILE_WIDTH + col]
-            state[_MOMENT + j] = saved[SAVED_MOMENT, row * TILE_WIDTH + col]
-            state[_LAST + j] = saved[SAVED_LAST, row * TILE_WIDTH + col]
+            state[_LIGHT + j] = saved[at.SAVED_LIGHT, row * TILE_WIDTH + col]
+            state[_MOMENT + j] = saved[at.SAVED_MOMENT, row * TILE_WIDTH + col]
+            state[_LAST + j] = saved[at.SAVED_LAST, row * TILE_WIDTH + col]
             if (x < width) & (y < height) & (state[_LAST + j] > ZERO):
                 total = ONE - state[_LIGHT + j]
                 d_z = d_depth[y, x] / total

@@ -1,4 +1,4 @@
-"""Which disks some cameras may see at all: a quick test that errs on the side of seeing."""
+"""Conservative frustum test of disks against some cameras."""
 
 import numba
 import numpy as np

@@ -1,4 +1,4 @@
-"""What the kernels share: layouts, constants, compiler options and an exponential.
+"""Layouts, constants, compiler options and an exponential, shared by the kernels.
 
 A disk's *record* holds what a pixel needs to know about it, in float32. With (dx, dy) the pixel's
 offset from the projected centre, the plane's inverse depth is w = Wx dx + Wy dy + Wc and the hit's

@@ -20,10 +20,10 @@ def rendered(
     near: float,
     with_trace: bool,
 ) -> tuple[tuple[Tensor, ...], Backward]:
-    """Maps of one pose, as a ``RenderOutput`` has them, and what takes their gradients back.
+    """Maps of one pose, as in ``RenderOutput``, and their backward pass.
 
-    That gives the gradients of the disks and, float64, of the pose; it takes those of depth,
-    normal, alpha and distortion, None for zero. It may be asked again, but not without trace.
+    It takes the gradients of depth, normal, alpha and distortion, None for zero, and gives those of
+    the disks and, float64, of the pose. It may be called again, but not without trace.
     """
     x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
     pose, threads = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy(), worker_count()

@@ -10,40 +10,16 @@ import numba
 import numpy as np
 
 from geogs.kernel_parts import inlined
+from geogs.splat.cpu import layout as at
 from geogs.splat.cpu.layout import (
-    BLUR,
-    CENTER_X,
-    CENTER_Y,
-    HALF_X,
-    HALF_Y,
     MARGIN,
     MAX_LOG_SCALE,
     MAX_REACH_RATIO,
-    MIDDLE_X,
-    MIDDLE_Y,
     MIN_ALPHA,
     MIN_FACING,
-    MX,
-    MY,
-    NX,
-    NY,
-    NZ,
-    OPACITY,
     PER_DISK,
-    SIDE,
-    SLOPE,
     TILE_HEIGHT,
     TILE_WIDTH,
-    TOP,
-    UX,
-    UY,
-    VX,
-    VY,
-    WC,
-    WX,
-    WY,
-    Z_FURTHEST,
-    Z_NEAREST,
 )
 
 _PART = inlined(PER_DISK)
@@ -127,10 +103,10 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     """
     fx, fy = intrinsics[0], intrinsics[1]
     radius2 = 2 * math.log(opacity / MIN_ALPHA)
-    outline[CENTER_X], outline[CENTER_Y], outline[BLUR] = mx, my, math.sqrt(radius2 / 2)
+    outline[at.CENTER_X], outline[at.CENTER_Y], outline[at.BLUR] = mx, my, math.sqrt(radius2 / 2)
     d = radius2 * (u[2] * u[2] + v[2] * v[2]) - c[2] * c[2]
     if d > -1e-6 * c[2] * c[2]:
-        outline[BLUR], outline[MIDDLE_X], outline[HALF_X] = np.inf, mx, -1
+        outline[at.BLUR], outline[at.MIDDLE_X], outline[at.HALF_X] = np.inf, mx, -1
         return False
     x, y = c[0] / c[2], c[1] / c[2]
     ux, vx = fx * (u[0] - x * u[2]), fx * (v[0] - x * v[2])
@@ -140,21 +116,21 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     xx = max(ox * ox - k * (ux * ux + vx * vx), 1e-6)
     yy = max(oy * oy - k * (uy * uy + vy * vy), 1e-6)
     xy = ox * oy - k * (ux * uy + vx * vy)
-    outline[MIDDLE_X], outline[MIDDLE_Y] = mx + ox, my + oy
-    outline[HALF_X], outline[HALF_Y] = math.sqrt(xx), math.sqrt(yy)
-    outline[SLOPE], outline[SIDE] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
-    outline[TOP] = xy / outline[HALF_Y]
+    outline[at.MIDDLE_X], outline[at.MIDDLE_Y] = mx + ox, my + oy
+    outline[at.HALF_X], outline[at.HALF_Y] = math.sqrt(xx), math.sqrt(yy)
+    outline[at.SLOPE], outline[at.SIDE] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
+    outline[at.TOP] = xy / outline[at.HALF_Y]
     return True
 
 
 @numba.njit(**_PART)
 def box_of(outline, width, height):
     """Pixels (x0, x1, y0, y1) within an outline."""
-    x, y, blur = outline[CENTER_X], outline[CENTER_Y], outline[BLUR]
-    left, right = outline[MIDDLE_X] - outline[HALF_X], outline[MIDDLE_X] + outline[HALF_X]
-    top, bottom = outline[MIDDLE_Y] - outline[HALF_Y], outline[MIDDLE_Y] + outline[HALF_Y]
-    x0, x1 = pixel_range(min(left, x - blur), max(right, x + blur), width)
-    y0, y1 = pixel_range(min(top, y - blur), max(bottom, y + blur), height)
+    x, y, blur = outline[at.CENTER_X], outline[at.CENTER_Y], outline[at.BLUR]
+    middle, half = outline[at.MIDDLE_X], outline[at.HALF_X]
+    x0, x1 = pixel_range(min(middle - half, x - blur), max(middle + half, x + blur), width)
+    middle, half = outline[at.MIDDLE_Y], outline[at.HALF_Y]
+    y0, y1 = pixel_range(min(middle - half, y - blur), max(middle + half, y + blur), height)
     return x0, x1, y0, y1
 
 
@@ -212,10 +188,10 @@ def project_disks(
         reach = 3 * math.sqrt(u[2] * u[2] + v[2] * v[2])
         away = -1.0 if facing > 0 else 1.0
         r = records[i]
-        r[MX], r[MY], r[OPACITY] = mx, my, opacity
-        r[UX], r[UY] = ku * (a[0] - ac * ex) / fx, ku * (a[1] - ac * ey) / fy
-        r[VX], r[VY] = kv * (b[0] - bc * ex) / fx, kv * (b[1] - bc * ey) / fy
-        r[WX], r[WY], r[WC] = ex / fx, ey / fy, 1 / c[2]
-        r[NX], r[NY], r[NZ] = away * n[0], away * n[1], away * n[2]
-        r[Z_NEAREST] = c[2] - min(reach, c[2] - near)
-        r[Z_FURTHEST] = c[2] + min(reach, MAX_REACH_RATIO * c[2])
+        r[at.MX], r[at.MY], r[at.OPACITY] = mx, my, opacity
+        r[at.UX], r[at.UY] = ku * (a[0] - ac * ex) / fx, ku * (a[1] - ac * ey) / fy
+        r[at.VX], r[at.VY] = kv * (b[0] - bc * ex) / fx, kv * (b[1] - bc * ey) / fy
+        r[at.WX], r[at.WY], r[at.WC] = ex / fx, ey / fy, 1 / c[2]
+        r[at.NX], r[at.NY], r[at.NZ] = away * n[0], away * n[1], away * n[2]
+        r[at.Z_NEAREST] = c[2] - min(reach, c[2] - near)
+        r[at.Z_FURTHEST] = c[2] + min(reach, MAX_REACH_RATIO * c[2])

@@ -6,31 +6,9 @@ import numba
 import numpy as np
 
 from geogs.kernel_parts import inlined
+from geogs.splat.cpu import layout as at
 from geogs.splat.cpu.layout import (
-    G_CLAMPED,
-    G_MX,
-    G_MY,
-    G_NX,
-    G_NY,
-    G_NZ,
-    G_OPACITY,
-    G_U,
-    G_UX,
-    G_UY,
-    G_V,
-    G_VX,
-    G_VY,
-    G_W,
-    G_WX,
-    G_WY,
-    OPACITY,
     PER_DISK,
-    UX,
-    UY,
-    VX,
-    VY,
-    WX,
-    WY,
 )
 from geogs.splat.cpu.project import axes_of, bounded_facing, dot, place, rotate, unit_quaternion
 
@@ -86,9 +64,10 @@ def record_backward(record, g, axes, c, ku, kv, intrinsics):
     h = 1 / facing
     ac, bc = dot(a, c), dot(b, c)
     # With e = n / (n . c): u = ku (a - (a . c) e) / f, v = kv (b - (b . c) e) / f, w = e / f.
-    pu, pv = (ku * g[G_UX] / fx, ku * g[G_UY] / fy), (kv * g[G_VX] / fx, kv * g[G_VY] / fy)
-    g_ex = g[G_WX] / fx - ac * pu[0] - bc * pv[0]
-    g_ey = g[G_WY] / fy - ac * pu[1] - bc * pv[1]
+    pu = ku * g[at.G_UX] / fx, ku * g[at.G_UY] / fy
+    pv = kv * g[at.G_VX] / fx, kv * g[at.G_VY] / fy
+    g_ex = g[at.G_WX] / fx - ac * pu[0] - bc * pv[0]
+    g_ey = g[at.G_WY] / fy - ac * pu[1] - bc * pv[1]
     g_ac = -h * (pu[0] * n[0] + pu[1] * n[1])
     g_bc = -h * (pv[0] * n[0] + pv[1] * n[1])
     g_facing = 0.0 if is_bounded else -h * h * (g_ex * n[0] + g_ey * n[1])
@@ -96,22 +75,22 @@ def record_backward(record, g, axes, c, ku, kv, intrinsics):
     g_a = (pu[0] + g_ac * c[0], pu[1] + g_ac * c[1], g_ac * c[2])
     g_b = (pv[0] + g_bc * c[0], pv[1] + g_bc * c[1], g_bc * c[2])
     g_n = (
-        h * g_ex + g_facing * c[0] + away * g[G_NX],
-        h * g_ey + g_facing * c[1] + away * g[G_NY],
-        g_facing * c[2] + away * g[G_NZ],
+        h * g_ex + g_facing * c[0] + away * g[at.G_NX],
+        h * g_ey + g_facing * c[1] + away * g[at.G_NY],
+        g_facing * c[2] + away * g[at.G_NZ],
     )
     # A pixel's offset is its position minus the projected centre, and enters u, v, w and rho2.
-    g_mx = fx * (g[G_MX] - g[G_U] * record[UX] - g[G_V] * record[VX] - g[G_W] * record[WX])
-    g_my = fy * (g[G_MY] - g[G_U] * record[UY] - g[G_V] * record[VY] - g[G_W] * record[WY])
-    # G_W is the sum for w where the plane gave the depth; where the depth was held at a constant
+    g_u, g_v, g_w = g[at.G_U], g[at.G_V], g[at.G_W]
+    g_mx = fx * (g[at.G_MX] - g_u * record[at.UX] - g_v * record[at.VX] - g_w * record[at.WX])
+    g_my = fy * (g[at.G_MY] - g_u * record[at.UY] - g_v * record[at.VY] - g_w * record[at.WY])
+    # g_w is the sum for w where the plane gave the depth; where the depth was clamped to a constant
     # distance from the centre, G_CLAMPED goes to c_z directly.
-    g_wc = g[G_W]
     x, y, inverse_z = c[0] / c[2], c[1] / c[2], 1 / c[2]
     g_c = (
         g_ac * a[0] + g_bc * b[0] + g_facing * n[0] + g_mx * inverse_z,
         g_ac * a[1] + g_bc * b[1] + g_facing * n[1] + g_my * inverse_z,
-        g_ac * a[2] + g_bc * b[2] + g_facing * n[2] + g[G_CLAMPED]
-        - (g_mx * x + g_my * y + g_wc * inverse_z) * inverse_z,
+        g_ac * a[2] + g_bc * b[2] + g_facing * n[2] + g[at.G_CLAMPED]
+        - (g_mx * x + g_my * y + g_w * inverse_z) * inverse_z,
     )  # fmt: skip
     return g_a, g_b, g_n, g_c
 
@@ -151,10 +130,10 @@ def project_disks_backward(
         ku = _SQRT_HALF * math.exp(-np.float64(log_scale[i, 0]))
         kv = _SQRT_HALF * math.exp(-np.float64(log_scale[i, 1]))
         g_a, g_b, g_n, g_c = record_backward(r, g, axes, c, ku, kv, intrinsics)
-        d_log_scale[i, 0] = -(g[G_UX] * r[UX] + g[G_UY] * r[UY])
-        d_log_scale[i, 1] = -(g[G_VX] * r[VX] + g[G_VY] * r[VY])
-        opacity = np.float64(r[OPACITY])
-        d_opacity_logit[i] = g[G_OPACITY] * opacity * (1 - opacity)
+        d_log_scale[i, 0] = -(g[at.G_UX] * r[at.UX] + g[at.G_UY] * r[at.UY])
+        d_log_scale[i, 1] = -(g[at.G_VX] * r[at.VX] + g[at.G_VY] * r[at.VY])
+        opacity = np.float64(r[at.OPACITY])
+        d_opacity_logit[i] = g[at.G_OPACITY] * opacity * (1 - opacity)
         world = rotate_back(T, g_c)
         d_position[i, 0], d_position[i, 1], d_position[i, 2] = world
         columns = rotate_back(T, g_a), rotate_back(T, g_b), rotate_back(T, g_n)

@@ -54,7 +54,7 @@ class TileLists:
 
 @dataclass(slots=True)
 class Trace:
-    """What a forward pass leaves for its backward pass; no other pass writes to it."""
+    """State that a forward pass leaves for its backward pass alone."""
 
     parameters: Arrays
     T_cw: np.ndarray

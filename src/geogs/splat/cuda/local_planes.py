@@ -1,4 +1,4 @@
-"""Planes through neighbourhoods of points, by a kernel: no host in between, no batched eigh."""
+"""Planes through neighbourhoods of points, by one kernel without the host or a batched eigh."""
 
 from pathlib import Path
 

@@ -16,12 +16,12 @@ from geogs.splat.protocols import Backward
 from geogs.world.disks import DiskParameters
 
 _KEPT = 4
-"""Rasterizers at rest; those used longest ago are dropped."""
+"""Idle rasterizers that are kept; the least recently used are dropped."""
 
 
 @dataclass(frozen=True)
 class _Key:
-    """What two renderings must share to use the same buffers one after the other."""
+    """Properties of a rendering by which its buffers can be used again."""
 
     disks: int
     views: int
@@ -33,7 +33,7 @@ class _Key:
 
 @dataclass
 class RasterizerPool:
-    """Lends rasterizers; each comes back when its loan is given up."""
+    """Lends rasterizers; each returns when its loan is deleted."""
 
     _resting: deque[tuple[_Key, Rasterizer]] = field(default_factory=lambda: deque(maxlen=_KEPT))
 
@@ -81,16 +81,15 @@ def rendered(
     near: float,
     with_trace: bool,
 ) -> tuple[tuple[Tensor, ...], Backward]:
-    """Maps of one pose or of several, as a ``RenderOutput`` has them, on the GPU that holds the
-    disks, and what takes their gradients back.
+    """Maps of one pose or of several, as in ``RenderOutput``, on the GPU that holds the disks, and
+    their backward pass.
 
-    That gives the gradients of the disks and, float64 on their device, of the poses; it takes those
-    of depth, normal (components last), alpha and distortion, None for zero, but not all of them. It
-    may be asked again, but not without trace; until it is gone its rasterizer serves no other.
+    It takes the gradients of depth, normal (components last), alpha and distortion, None for zero,
+    but not all None, and gives those of the disks and, float64 on their device, of the poses. It
+    may be called again, but not without trace; it keeps its rasterizer as long as it exists.
 
-    The compositing is launched on the guess that the list entries fit where the last ones did, and
-    once more if they do not: that is known as soon as the projection is done, while the GPU goes
-    on.
+    The compositing is launched before it is known whether the list entries fit, and once more if
+    they do not: that is known as soon as the projection is done, while the GPU goes on.
     """
     device, n = disks.position.device, len(disks.position)
     disks = DiskParameters(*(p.detach().contiguous() for p in disks))

@@ -1,4 +1,4 @@
-"""The keyframes that losses on a GPU know."""
+"""Keyframes of the losses on a GPU."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.single_view import ViewConstants
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.lru import LruCache
@@ -16,16 +17,16 @@ from geogs.world.lru import LruCache
 class KnownViews:
     """The keyframes' images, constants and poses on the GPU, brought up to date on demand.
 
-    At most ``resident`` of them, unless more are asked for at once: the one not used for longest
-    gives its slot away, and has to be rendered again before it hides anything.
+    At most ``resident`` of them, unless more are asked for at once. The least recently used gives
+    its slot away, and with it its rendered depth.
     """
 
     def __init__(self, cameras: MapCameras, device: torch.device, resident: int) -> None:
         self.table = ViewTable(cameras.render, cameras.photo, device)
         self._slots: LruCache[int, int] = LruCache(resident, self._free)
         self._unused: list[int] = []
-        """Slots whose views had to go."""
-        self._constants: dict[int, object] = {}
+        """Slots given away."""
+        self._constants: dict[int, ViewConstants] = {}
         self._poses: dict[int, Tensor] = {}
 
     def slots(self, views: Sequence[MapView]) -> list[int]:
@@ -34,7 +35,7 @@ class KnownViews:
         for view in views:
             constants, is_new = view.constants, view.id not in self._slots
             slot = self._slots.get(view.id, partial(self._new_slot, view), wanted)
-            if not is_new and constants is not None and self._constants[view.id] is not constants:
+            if not is_new and self._constants[view.id] is not constants:
                 self.table.set_constants(slot, constants)
             slots.append(slot)
             self._constants[view.id] = constants
@@ -46,7 +47,7 @@ class KnownViews:
         return slots
 
     def _new_slot(self, view: MapView) -> int:
-        """A slot that now stands for the view."""
+        """A slot that now holds the view."""
         if not self._unused:
             return self.table.add(view.constants, view.photo)
         slot = self._unused.pop()

@@ -19,7 +19,7 @@ from geogs.mapping.training.cuda.window_pass import WindowPass
 from geogs.mapping.training.map_trainer import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.view_arrays import MapCameras
 from geogs.splat.cuda import rasterize
-from geogs.splat.optimizer import BETAS, EPSILON, MapOptimizer
+from geogs.splat.optimizer import BETAS, EPSILON
 from geogs.world.disks import GaussianMap
 
 _ADAM = Path(rasterize.__file__).with_name("adam.cu")
@@ -28,9 +28,9 @@ _ADAM = Path(rasterize.__file__).with_name("adam.cu")
 class CudaTrainer:
     """As :class:`geogs.mapping.training.cpu.CpuTrainer`; the map never leaves the GPU.
 
-    The views of every step and the factors of the learning rates are uploaded once per call; the
-    steps themselves, from the rendering to Adam, are one CUDA graph that reads its row of that
-    schedule. A step whose list entries find no room changes nothing and is done again with more.
+    The views of every step and the factors of the learning rates are uploaded once per call; a
+    step, from the rendering to Adam, is one CUDA graph that reads its row of that schedule. A step
+    whose lists are too small changes nothing and is repeated with larger ones.
     """
 
     def __init__(
@@ -42,7 +42,6 @@ class CudaTrainer:
         resident: int,
     ) -> None:
         self.disks, self.cameras, self.config, self.unit = disks, cameras, config, unit
-        self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
         self.known = KnownViews(cameras, disks.device, resident)
         self._programs: dict[tuple[int, int], _TrainingStep] = {}
         self._pose_pass: WindowPass | None = None
@@ -86,7 +85,7 @@ class CudaTrainer:
         return refine_poses(self.disks, active, views, self.known, window, config, self.unit)
 
     def forget_renders(self, views: Iterable[MapView]) -> None:
-        """What the views showed of the map counts no more: it was moved."""
+        """Discard the rendered depths of all views, as the map was moved."""
         self.known.table.forget_rendered()
 
     def _program(self, views: int, partners: int) -> "_TrainingStep":
@@ -136,7 +135,7 @@ class _TrainingStep:
         self._schedule[: len(rows)] = to_device(torch.from_numpy(rows), self._device)
         scale = torch.as_tensor(np.asarray(factors, np.float32))
         self._factors[: len(rows)] = to_device(scale, self._device)
-        rates = torch.tensor(self._trainer.optimizer.learning_rates)
+        rates = torch.tensor(learning_rates(self._trainer.config, self._trainer.unit))
         self._base.copy_(to_device(rates, self._device))
         self._count.fill_(len(self._trainer.disks))
         self._completed.zero_()
@@ -151,7 +150,7 @@ class _TrainingStep:
         if self._graph is not None:
             self._graph.replay()
             return
-        self._launch()  # the first step of its kind also loads what it needs
+        self._launch()  # the first step of its kind also loads the kernels
         if self._device.type == "cuda":
             with recording(self._device) as graph:
                 self._launch()

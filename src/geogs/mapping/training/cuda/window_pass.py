@@ -33,7 +33,7 @@ class WindowPass:
         for_poses: bool = False,
         fresh: bool = False,
     ) -> None:
-        """``fresh`` renders all partners first, for the occlusion tests of the same pass."""
+        """``fresh`` renders all partners first, for the occlusion tests of this pass."""
         device = table.device
         self.table, self.views, self.capacity = table, views, capacity
         self._generation = table.generation
@@ -52,7 +52,7 @@ class WindowPass:
         self._partners: tuple[Rasterizer, Maps] | None = None
         if fresh and partners > 0:
             shown = Rasterizer(capacity, views * partners, camera, NEAR, device)
-            shown.status = self.rasterizer.status  # both have room, or neither counts
+            shown.status = self.rasterizer.status  # neither counts unless both have room
             self._partners = shown, Maps.empty(camera, (views * partners,), capacity, device)
         self.loss: Float[Tensor, "b"] = torch.zeros(views, device=device)
         sizes = ((3,), (4,), (2,), ())

@@ -1,4 +1,4 @@
-"""The completion of ``completion.py`` and the evidence drawn from it on a GPU."""
+"""The completion of ``grid_completion.py`` and the evidence drawn from it on a GPU."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from geogs.depth import completion, evidence
+from geogs.depth import evidence, grid_completion
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import upload
 
@@ -18,7 +18,7 @@ _PANEL = 8
 
 
 def _window(minors: int) -> int:
-    """Rows of the band matrix that are in work at a time, for lines of so many cells."""
+    """Rows of the band matrix worked on at a time, for lines of so many cells."""
     return -(-2 * minors // _PANEL) * _PANEL + _PANEL
 
 
@@ -65,9 +65,9 @@ def complete(
 class CompletionSettings(NamedTuple):
     """The struct of this name in ``completion.cu``."""
 
-    sigma_scale: float = completion.DEVIATION_SCALE
-    bending: float = completion.BENDING
-    membrane: float = completion.MEMBRANE
+    sigma_scale: float = grid_completion.DEVIATION_SCALE
+    bending: float = grid_completion.BENDING
+    membrane: float = grid_completion.MEMBRANE
     sure_deviation: float = evidence.CONFIDENT_DEVIATION
     tracker_scale: float = evidence.TRACKER_SCALE
     unknown_deviation: float = evidence.UNKNOWN_DEVIATION

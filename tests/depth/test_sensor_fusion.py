@@ -1,4 +1,4 @@
-"""Searched and measured depth made one."""
+"""The fusion of searched and measured depth."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geogs.depth.depth_view import DenseDepth
-from geogs.depth.sensor import joined
+from geogs.depth.sensor_fusion import fused_with_sensor
 
 
 def searched(depth: float, confidence: float) -> DenseDepth:
@@ -26,7 +26,7 @@ def measured(depth: float, deviation: float) -> tuple[torch.Tensor, torch.Tensor
 
 
 def test_where_nothing_was_measured_the_search_stands():
-    found = joined(searched(2.0, 0.7), *measured(3.0, 0.005))
+    found = fused_with_sensor(searched(2.0, 0.7), *measured(3.0, 0.005))
     assert (found.depth[:, 0] == 2.0).all()
     assert (found.confidence[:, 0] == 0.7).all()
 
@@ -34,7 +34,7 @@ def test_where_nothing_was_measured_the_search_stands():
 def test_what_agrees_is_averaged_by_variances():
     # A confidence of 0.5 is that of the deviation whose errors are below 2 % half of the time.
     theirs = 0.02 / 0.6745
-    found = joined(searched(2.02, 0.5), *measured(2.0, 0.01))
+    found = fused_with_sensor(searched(2.02, 0.5), *measured(2.0, 0.01))
     share = 0.01**2 / (0.01**2 + theirs**2)
     assert float(found.depth[0, 1]) == pytest.approx(2.0 + share * 0.02, rel=1e-4)
     deviation = 1 / math.hypot(1 / 0.01, 1 / theirs)
@@ -43,13 +43,13 @@ def test_what_agrees_is_averaged_by_variances():
 
 
 def test_a_search_that_is_far_off_is_left():
-    found = joined(searched(3.0, 0.9), *measured(2.0, 0.01))
+    found = fused_with_sensor(searched(3.0, 0.9), *measured(2.0, 0.01))
     assert (found.depth[:, 1:] == 2.0).all()
     assert float(found.median) == 2.0
 
 
 def test_unsure_measurements_say_so():
-    found = joined(searched(2.0, 0.01), *measured(2.0, 0.05))
+    found = fused_with_sensor(searched(2.0, 0.01), *measured(2.0, 0.05))
     assert float(found.confidence[0, 1]) == pytest.approx(math.erf(0.02 / 0.05 / 2**0.5), rel=0.02)
-    sure = joined(searched(2.0, 0.01), *measured(2.0, 0.001))
+    sure = fused_with_sensor(searched(2.0, 0.01), *measured(2.0, 0.001))
     assert float(sure.confidence[0, 1]) == pytest.approx(0.98)

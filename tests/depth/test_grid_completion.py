@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from geogs.depth.completion import (
+from geogs.depth.grid_completion import (
     BENDING,
     MEMBRANE,
     _smoothness_bands,

@@ -1,4 +1,4 @@
-"""The tracker's sparse, unevenly certain inverse depth, completed on its own grid."""
+"""Completion of the tracker's sparse, unevenly certain inverse depth on its own grid."""
 
 import functools
 from dataclasses import dataclass
@@ -14,10 +14,9 @@ from geogs.world.grid import OFFSET, STRIDE
 DEVIATION_SCALE = 0.14
 """Real over expected deviation of the tracker's inverse depth, as measured on rendered rooms."""
 BENDING = 0.02
-"""Second difference of inverse depth per cell, over its median, that is usual."""
+"""Usual second difference of inverse depth per cell, over its median."""
 MEMBRANE = 0.3
-"""First difference of inverse depth per cell, over its median, that is usual: weak, as slanted
-surfaces are not flat."""
+"""Usual first difference of inverse depth per cell, over its median: large for slanted surfaces."""
 EDGE_SHARPNESS = 48.0
 """How fast smoothness falls with the image gradient (Lab, 0 to 1 per pixel)."""
 
@@ -83,7 +82,7 @@ def complete_grid(
 def known_cells(
     inverse_depth: Float32[np.ndarray, "gh gw"], information: Float32[np.ndarray, "gh gw"]
 ) -> Bool[np.ndarray, "gh gw"]:
-    """Cells of which the tracker knows something."""
+    """Cells whose depth the tracker knows."""
     known = np.isfinite(inverse_depth) & (inverse_depth > 1e-6)
     return known & np.isfinite(information) & (information > 0)
 

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
-from geogs.losses import light
-from geogs.losses.light import (
+from geogs.losses import exposure
+from geogs.losses.exposure import (
     LEAST_NOISE,
     USUAL_NOISE,
-    fitted_on_gpu,
     noise_between,
-    relative_light,
+    relative_exposure,
+    relative_exposure_on_gpu,
 )
 
 GPU = pytest.param(
@@ -37,7 +37,7 @@ def test_hidden_surfaces_do_not_count(gain, offset):
     grey = values(random)
     other = gain * grey + offset + noise(random)
     other[:700] = values(random, 700)  # what hides the surface has grey values of its own
-    found = relative_light(grey + noise(random), other, torch.ones(2000, dtype=torch.bool))
+    found = relative_exposure(grey + noise(random), other, torch.ones(2000, dtype=torch.bool))
     assert found.tolist() == pytest.approx([gain, offset], abs=0.02)
 
 
@@ -47,7 +47,7 @@ def test_noise_is_no_gain_along_a_chain():
     true, gain = values(random), 1.0
     for _ in range(20):
         here, there = true + noise(random), true + noise(random)
-        gain *= float(relative_light(here, there, torch.ones(2000, dtype=torch.bool))[0])
+        gain *= float(relative_exposure(here, there, torch.ones(2000, dtype=torch.bool))[0])
     assert gain == pytest.approx(1.0, abs=0.02)
 
 
@@ -55,7 +55,7 @@ def test_a_bare_wall_tells_brightness_only():
     random = np.random.default_rng(2)
     wall = torch.full((2000,), 0.7)
     usable = torch.ones(2000, dtype=torch.bool)
-    found = relative_light(wall + noise(random), wall - 0.1 + noise(random), usable)
+    found = relative_exposure(wall + noise(random), wall - 0.1 + noise(random), usable)
     assert float(found[0]) == pytest.approx(1.0, abs=0.05)
     assert float(found[0]) * 0.7 + float(found[1]) == pytest.approx(0.6, abs=2e-3)
 
@@ -64,22 +64,22 @@ def test_too_few_pixels_say_nothing():
     grey = values(np.random.default_rng(3))
     usable = torch.zeros(2000, dtype=torch.bool)
     usable[:40] = True
-    assert relative_light(grey, 0.5 * grey, usable).tolist() == [1.0, 0.0]
+    assert relative_exposure(grey, 0.5 * grey, usable).tolist() == [1.0, 0.0]
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
 @pytest.mark.parametrize("usable", [0.9, 0.2, 0.01, 0.0])
 def test_the_kernel_fits_what_pytorch_fits(device, usable, monkeypatch):
     if device == "cpu":
-        use_emulator(monkeypatch, light)
-        monkeypatch.setattr(light, "_THREADS", 64)
+        use_emulator(monkeypatch, exposure)
+        monkeypatch.setattr(exposure, "_THREADS", 64)
     random = np.random.default_rng(5)
     grey = values(random)
     other = 1.4 * grey - 0.1 + noise(random)
     other[:500] = values(random, 500)
     counts = torch.from_numpy(random.random(2000) < usable)
-    expected = relative_light(grey, other, counts)
-    found = fitted_on_gpu(grey.to(device), other.to(device), counts.to(device)).cpu()
+    expected = relative_exposure(grey, other, counts)
+    found = relative_exposure_on_gpu(grey.to(device), other.to(device), counts.to(device)).cpu()
     assert found.tolist() == pytest.approx(expected.tolist(), abs=2e-4)
     assert (expected[0] == 1) == (usable <= 0.01)
 

@@ -1,4 +1,4 @@
-"""How bright one view is against another, and how noisy: exposure, white balance, noise."""
+"""Exposure of one view against another, as a gain and an offset, and the noise of both."""
 
 from pathlib import Path
 
@@ -20,19 +20,19 @@ _LARGEST_GAIN = 8.0
 USUAL_NOISE = 1e-4
 """Variance of grey values (of 1) by which two views of a place differ where nobody measured it."""
 LEAST_NOISE = 1e-6
-"""That of rounding to 8 bits, about."""
+"""Variance about that of rounding to 8 bits."""
 _MEDIAN_TO_DEVIATION = 1.4826
 """Standard deviation over the median of the absolute value, normal distribution."""
 _THREADS = 1024
 """Threads of the one block, as many as one may have."""
 
 
-def same_light(device: torch.device | str) -> Float[Tensor, "3"]:
+def identity_exposure(device: torch.device | str) -> Float[Tensor, "3"]:
     """Gain 1, offset 0, the usual noise."""
     return torch.tensor([1.0, 0.0, USUAL_NOISE], device=device)
 
 
-def relative_light(
+def relative_exposure(
     grey: Float[Tensor, "n"], other: Float[Tensor, "n"], usable: Bool[Tensor, "n"]
 ) -> Float[Tensor, "2"]:
     """Gain and offset by which most of some grey values become those of another view.
@@ -43,7 +43,7 @@ def relative_light(
     stays near 1. Returns gain 1 and offset 0 where too few pixels agree. Nothing waits for a GPU.
     """
     if grey.device.type == "cuda":
-        return fitted_on_gpu(grey, other, usable)
+        return relative_exposure_on_gpu(grey, other, usable)
     weight = usable.to(grey.dtype)
     for n in range(_ROUNDS):
         total = weight.sum().clamp(min=1e-12)
@@ -61,19 +61,19 @@ def relative_light(
         scale = _SCALE * max(1.0, 4.0 * (1 - n / (_ROUNDS / 2)))
         weight = usable / (1 + (residual / scale).square())
     found = torch.stack([gain, mean_y - gain * mean_x])
-    return torch.where(weight.sum() > _FEWEST, found, same_light(grey.device)[:2].to(grey))
+    return torch.where(weight.sum() > _FEWEST, found, identity_exposure(grey.device)[:2].to(grey))
 
 
-def fitted_on_gpu(
+def relative_exposure_on_gpu(
     grey: Float[Tensor, "n"], other: Float[Tensor, "n"], usable: Bool[Tensor, "n"]
 ) -> Float[Tensor, "2"]:
-    """:func:`relative_light` by one CUDA kernel, in float32."""
-    light = grey.new_empty(2)
+    """:func:`relative_exposure` by one CUDA kernel, in float32."""
+    exposure = grey.new_empty(2)
     values = (grey.contiguous(), other.contiguous(), usable.contiguous())
     kernels_for(_SOURCE, grey.device)["fit_light"](
-        1, _THREADS, *values, len(grey), _ROUNDS, _SCALE, _PLAIN, _FEWEST, _LARGEST_GAIN, light
+        1, _THREADS, *values, len(grey), _ROUNDS, _SCALE, _PLAIN, _FEWEST, _LARGEST_GAIN, exposure
     )
-    return light
+    return exposure
 
 
 def noise_between(
@@ -82,7 +82,7 @@ def noise_between(
     texture: Float[Tensor, "n"],
     usable: Bool[Tensor, "n"],
 ) -> Float[Tensor, ""]:
-    """Variance by which either of two views in the same light differs from what both show.
+    """Variance of the noise in the grey values of either of two views of the same exposure.
 
     From the median difference of their grey values where the first has least ``texture``, so that
     pixels that are not quite in place do not count for noise. The usual noise where too few can be

@@ -1,4 +1,4 @@
-"""A keyframe's searched depth and what a sensor measured of it, made one."""
+"""A keyframe's searched depth fused with that of a sensor."""
 
 import math
 from dataclasses import replace
@@ -9,38 +9,37 @@ from torch import Tensor
 
 from geogs.depth.depth_view import DenseDepth
 
-RIGHT = 0.02
-"""Relative error of a depth that is called right: what confidences are the chance of."""
-SEARCHED = 0.02
-"""Relative deviation of a searched depth, at best, beside a measured one."""
-OUTVOTED = 3.0
-"""Deviations by which the two differ where the searched depth is left."""
-SUREST = 0.98
-"""Confidence that no measured depth exceeds."""
+TOLERANCE = 0.02
+"""Relative error below which a depth is right: confidences are the chance of that."""
+MIN_DEVIATION = 0.02
+"""Least relative deviation of a searched depth beside a measured one."""
+MAX_DIFFERENCE = 3.0
+"""Standard deviations of the difference beyond which the searched depth is an outlier."""
+MAX_CONFIDENCE = 0.98
+"""Largest confidence of a measured depth."""
 
 
-def joined(
+def fused_with_sensor(
     searched: DenseDepth,
     inverse_depth: Float[Tensor, "h w"],
     information: Float[Tensor, "h w"],
 ) -> DenseDepth:
-    """The searched depth with the measured one: their mean by variances where they agree.
+    """Mean of the searched and the measured depth, weighted by their inverse variances.
 
-    Where they do not, the measured one; where nothing was measured, the searched one. The measured
-    one is an inverse depth in the lengths of the map with its information 1 / sigma^2, 0 where
-    there is none.
+    Where they do not agree, the measured depth; where nothing was measured, the searched one. What
+    was measured is an inverse depth, per map unit, and its information 1 / sigma^2, 0 for none.
     """
     known = information > 0
     measured = torch.where(known, 1 / inverse_depth.clamp(min=1e-12), searched.depth)
     own = torch.where(known, measured / information.clamp(min=1e-12).sqrt(), 1.0)
     chance = searched.confidence.clamp(1e-3, 1 - 1e-3)
-    theirs = (RIGHT / (math.sqrt(2) * torch.erfinv(chance))).clamp(min=SEARCHED)
+    theirs = (TOLERANCE / (math.sqrt(2) * torch.erfinv(chance))).clamp(min=MIN_DEVIATION)
     step = searched.depth / measured - 1
-    agree = step.abs() < OUTVOTED * torch.hypot(own, theirs)
+    agree = step.abs() < MAX_DIFFERENCE * torch.hypot(own, theirs)
     fraction = torch.where(known & agree, own.square() / (own.square() + theirs.square()), 0.0)
     depth = torch.where(known, measured * (1 + fraction * step), searched.depth)
     deviation = own * (1 - fraction).sqrt()
-    right = torch.erf(RIGHT / (math.sqrt(2) * deviation)).clamp(max=SUREST)
+    right = torch.erf(TOLERANCE / (math.sqrt(2) * deviation)).clamp(max=MAX_CONFIDENCE)
     confidence = torch.where(known, right, searched.confidence)
     median = depth.median().cpu()
     return replace(searched, depth=depth, confidence=confidence, median=median, written=None)
