@@ -67,9 +67,8 @@ def linearised_sources(
     """
     found = []
     for source in flow.sources(problem, state, options):
-        edges = source.edges
-        for term in problem.depth_terms:
-            edges = edges.joined(term.of_frame(source.frame, state))
+        others = (term.of_frame(source.frame, state) for term in problem.depth_terms)
+        edges = source.edges.with_depths(others)
         if bool(problem.free_depth[source.frame]):
             edges = edges.eliminated()
         found.append(replace(source, edges=edges))

@@ -7,7 +7,6 @@ c + F x (1 + k1 |x|^2 + k2 |x|^4), x = (X / Z, Y / Z), which is OpenCV's model w
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -36,11 +35,11 @@ class RadialLens:
         return RadialLens(camera, self.k1 + k1, self.k2 + k2)
 
     def growth(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Of a ray's distance from the axis, whose square is given."""
+        """Factor on a ray's distance from the axis, whose square is given."""
         return 1 + square * (self.k1 + square * self.k2)
 
     def steepness(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
+        """Slope of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
         ``_LEAST_SLOPE``."""
         return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=_LEAST_SLOPE)
 
@@ -56,11 +55,10 @@ class LensBlock:
     """Whether the focal length is a variable."""
     radial: bool = False
     """Whether k1 and k2 are variables."""
-    largest_step: ClassVar[float] = 0.3
 
     @property
     def free(self) -> tuple[bool, bool, bool]:
-        """As in the protocol."""
+        """Whether each unknown is a variable."""
         return self.focal, self.radial, self.radial
 
     @cached_property
@@ -69,7 +67,7 @@ class LensBlock:
         return lens_rays(self.lens, self.pixels)
 
     def moved(self, step: Float[Tensor, "3"]) -> "LensBlock":
-        """As in the protocol."""
+        """The block after a step of all unknowns, zero for those that are no variables."""
         return replace(self, lens=self.lens.moved(*step.tolist()))
 
     def project(

@@ -35,13 +35,13 @@ class LensFlow:
 
     @staticmethod
     def of_pinhole(grid: SampleGrid) -> "LensFlow":
-        """That of the cells of a grid, through its camera."""
+        """Dense flow of the cells of a grid, seen through its camera."""
         return LensFlow(LensBlock(RadialLens(grid.camera), grid.pixels))
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """As in the protocol; each with its diagonal where the lens is unknown."""
+        """The sources of all edges, in order; with their diagonal where the lens is unknown."""
         from geogs.bundle.lens_kernels import linearise_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
@@ -68,7 +68,6 @@ class LensFlow:
             yield SourceFlow(frame, found, None if self._known else found.chained()[0].diagonal())
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """As in the protocol."""
         from geogs.bundle.lens_kernels import cost_of_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)

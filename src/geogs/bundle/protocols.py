@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.problem import Problem
-from geogs.bundle.terms import SharedBlock
 from geogs.geometry.least_squares import Policy
 
 P = TypeVar("P", bound=Problem, contravariant=True)
@@ -38,8 +37,6 @@ class BundleOptions:
     """Damping of inverse depth relative to the mean curvature of its frame."""
     chunk: int = 24
     """Edges linearised at a time; bounds memory."""
-    min_inverse_depth: float = 1e-3
-    max_inverse_depth: float = 1e2
     tolerance: float = 0.0
     """A step that moves no pose by this much (units, radians) is the last one; the dense solver of
     a GPU waits for that only where it waits for the cost."""
@@ -75,8 +72,6 @@ class BundleResult:
     """Sum over a frame's edges of w |dp/dd|^2 before the last step, and the information of what was
     measured beside the matches."""
     finite: bool
-    block: SharedBlock | None = None
-    """The shared unknowns of a problem that has some."""
 
 
 @runtime_checkable

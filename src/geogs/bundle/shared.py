@@ -29,6 +29,8 @@ from geogs.geometry.lie import se3_inverse
 
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
+LARGEST_STEP = 0.3
+"""By no more does an unknown of the lens move at once."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
 
@@ -96,7 +98,7 @@ class SharedSchur(DenseSchur):
         super().__init__(problem, LensFlow(), options)
 
     def linearise(self, state: BundleState) -> LinearBundle:
-        """As without shared unknowns, and the scale is kept."""
+        """The problem with a penalty that keeps the scale."""
         linear = super().linearise(state)
         system, T = linear.system, state.T_cw
         diagonal = torch.zeros_like(system.gradient)
@@ -110,6 +112,13 @@ class SharedSchur(DenseSchur):
         scale = scale / scale.norm().clamp(min=1e-12)
         system.hessian += diagonal.mean() * scale[:, None] * scale
         return linear
+
+    def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
+        """The solution with the step of the lens cut to ``LARGEST_STEP``."""
+        step = super().solve_cameras(linear, damping)
+        if step is not None:
+            step[6 * linear.system.frames :].clamp_(-LARGEST_STEP, LARGEST_STEP)
+        return step
 
     def cost(self, state: BundleState, linear: LinearBundle | None = None) -> float:
         """Mean over the matched cells; infinite where nothing is matched."""

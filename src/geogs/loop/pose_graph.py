@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import (
     retract,
@@ -48,8 +49,6 @@ this is left, in squared standard deviations."""
 DAMPING, MAX_DAMPING = 1e-8, 1e4
 """Levenberg damping at the start, relative to the diagonal; a stage ends when even the second
 brings no decrease."""
-INVERSE_DEPTHS = 1e-3, 1e2
-"""Least and largest that is given to a cell."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from geogs.bundle.cuda.linear_edges import (
     joined_edges,
 )
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.bundle.protocols import BundleOptions, BundleResult
-from geogs.bundle.terms import BundleState, SharedBlock
+from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Step, minimise
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device, upload_indices
@@ -123,7 +124,6 @@ class _State:
     memory: Float[Tensor, "m"]
     """Poses and the sign of failure, which travel back together."""
     inverse_depth: Float[Tensor, "n p"]
-    block: SharedBlock | None
 
     @staticmethod
     def at_start(problem: BundleProblem) -> "_State":
@@ -131,7 +131,7 @@ class _State:
         d, T = problem.inverse_depth, problem.T_cw
         memory = torch.zeros(T.numel() + 1, dtype=torch.float64, device=d.device)
         memory[:-1].copy_(to_device(T.reshape(-1), d.device))
-        return _State(memory, d, problem.block)
+        return _State(memory, d)
 
     @property
     def T(self) -> Float[Tensor, "m"]:
@@ -145,17 +145,17 @@ class _State:
 
     @property
     def everything(self) -> BundleState:
-        """As terms see it."""
-        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth, self.block)
+        """The state that terms are given."""
+        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth)
 
     @property
     def with_poses_here(self) -> BundleState:
-        """As terms of poses see it; waits."""
-        return BundleState(self.T.reshape(-1, 4, 4).cpu(), self.inverse_depth, self.block)
+        """The state that terms of poses are given; waits."""
+        return BundleState(self.T.reshape(-1, 4, 4).cpu(), self.inverse_depth)
 
     def copy(self) -> "_State":
         """For a step to change."""
-        return _State(self.memory.clone(), self.inverse_depth.clone(), self.block)
+        return _State(self.memory.clone(), self.inverse_depth.clone())
 
 
 class _Workspace:
@@ -202,7 +202,7 @@ class CudaDenseBundle:
         self._last: tuple[tuple[bytes, ...], _Structure] | None = None
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
-        """As in the protocol; poses are returned where they were given.
+        """Take the steps; poses are returned where they were given.
 
         Where steps need not lower the cost nobody waits for one to end, be it small
         (``tolerance``) or not finite.
@@ -220,7 +220,7 @@ class CudaDenseBundle:
         return BundleResult(T, found.state.inverse_depth, w.edges.information, finite)
 
     def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
-        """That of the last problem, if it is the same: edges are adjusted in rounds."""
+        """The structure of the last problem, if it is the same: edges are adjusted in rounds."""
         parts = (problem.source, problem.target, problem.free_pose, problem.free_depth)
         key = tuple(x.cpu().numpy().tobytes() for x in parts)
         if self._last is None or self._last[0] != key:
@@ -247,9 +247,8 @@ class _DenseSteps:
         """Edges, summed up by source; that they are."""
         w = self.workspace
         w.edges.fill(
-            self.grid, state.T, state.inverse_depth, self.matches, self.options, w.depth_terms,
-            range(w.structure.frames), state.everything,
-        )  # fmt: skip
+            self.grid, state.T, state.inverse_depth, self.matches, self.options, w.depth_terms
+        )
         return True
 
     def step(self, state: _State, linear: bool, damping: float) -> Step[_State] | None:
@@ -263,7 +262,7 @@ class _DenseSteps:
         return Step(moved, float(self.workspace.cameras.xi.abs().max()))
 
     def cost(self, state: _State, linear: bool) -> float:
-        """As of the CPU's solvers; waits."""
+        """Twice what is minimised; waits."""
         p, edges = self.problem, self.workspace.structure.edges
         matched = edge_costs(
             self.kernels, edges, self.grid, state.T, state.inverse_depth, self.matches,
@@ -308,12 +307,12 @@ class _DenseSteps:
         )
 
     def _moved(self, state: _State) -> _State:
-        w, options, moved = self.workspace, self.options, state.copy()
+        w, moved = self.workspace, state.copy()
         s, edges = w.structure, w.edges
         edges.find_depth_steps(w.cameras.xi, w.delta, moved.failed)
         self.kernels["take_steps"](
             (-(-edges.cells // edges.block), s.frames), edges.block, s.slot, s.edges.free_depth,
-            w.cameras.xi, w.delta, edges.cells, options.min_inverse_depth,
-            options.max_inverse_depth, moved.failed, moved.T, moved.inverse_depth,
+            w.cameras.xi, w.delta, edges.cells, *INVERSE_DEPTHS, moved.failed, moved.T,
+            moved.inverse_depth,
         )  # fmt: skip
         return moved

@@ -4,14 +4,14 @@ Linearised on the CPU, some edges at a time, wherever the matches lie.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, residual_norms
-from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.hyper_edge import DepthEquations
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
@@ -95,10 +95,8 @@ class _ThinnedTerm:
     cells: slice
     information: None = None
 
-    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
-        edges = self.term.of_frame(frame, self.state)
-        assert edges.depth is not None
-        return replace(edges, depth=edges.depth.on_cells(self.cells))
+    def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
+        return self.term.of_frame(frame, self.state).on_cells(self.cells)
 
     def cost(self, state: BundleState) -> float:
         return self.term.cost(self.state)
