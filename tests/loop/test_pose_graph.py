@@ -25,8 +25,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop import matched_edges, pose_graph
 from geogs.loop.closure import ClosingQuestion, LoopClosure, close_loops
 from geogs.loop.consistency import AGREEMENT, consistent_loops, cycle_errors
-from geogs.loop.graph_terms import GraphState
-from geogs.loop.matched_edges import MatchedEdges, MatchTerm
+from geogs.loop.matched_edges import GraphState, MatchedEdges
 from geogs.loop.pose_graph import (
     PoseGraph,
     PoseGraphResult,
@@ -315,7 +314,7 @@ def test_exact_recovery_without_noise():
     assert kept.all()
     assert ate(d, d.T_cw) > 0.05
     assert ate(d, result.S) < 1e-6
-    torch.testing.assert_close(result.scale, sim3_scale(d.units), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(sim3_scale(result.S), sim3_scale(d.units), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(("count", "factor"), [(1, 5), (5, 10), (20, 12)])
@@ -324,7 +323,7 @@ def test_a_loop_removes_the_drift_of_a_corridor(count, factor):
     result, kept = twenty_true_loops() if count == 20 else close(d, loops(d, count))
     assert kept.all()
     assert ate(d, d.T_cw) > factor * ate(d, result.S)
-    ratio = result.scale / sim3_scale(d.units)
+    ratio = sim3_scale(result.S) / sim3_scale(d.units)
     assert (ratio / ratio.mean() - 1).abs().max() < 0.012  # of the planted 0.05
 
 
@@ -406,7 +405,7 @@ def test_relative_poses_keep_their_meaning_after_a_correction():
     result, _ = close(d, loops(d, 5))
     correction = pose_correction(range(KEYFRAMES), d.T_cw, result.S)
     after = torch.stack(list(correction.after.values()))
-    before, moved = d.odometry, d.odometry.rescaled(result.scale)
+    before, moved = d.odometry, d.odometry.rescaled(sim3_scale(result.S))
     was, now = relative_errors(result.S, before), relative_errors(after, moved)
     torch.testing.assert_close(
         (before.information * was**2).sum(1), (moved.information * now**2).sum(1)
@@ -499,7 +498,7 @@ def test_matched_edges_close_a_loop_in_scale(monkeypatch):
     monkeypatch.setattr(pose_graph, "STEPS", 50)
     result = solve(graph)
     before = GraphState(graph.start, edges.inverse_depth)
-    linear = MatchTerm(edges).linearise(before)
+    linear = edges.linearise(before)
     assert linear.cost(GraphState(result.S, result.inverse_depth)) < 1e-4 * linear.cost(before)
     # Without a prior on depth the unit of the second follows from the baseline in both directions.
     moved, true = result.S[1], S[1]

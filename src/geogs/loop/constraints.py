@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.relative_pose import LEAST_ROTATION, LEAST_SCALE, relative_poses
@@ -168,7 +169,7 @@ def thinned(relative: RelativePoses, most: int) -> RelativePoses:
 
 def squared_errors(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e"]:
     """Squared errors of relative poses between places at given poses, in their own variances."""
-    now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
+    now = relative_motion(T_cw, relative.source, relative.target)
     error = sim3_log(relative.G @ sim3_inverse(now))
     return (relative.information * error.square()).sum(-1)
 
@@ -178,7 +179,7 @@ def differences(
 ) -> Float[Tensor, "e"]:
     """How far relative poses between places lie from given poses, as :func:`disagreement` has it
     in the frames of their targets, whose median depth is ``depth``."""
-    now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
+    now = relative_motion(T_cw, relative.source, relative.target)
     return disagreement(relative.G, now, depth[relative.target])
 
 

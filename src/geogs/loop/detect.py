@@ -56,7 +56,7 @@ class LoopDetector:
         self,
         keyframes: KeyframeTable,
         operator: FlowOperator,
-        config: LoopConfig | None = None,
+        config: LoopConfig,
         waits: bool = True,
         mask: Bool[np.ndarray, "h w"] | None = None,
         table: LoopTable | None = None,
@@ -68,7 +68,7 @@ class LoopDetector:
         self.keyframes = keyframes
         self.grid = keyframes.grid
         self.operator = operator
-        self.config = config or LoopConfig()
+        self.config = config
         self._waits = waits
         # What the search reads was written in the stream of whoever made the detector.
         stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
@@ -130,7 +130,7 @@ class LoopDetector:
             return []
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
         there, back = frame_distances(store, directed, ROTATION_WEIGHT).chunk(2)
-        limit = MAX_FLOW_DISTANCE * max(self.grid.camera.width, self.grid.camera.height)
+        limit = MAX_FLOW_DISTANCE * self.grid.camera.long_edge
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
         return [facing[n] for n in order[distance < limit].tolist()]
 

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.flow_term import weighed_residuals
-from geogs.bundle.projection import LinearProjection, linearise
+from geogs.bundle.projection import LinearProjection, linearise, relative_motion
 from geogs.geometry.least_squares import Policy, Step, minimise
-from geogs.geometry.lie import move, se3_inverse
+from geogs.geometry.lie import move
 from geogs.loop.matched_edges import CHUNK, HUBER, MatchedEdges
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import RelativePoses
@@ -64,7 +64,7 @@ def relative_poses(
     """
     G, information, kept = [], [], []
     if start is None:
-        start = T_cw[edges.target] @ se3_inverse(T_cw[edges.source])
+        start = relative_motion(T_cw, edges.source, edges.target)
     for first in range(0, len(edges.source), CHUNK):
         chunk = slice(first, first + CHUNK)
         solved, known, keep = _solve_edges(grid, edges, chunk, start[chunk], is_loop, steps)

@@ -103,7 +103,7 @@ def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Flo
 
 def position_step(camera: Camera) -> float:
     """Pixels between two packed positions that differ by one."""
-    return 2.0**-15 * max(camera.width, camera.height)
+    return 2.0**-15 * camera.long_edge
 
 
 def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 2"]:

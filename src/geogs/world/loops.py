@@ -146,10 +146,7 @@ class RelativePoses:
         return RelativePoses(*(p[keep] for p in parts))
 
     def rescaled(self, scale: Float[Tensor, "n"]) -> "RelativePoses":
-        """The same measurements after the unit of each keyframe was divided by ``scale``.
-
-        To be applied to edges kept beyond a correction, with :attr:`PoseGraphResult.scale`.
-        """
+        """The same measurements after the unit of each keyframe was divided by ``scale``."""
         here, there = scale[self.source], scale[self.target]
         G = self.G.clone()
         G[:, :3, :3] *= (here / there)[:, None, None]

@@ -18,16 +18,7 @@ from torch import Tensor
 from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp, se3_log
-from geogs.limits import (
-    RIGID,
-    UNBOUNDED,
-    AtLeast0,
-    Id,
-    KeyframeId,
-    Number,
-    Pose,
-    Positive,
-)
+from geogs.limits import RIGID, UNBOUNDED, AtLeast0, Id, KeyframeId, Number, Pose, Positive
 from geogs.world.edges import Edge, Pair
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
@@ -251,7 +242,8 @@ def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -
     """
     numbers = [segment.number for segment in table.segments]
     here = {table.main, table.current} if numbers else set[int]()
-    if not here <= {*numbers} or any(n >= table.count for n in numbers) or _repeats(numbers):
+    is_unique = len({*numbers}) == len(numbers)
+    if not here <= {*numbers} or any(n >= table.count for n in numbers) or not is_unique:
         raise InputError("a segment is missing, or has the number of another")
     sizes = keyframes.grid.sizes
     for segment in table.segments:
@@ -263,10 +255,6 @@ def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -
             raise InputError(f"the frames of segment {segment.number} are not in their order")
         if not _ascends(segment.final):
             raise InputError(f"the keyframes of segment {segment.number} are not in their order")
-
-
-def _repeats(numbers: list[int]) -> bool:
-    return len(set(numbers)) < len(numbers)
 
 
 def _ascends(numbers: list[int]) -> bool:
