@@ -82,8 +82,7 @@ def costs(grid: SampleGrid, problem: BundleProblem, device: torch.device) -> dic
     options = replace(LEVENBERG, chunk=5)
     bundle = cuda_dense.CudaDenseBundle(SampleGrid(grid.camera, device))
     there = on(problem, device)
-    workspace = cuda_dense._Workspace(there, bundle._structure_of(there, device), bundle.kernels)
-    steps = cuda_dense._DenseSteps(bundle, there, options, workspace)
+    steps = cuda_dense._DenseSteps(bundle, there, options)
     many = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
     flow = LensFlow.of_pinhole(grid)
     state = problem.start
