@@ -21,8 +21,8 @@ from geogs.bundle.terms import BundleState
 from geogs.geometry.robust import huber_weight
 
 BEHIND = 10.0
-"""By how many of Huber's knees a cell counts as off whose target sees it from behind. No step is
-drawn by that, and none is taken that brings many there."""
+"""Residual of a cell that lies behind its target, in knees of Huber's cost. No step is drawn by
+that, and none is taken that brings many there."""
 
 
 @dataclass(frozen=True)

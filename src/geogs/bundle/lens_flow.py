@@ -23,14 +23,14 @@ from geogs.geometry.lie import se3_adjoint
 from geogs.world.grid import SampleGrid
 
 Further = Callable[[BundleProblem], Float[Tensor, "e o p 2"]]
-"""By how much more unknowns that all edges share, at size one, move where cells fall."""
+"""Moves of where cells fall by more unknowns of size one that all edges share."""
 
 
 class LensFlow:
     """Dense flow of cells that are seen through the lens of a state, or one that is known."""
 
     def __init__(self, known: LensBlock | None = None, further: Further | None = None) -> None:
-        """A lens that is ``known`` is no unknown, whatever block the state has for other terms."""
+        """The lens of the state is an unknown where none is ``known``."""
         self._known, self._further = known, further
 
     @staticmethod

@@ -16,8 +16,8 @@ MAX_DAMPING = 1.0
 TRIALS = 2
 """Steps that are tried for each that may be taken."""
 COST_ROUNDING = 1e-6
-"""By this part of itself a cost may be off, as pixels are float32: a step that seems to raise it by
-less says that there is nothing left to gain."""
+"""Relative error of a cost, as pixels are float32: a step that seems to raise it by less says that
+there is nothing left to gain."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class BundleOptions:
 
     @property
     def policy(self) -> Policy:
-        """The steps as the least-squares loop is told them."""
+        """The policy of the least-squares loop."""
         plain = Policy(self.iterations, self.damping, self.tolerance)
         if self.least_damping is None:
             return plain

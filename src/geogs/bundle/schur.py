@@ -28,7 +28,7 @@ class SchurBundle(ABC, Generic[P, L]):
     def __init__(self, problem: P, options: BundleOptions) -> None:
         self.problem, self.options = problem, options
         self.information = problem.known_before()
-        """That of ``BundleResult``, where the problem was linearised last."""
+        """Information of every inverse depth, where the problem was linearised last."""
 
     @abstractmethod
     def linearise(self, state: BundleState) -> L:

@@ -1,4 +1,4 @@
-"""Bundle adjustment whose variables are also some that all edges share, such as a lens.
+"""Bundle adjustment with unknowns that all edges share: a lens.
 
 Levenberg-Marquardt on the tracker's cost (:mod:`geogs.bundle.dense`) with a block of unknowns
 beside poses and inverse depths: depths are eliminated frame by frame, then poses and block are
@@ -30,7 +30,7 @@ from geogs.geometry.lie import se3_inverse
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
 LARGEST_STEP = 0.3
-"""By no more does an unknown of the lens move at once."""
+"""Most that an unknown of the lens moves by at once."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
 

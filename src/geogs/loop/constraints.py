@@ -97,7 +97,7 @@ def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
     if len(ids) < 2:
         return RelativePoses.none()
     T_cw = segment.poses(ids)
-    depth = 1 / segment.inverse_depths(ids[1:]).median(1).values.cpu().double()
+    depth = segment.median_depths(ids[1:])
     most = 1 / torch.tensor([LEAST_ROTATION] * 6 + [LEAST_SCALE]).double().square()
     information = most.repeat(len(ids) - 1, 1)
     information[:, :3] /= depth[:, None].square()

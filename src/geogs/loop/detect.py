@@ -141,7 +141,7 @@ class LoopDetector:
         return Query(id, features, near, by_pose, known, tuple(settled), self._depths())
 
     def _ranked(self, pairs: Sequence[Pair]) -> list[Pair]:
-        """Those of keyframes taken so far."""
+        """The pairs of keyframes taken so far."""
         return [p for p in pairs if p[0] in self._order and p[1] in self._order]
 
     def _enter(self, id: int) -> None:
@@ -168,11 +168,10 @@ class LoopDetector:
 
     def _is_implied(self, id: int, found: Sequence[Loop], settled: Sequence[Pair]) -> bool:
         """Whether a place was joined before with one that a loop of the same keyframe has found."""
-        for loop in found:
-            pair = min(id, loop.first), max(id, loop.first)
-            if self._search.is_suppressed(pair, self._found_near(pair[1]), settled):
-                return True
-        return False
+        pairs = ((min(id, loop.first), max(id, loop.first)) for loop in found)
+        return any(
+            self._search.is_suppressed(pair, self._found_near(pair[1]), settled) for pair in pairs
+        )
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""

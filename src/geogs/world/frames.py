@@ -84,7 +84,7 @@ class FrameLog:
     rows: dict[Number, SeenRows] = field(default_factory=dict)
     """Rectified rows of a rolling shutter, by the indices of the frames."""
     open_rows: SeenRows | None = None
-    """Those of every frame where none are rectified, and nobody knows whether they should be."""
+    """Rows of every frame where none are rectified, and nobody knows whether they should be."""
 
     def set_readout(self, factor: float, doubt: float) -> None:
         """Have rows seen over a readout that is so many times what they were rectified by, with its

@@ -24,7 +24,7 @@ from geogs.world.pose_table import PoseTable
 from geogs.world.tables import check_arrays, check_tables
 
 Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
-"""A flow operator's form of an image."""
+"""A flow operator's encoding of an image."""
 
 KEYFRAME_ARRAYS = {
     "image": UInt8[np.ndarray, "h w 3"],
@@ -64,7 +64,7 @@ class Keyframe:
     measured: MeasuredCells | None = None
     """What a depth sensor says; none without, or where the map is not metric."""
     pose: MeasuredPose | None = None
-    """By another tracker, in its own world; none where there is none."""
+    """Pose by another tracker, in its own world; none where there is none."""
     table: "KeyframeTable" = field(init=False, repr=False, metadata=NOT_STORED)
     """Which has it; given by the table."""
     own_encoded: Any = field(default=None, repr=False, metadata=NOT_STORED)
@@ -93,7 +93,7 @@ class Keyframe:
 
     @property
     def encoded(self) -> Any:
-        """The flow operator's form of the image, computed again where it is no longer kept."""
+        """The encoded image, computed again where it is no longer kept."""
         encode = self.table.encode
         if encode is None:
             return self.own_encoded
@@ -193,12 +193,12 @@ class KeyframeTable:
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     lens: FoundLens | None = None
-    """By which images and depths were straightened at the end; none where they are as they were
-    tracked."""
+    """Lens by which images and depths were straightened at the end; none where they are as they
+    were tracked."""
     frame_lenses: dict[Id, FrameLens] = field(default_factory=dict)
     """What the lenses of keyframes had of their own then, where they had."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
-    """Of matches and depths, with the camera that saw what they are of."""
+    """Grid of matches and depths, with the camera that saw them."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
     """The pinhole that the images are of, or will be once they are straight. That of the grid is
     another only while the lens is being found."""
@@ -305,7 +305,7 @@ class KeyframeSet:
 
     @property
     def camera(self) -> Camera:
-        """Of the images."""
+        """Camera of the images."""
         return self.table.camera
 
     @property
@@ -370,12 +370,16 @@ class KeyframeSet:
         return target @ se3_inverse(source)
 
     def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
-        """On the grid."""
+        """Inverse depths on the grid."""
         return torch.stack([self[i].inverse_depth for i in ids])
 
     def informations(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
-        """On the grid, pixels^2 per inverse depth^2."""
+        """Information on the grid, pixels^2 per inverse depth^2."""
         return torch.stack([self[i].information for i in ids])
+
+    def median_depths(self, ids: Sequence[int]) -> Float[Tensor, "n"]:
+        """Median depth of each keyframe's cells, float64, on the CPU."""
+        return 1 / self.inverse_depths(ids).median(1).values.cpu().double()
 
     def rescale(self, factor: float) -> None:
         """Multiply every length by ``factor``."""

@@ -56,9 +56,9 @@ class Packed:
 
     values: Values = None
     arrays: dict[str, Tensor] = field(default_factory=dict)
-    """By their place in the record, such as ``mapper.map.position``; copies on the CPU."""
+    """Copies on the CPU, by their place in the record, such as ``mapper.map.position``."""
     archives: dict[str, Archive] = field(default_factory=dict)
-    """Those that arrays of the record lie in, by name."""
+    """Archives that arrays of the record lie in, by name."""
 
 
 def pack(kind: Any, record: object) -> Packed:

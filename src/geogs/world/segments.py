@@ -131,7 +131,7 @@ class TrackStatus:
     misses: Number = 0
     """Frames since the camera was last located."""
     frames_lost: Number = 0
-    """Those of them with texture that show more than a rotation."""
+    """Frames among them that have texture and show more than a rotation."""
 
     @property
     def has_map(self) -> bool:

@@ -47,7 +47,7 @@ class Considered(NamedTuple):
     """Second moments of the moves of a solution by errors that are not solved for."""
 
     covariance: Float[Tensor, "m m"]
-    """Of all poses, as that of :class:`Marginals`."""
+    """Second moments of all poses, in the order of :class:`Marginals`."""
     relative_depth: Float[Tensor, "n c"]
     """Squares of the moves of its cells' inverse depths, as parts of these."""
     focal: float = 0.0
@@ -63,7 +63,7 @@ class Marginals:
     """
 
     covariance: Float[Tensor, "m m"]
-    """Of the left perturbations of all poses, m = 6n; float64."""
+    """Covariance of the left perturbations of all poses, m = 6n; float64."""
     relative_depth: Float[Tensor, "n c"]
     """Deviation of the inverse depth of some cells of each frame, as a part of it."""
     normalised_residual: Float[Tensor, "n"]
@@ -71,9 +71,9 @@ class Marginals:
     dimensions), each counted by what it says: 1.2 where errors are as expected, more where the
     scene is not as modelled."""
     focal_variance: float = 0.0
-    """Of the focal length, as a part of it."""
+    """Variance of the focal length, as a fraction of it."""
     focal_change: float = 0.0
-    """By how much parts of the video want focal lengths that differ, as a part of them."""
+    """Difference of the focal lengths that parts of the video want, as a fraction of them."""
     lens_change: float = 0.0
     """Part of the matches' cost that a lens of each frame of its own would take off."""
 
@@ -96,8 +96,8 @@ class Marginals:
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
-        """That of the ``BEST_KNOWN`` of its cells whose depths are known best; infinite where fewer
-        have matches."""
+        """Worst deviation among the ``BEST_KNOWN`` fraction of each frame's cells; infinite where
+        fewer have matches."""
         return self.relative_depth.quantile(BEST_KNOWN, -1, interpolation="higher")
 
 

@@ -45,17 +45,17 @@ class ThinnedProblem:
     def depth_moves(
         self, source: SourceFlow, pull: Float[Tensor, "c k"], moves: Float[Tensor, "m k"]
     ) -> Float[Tensor, "c k"]:
-        """By how much errors of matches, of size one each, move the inverse depths of a source.
+        """Moves of the inverse depths of a source by errors of matches of size one each.
 
-        As parts of these: ``C^-1 (pull - E^T moves)``, with what they pull at the depths and the
-        ``moves`` of all poses by them. Zero for what is fixed, or no match tells of.
+        As fractions of these: ``C^-1 (pull - E^T moves)``, with their ``pull`` at the depths and
+        the ``moves`` of all poses by them. Zero for what is fixed, or has no match.
         """
         depth, rows = source.edges.depth, source.edges.rows(len(moves) // 6)
         assert depth is not None
         left = pull - source.edges.chained_coupling().mT @ moves[rows].to(pull)
         scale = depth.curvature * self.inverse_depth[source.frame].clamp(min=1e-12)
-        told = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
-        return torch.where(told[:, None], left / scale[:, None], 0.0)
+        known = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
+        return torch.where(known[:, None], left / scale[:, None], 0.0)
 
     def residuals(
         self, options: BundleOptions
