@@ -7,12 +7,11 @@ import torch
 from torch import Tensor
 
 import geogs.bundle.cuda.dense as cuda_dense
-from bundle_scenes import disturbed, scene
+from bundle_scenes import disturbed, scene, streamed
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import MeasuredDepths
 from geogs.bundle.hyper_edge import HyperEdge
-from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
 from geogs.bundle.terms import BundleState
@@ -50,13 +49,6 @@ class Positions:
         """Weighted squares of what the centres are off by."""
         centre = se3_inverse(state.T_cw[self.source])[:, :3, 3]
         return self.weight * float((centre - self.centre).square().sum())
-
-
-def streamed(p: BundleProblem) -> StreamedProblem:
-    return StreamedProblem(
-        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth, p.depth_terms,
-        p.pose_terms, matches=lambda e: (p.pixels[e], p.weight[e]),
-    )  # fmt: skip
 
 
 def located(frames: int = 4) -> tuple:

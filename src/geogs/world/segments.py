@@ -19,6 +19,7 @@ from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp, se3_log
 from geogs.limits import RIGID, UNBOUNDED, AtLeast0, Id, KeyframeId, Number, Pose, Positive
+from geogs.world.arrays import NOT_STORED
 from geogs.world.edges import Edge, Pair
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
@@ -101,7 +102,7 @@ class ReferenceView:
     image: UInt8[np.ndarray, "h w 3"]
     R: Annotated[Float64[Tensor, "3 3"], RIGID] | None
     """The camera that was located last to this one; none where nothing links them."""
-    encoded: Any = field(default=None, metadata={"stored": False})
+    encoded: Any = field(default=None, metadata=NOT_STORED)
     """The flow operator's form of the image, or None where it has to be computed again."""
 
 
