@@ -22,7 +22,7 @@ from geogs.bundle.flow_term import residual_norms
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, minimise
 from geogs.geometry.lie import se3_inverse
@@ -35,21 +35,16 @@ LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
 
 
-@dataclass(frozen=True)
-class SharedResult:
+@dataclass(frozen=True, kw_only=True)
+class SharedResult(BundleResult):
     """The adjusted problem, and how well the block is known."""
 
     block: LensBlock
-    T_cw: Float[Tensor, "n 4 4"]
-    inverse_depth: Float[Tensor, "n p"]
-    information: Float[Tensor, "n p"]
-    """Sum over a frame's edges of w |dp/dd|^2."""
     cost: float
     """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
     covariance: Float[Tensor, "m m"]
     """Covariance of the block's unknowns, zero for those that are no variables; see
     :func:`solve_shared`."""
-    finite: bool
 
 
 def solve_shared(
@@ -79,13 +74,13 @@ def solve_shared(
     state, linear = found.state, found.linear or shared.linearise(found.state)
     covariance = _covariance(linear)
     return SharedResult(
-        cast(LensBlock, state.block),
         state.T_cw,
         state.inverse_depth,
         shared.information,
-        found.cost,
-        covariance,
         found.finite and bool(torch.isfinite(covariance).all()),
+        block=cast(LensBlock, state.block),
+        cost=found.cost,
+        covariance=covariance,
     )
 
 

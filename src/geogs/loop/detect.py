@@ -77,12 +77,8 @@ class LoopDetector:
             initializer=lambda: None if stream is None else torch.cuda.set_stream(stream),
         )  # fmt: skip
         self.table = table or LoopTable()
-        self._order: dict[int, int] = {}
+        self._order = {id: rank for rank, id in enumerate(self.table.keyframes)}
         """Rank in time of each keyframe searched so far."""
-        self._ids = np.zeros(64, np.int64)
-        """Ids of the keyframes by their rank, with room for more."""
-        for id in self.table.keyframes:
-            self._rank(id)
         self._search = PlaceRecognition(self.grid, self.config, self._order, mask, self.table)
         self._pending: deque[Future[None] | None] = deque(None for _ in self.table.found)
         """The search for each keyframe that is not decided yet; none where it was done before."""
@@ -147,13 +143,7 @@ class LoopDetector:
     def _enter(self, id: int) -> None:
         """Take a keyframe as the latest."""
         self.table.keyframes.append(id)
-        self._rank(id)
-
-    def _rank(self, id: int) -> None:
-        rank = self._order[id] = len(self._order)
-        if rank == len(self._ids):
-            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
-        self._ids[rank] = id
+        self._order[id] = len(self._order)
 
     def _found_near(self, id: int) -> list[Pair]:
         """Pairs of the loops found whose later keyframe is so near to one that they can rule out
@@ -176,8 +166,7 @@ class LoopDetector:
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
         gap, store = self._order[id] - self.config.min_gap, self.keyframes.set_of[id]
-        recent = self._ids[max(gap, 0) : len(self._order)].tolist()
-        return frozenset(k for k in recent if k in store)
+        return frozenset(k for k in self.table.keyframes[max(gap, 0) :] if k in store)
 
     def _depths(self) -> Depths:
         """What is known of the depth of all keyframes now; they are replaced, never changed."""
@@ -187,7 +176,8 @@ class LoopDetector:
     def _facing(self, id: int) -> list[int]:
         """The earlier keyframes nearest by that look roughly the same way; there are never many."""
         store = self.keyframes.set_of[id]
-        old = self._ids[: max(self._order[id] - self.config.min_gap, 0)]
+        gap = max(self._order[id] - self.config.min_gap, 0)
+        old = np.array(self.table.keyframes[:gap], np.int64)
         depth = 1 / float(store[id].inverse_depth.median())
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
         return list(islice((k for k in around.tolist() if k in store), MEASURED))
