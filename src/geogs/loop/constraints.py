@@ -21,8 +21,8 @@ from geogs.world.loops import Loop, RelativePoses
 AGREEING_LOOPS = 2
 """Loops that have to agree before a segment is joined to another: one may be a look-alike."""
 JOIN_TOLERANCE = 0.12
-"""Within which they agree: radians, parts of the median depth, or of the scale; what segments drift
-by within themselves."""
+"""Largest difference between loops that agree: radians, fraction of the median depth, or of the
+scale. Segments drift by as much within themselves."""
 
 
 def joined(parts: Sequence[RelativePoses]) -> RelativePoses:

@@ -54,8 +54,8 @@ def relative_poses(
 
     Matches and depths may be on a GPU; poses are on the CPU, and so is the result.
 
-    From the present poses on, or from ``start``, the motion of each edge in its source's unit;
-    with no ``steps`` that stays, where an adjustment has fitted it with more than its own matches.
+    The solution begins at the present poses, or at ``start``, the motion of each edge in its
+    source's unit. Without ``steps`` that stays: an adjustment of all edges has found it.
 
     Covariance is ``sigma^2 diag(H^-1)`` with ``sigma^2 = sum w r^2`` divided not by the number of
     cells, but by ``INDEPENDENT``. A loop's scale is the median ratio of the depths at

@@ -122,14 +122,14 @@ class Keyframe:
         self.table.arrays.put("sensor depth", self.id, metres.astype(np.float16))
 
     def copied_to(self, table: "KeyframeTable") -> "Keyframe":
-        """A copy for another table, which stays what this one is now; its pose is not copied."""
+        """A snapshot for another table, without the pose."""
         twin = copy.copy(self)
         twin.prior, twin.measured = copy.copy(self.prior), copy.copy(self.measured)
         twin.table = table
         return twin
 
     def as_it_is(self) -> "Keyframe":
-        """A copy with its pose that stays what this one is now, in no table that others see."""
+        """A snapshot with its pose, in a table of its own."""
         twin = self.copied_to(self.table.mirror())
         twin.T_cw = self.T_cw
         return twin

@@ -211,15 +211,15 @@ class LensEvidence:
     def considered(
         self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
     ) -> Considered:
-        """The error that the lens has, and what it does to poses and depths.
+        """Second moments of what the error of the lens does to poses and depths.
 
-        By what matches say of it and what was known of it (:func:`lens_prior`) together: their
-        estimate moves them as far as it would if it were taken off, and what it leaves open does
-        too; and by what is left of a focal length that was ``corrected`` by a factor, which they do
-        not tell of. Of a readout that was asked for, too, ``doubt`` is the deviation as a part of
-        it. Without ``LEAST``: what matches have wrong in common is taken for an error of the lens
-        that hardly moves a pose, and three sizes that were each so unsure would move them two to
-        five times as far.
+        The matches' estimate is combined with the prior (:func:`lens_prior`). Poses and depths move
+        by the estimate, as if it were taken off, and by what it leaves open; besides by what is
+        left of a focal length that was ``corrected`` by a factor, which matches do not tell of.
+        ``doubt`` is the deviation of a readout that is one more size, as a fraction of it.
+        ``LEAST`` is not added: errors that matches have in common pass for one of the lens that
+        hardly moves a pose, and three sizes of such deviations would move poses two to five times
+        as far.
         """
         said = _estimate(self.information, self.gradient)
         expected = (*lens_prior(focal_deviation), doubt)

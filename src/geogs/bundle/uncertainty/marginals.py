@@ -236,9 +236,9 @@ def _normalised_residual(
 ) -> Float[Tensor, "n"]:
     """Median residual from each frame; infinite without matches.
 
-    On a bare wall the flow goes on as it does around: residuals of matches that say next to nothing
-    are a small part of their deviations, however well or badly the others fit, so that by number
-    alone the more of an image is bare, the better all would seem to be known.
+    Matches count by their information. On a bare wall the flow continues what is around it, so its
+    residuals are small however badly the others fit: counted by number, an image would seem the
+    better known the more of it is bare.
     """
     found = torch.full((len(problem.T_cw),), torch.inf)
     for frame, norm, information in part.residuals(options):
