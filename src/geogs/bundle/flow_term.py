@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import CellProjection
 from geogs.bundle.protocols import BundleOptions
@@ -36,10 +36,15 @@ class SourceFlow:
     """Diagonal of the chained equations before any depth is eliminated, where it is asked for."""
 
     @property
+    def depth(self) -> DepthEquations:
+        """Equations of the source's inverse depths."""
+        assert self.edges.depth is not None
+        return self.edges.depth
+
+    @property
     def information(self) -> Float[Tensor, "p"]:
         """Information of the source's inverse depths."""
-        assert self.edges.depth is not None
-        return self.edges.depth.information
+        return self.depth.information
 
 
 @runtime_checkable

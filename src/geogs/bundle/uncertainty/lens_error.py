@@ -374,7 +374,6 @@ def _reduced(
         state = BundleState(part.T_cw, part.inverse_depth, thinned.lens)
         for source in linearised_sources(flow, part, state, options):
             edges = source.edges
-            assert edges.depth is not None
             hessian, gradient = edges.chained()
             c = len(gradient) - edges.shared
             yield _Reduced(
@@ -382,7 +381,7 @@ def _reduced(
                 hessian[:c, :c],
                 -hessian[:c, c:],
                 gradient[:c],
-                -edges.depth.coupling[-edges.shared :],
+                -source.depth.coupling[-edges.shared :],
                 hessian[c:, c:],
                 gradient[c:],
             )

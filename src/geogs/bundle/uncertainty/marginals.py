@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, weighed_residuals
-from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import sources_within
 from geogs.bundle.projection import linearise, relative_motion
@@ -130,7 +129,7 @@ def marginals(
     for source in part.sources(options):
         frame = source.frame
         if bool(problem.free_depth[frame]):
-            sigma = _depth_variance(source.edges, covariance).sqrt()
+            sigma = _depth_variance(source, covariance).sqrt()
             relative[frame] = sigma / part.inverse_depth[frame].clamp(min=1e-12)
     return Marginals(covariance, relative, _normalised_residual(problem, part, options))
 
@@ -192,8 +191,7 @@ def _common_pulls(
         pose, own = p.pose_jacobian * unit.mT[:, None], (p.depth_jacobian * unit).mT
         sources = linearised_sources(flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(i), strict=True):
-            depth, chain = source.edges.depth, source.edges.chain
-            assert depth is not None
+            depth, chain = source.depth, source.edges.chain
             follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
             along = torch.einsum("se,ekap->asekp", size[:, e], pose[e]).flatten(0, 1).flatten(1, 2)
             owns = torch.einsum("se,eap->asp", size[:, e], own[e]).flatten(0, 1)
@@ -254,11 +252,10 @@ def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
     return along / along.norm().clamp(min=1e-12)
 
 
-def _depth_variance(edges: HyperEdge, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
+def _depth_variance(source: SourceFlow, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
     """Variance of a source's inverse depths, by its matches and the covariance of its poses."""
-    depth, rows = edges.depth, edges.rows(len(covariance) // 6)
-    assert depth is not None
-    E = edges.chained_coupling()
+    depth, rows = source.depth, source.edges.rows(len(covariance) // 6)
+    E = source.edges.chained_coupling()
     among = covariance[rows[:, None], rows].to(E)
     through_poses = (E * (among @ E)).sum(0) / depth.curvature.square()
     return torch.where(depth.information > 0, ALIKE / depth.curvature + through_poses, torch.inf)

@@ -50,8 +50,7 @@ class ThinnedProblem:
         As fractions of these: ``C^-1 (pull - E^T moves)``, with their ``pull`` at the depths and
         the ``moves`` of all poses by them. Zero for what is fixed, or has no match.
         """
-        depth, rows = source.edges.depth, source.edges.rows(len(moves) // 6)
-        assert depth is not None
+        depth, rows = source.depth, source.edges.rows(len(moves) // 6)
         left = pull - source.edges.chained_coupling().mT @ moves[rows].to(pull)
         scale = depth.curvature * self.inverse_depth[source.frame].clamp(min=1e-12)
         known = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
