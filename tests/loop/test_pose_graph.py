@@ -25,6 +25,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop import matched_edges, pose_graph
 from geogs.loop.closure import ClosingQuestion, LoopClosure, close_loops
 from geogs.loop.consistency import AGREEMENT, consistent_loops, cycle_errors
+from geogs.loop.constraints import joined
 from geogs.loop.matched_edges import GraphState, MatchedEdges
 from geogs.loop.pose_graph import (
     PoseGraph,
@@ -151,18 +152,13 @@ def next_bay(d: Drive, count: int, seed: int = 4) -> RelativePoses:
     return as_loops(i, j, G)
 
 
-def joined(*parts: RelativePoses) -> RelativePoses:
-    names = ("source", "target", "G", "information", "is_loop")
-    return RelativePoses(*(torch.cat([getattr(p, k) for p in parts]) for k in names))
-
-
 def first_fixed(n: int) -> torch.Tensor:
     return torch.arange(n) == 0
 
 
 def close(d: Drive, *extra: RelativePoses) -> tuple[PoseGraphResult, torch.Tensor]:
     """Vote, adjust; the result, and which loops were voted for."""
-    relative = joined(d.odometry, *extra)
+    relative = joined([d.odometry, *extra])
     keep = consistent_loops(d.T_cw, relative)
     result = solve(PoseGraph(d.T_cw, relative.select(keep), first_fixed(KEYFRAMES)))
     return result, keep[relative.is_loop]
@@ -353,7 +349,7 @@ def test_false_loops_are_outvoted(name):
 
 def test_odometry_alone_could_not_tell_the_next_bay():
     d = drive()
-    relative = joined(d.odometry, loops(d, 20), next_bay(d, 12))
+    relative = joined([d.odometry, loops(d, 20), next_bay(d, 12)])
     pairs, alone = cycle_errors(d.T_cw, relative)
     assert alone.max() < AGREEMENT
     assert pairs[20:, 20:].max() < AGREEMENT  # they support each other
@@ -362,7 +358,7 @@ def test_odometry_alone_could_not_tell_the_next_bay():
 
 def test_the_kernel_alone_resists_random_loops():
     d = drive()
-    relative = joined(d.odometry, loops(d, 20), random_loops(20))
+    relative = joined([d.odometry, loops(d, 20), random_loops(20)])
     result = solve(PoseGraph(d.T_cw, relative, first_fixed(KEYFRAMES)))
     clean, _ = twenty_true_loops()
     weight = result.loop_weight[relative.is_loop]
@@ -373,7 +369,7 @@ def test_the_kernel_alone_resists_random_loops():
 
 def test_the_vote_forgives_odometry_that_is_too_sure_of_itself():
     d = drive()
-    relative = joined(d.odometry, loops(d, 20), random_loops(10), next_bay(d, 12))
+    relative = joined([d.odometry, loops(d, 20), random_loops(10), next_bay(d, 12)])
     sure = torch.where(relative.is_loop[:, None], 1.0, 10.0) * relative.information
     keep = consistent_loops(d.T_cw, replace(relative, information=sure))[relative.is_loop]
     assert keep[:20].all()
@@ -532,7 +528,7 @@ def closure(T_cw: torch.Tensor, relative: RelativePoses, *args, **kwargs) -> Loo
 
 def test_closing_loops_with_matches():
     d = drive()
-    relative = joined(d.odometry, loops(d, 8), random_loops(4))
+    relative = joined([d.odometry, loops(d, 8), random_loops(4)])
     true = [(0, 190), (1, 197), (190, 0), (197, 1), (197, 198), (0, 1), (1, 0), (190, 191)]
     false = [(int(relative.source[-1]), int(relative.target[-1]))]
     matches = in_view(d, true + false)
@@ -557,7 +553,7 @@ def test_closing_loops_with_matches():
 def test_no_loop_to_believe_corrects_nothing():
     d = drive()
     assert closure(d.T_cw, d.odometry) is None
-    assert closure(d.T_cw, joined(d.odometry, random_loops(3))) is None
+    assert closure(d.T_cw, joined([d.odometry, random_loops(3)])) is None
 
 
 def test_a_metric_map_keeps_its_scales():

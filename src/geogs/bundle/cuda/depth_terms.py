@@ -1,20 +1,24 @@
 """Terms of depths on the GPU, each of which has a place in the kernels."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
+from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.depth_terms import MEASURED_HUBER, DepthDamping, MeasuredDepths
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.terms import DepthTerm
 
 
-@dataclass(frozen=True)
-class KernelDepthTerms:
-    """What the kernel ``sum_sources`` takes beside the matches."""
+class KernelDepthTerms(NamedTuple):
+    """What the kernel ``sum_sources`` takes beside the matches; contiguous, none without."""
 
-    damping: DepthDamping | None = None
-    measured: MeasuredDepths | None = None
+    damping: Float[Tensor, "n p"] | None = None
+    """Curvature of a :class:`DepthDamping`."""
+    measured: Float[Tensor, "n p"] | None = None
+    """Inverse depth of :class:`MeasuredDepths`."""
+    information: Float[Tensor, "n p"] | None = None
+    """Their information."""
 
     @staticmethod
     def of(terms: Iterable[DepthTerm]) -> "KernelDepthTerms":
@@ -22,27 +26,16 @@ class KernelDepthTerms:
         found = KernelDepthTerms()
         for term in terms:
             if isinstance(term, DepthDamping) and found.damping is None:
-                found = replace(found, damping=term)
+                found = found._replace(damping=term.curvature.contiguous())
             elif isinstance(term, MeasuredDepths) and found.measured is None:
-                found = replace(found, measured=term)
+                measured, information = term.inverse_depth, term.information
+                found = found._replace(
+                    measured=measured.contiguous(), information=information.contiguous()
+                )
             else:
                 raise TypeError(f"The GPU has no kernel for another {type(term).__name__}.")
         return found
 
     def of_rows(self, rows: Tensor) -> "KernelDepthTerms":
         """The same for some of the frames alone."""
-        damping, measured = self.damping, self.measured
-        if damping is not None:
-            damping = DepthDamping(damping.curvature[rows])
-        if measured is not None:
-            measured = MeasuredDepths(measured.inverse_depth[rows], measured.information[rows])
-        return KernelDepthTerms(damping, measured)
-
-    @property
-    def arguments(self) -> tuple[Tensor | None, Tensor | None, Tensor | None, float]:
-        """What ``sum_sources`` takes."""
-        damping = None if self.damping is None else self.damping.curvature.contiguous()
-        if self.measured is None:
-            return damping, None, None, MEASURED_HUBER
-        measured = self.measured.inverse_depth.contiguous()
-        return damping, measured, self.measured.information.contiguous(), MEASURED_HUBER
+        return KernelDepthTerms(*(x if x is None else x[rows] for x in self))

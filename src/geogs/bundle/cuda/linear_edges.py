@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.depth_terms import MEASURED_HUBER
 from geogs.bundle.flow_term import BEHIND
 from geogs.bundle.protocols import BundleOptions
 from geogs.gpu.kernels import Kernel
@@ -123,10 +124,10 @@ class LinearisedEdges:
             self.cells, c.fx, c.fy, c.cx, c.cy, options.huber, self.motion, self.normal,
             self.coupling, curvature, gradient,
         )  # fmt: skip
-        damping, *measured = terms.arguments
         self.kernels["sum_sources"](
             len(depth), self.block, a.first, curvature, gradient, self.cells,
-            options.depth_damping, damping, depth, *measured, self.information, *self.depths,
+            options.depth_damping, terms.damping, depth, terms.measured, terms.information,
+            MEASURED_HUBER, self.information, *self.depths,
         )  # fmt: skip
 
     def eliminate(self, blocks: Tensor, vectors: Tensor) -> None:
