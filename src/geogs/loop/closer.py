@@ -101,8 +101,8 @@ class LoopCloser:
     def update(self, result: TrackResult, is_last: bool = False) -> tuple[int, ...]:
         """After a frame: look for loops at the keyframes that became final, and act on them.
 
-        Returns the ids of final keyframes that became part of the world; whether it was corrected,
-        its segment of the store tells.
+        Returns the ids of final keyframes that became part of the world. Corrections are taken
+        from its keyframes (``KeyframeSet.take_corrections``).
         """
         if not self.config.enabled:
             return ()
@@ -328,12 +328,12 @@ class LoopCloser:
 
     def _change(self, correction: PoseCorrection) -> float:
         """How far a correction moves the keyframe that it moves most."""
-        store, ids = self.segments.main.keyframes, sorted(correction.before)
+        keyframes, ids = self.segments.main.keyframes, sorted(correction.before)
         scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
         S = torch.stack([correction.after[k] for k in ids])
         S[:, :3] *= scale[:, None, None]
         before = torch.stack([correction.before[k] for k in ids])
-        return float(disagreement(S, before, store.median_depths(ids)).max())
+        return float(disagreement(S, before, keyframes.median_depths(ids)).max())
 
 
 def _rescale(known: SegmentConstraints, correction: PoseCorrection) -> None:

@@ -121,11 +121,11 @@ class LoopDetector:
 
     def candidates(self, id: int) -> list[int]:
         """Keyframes that the present poses say a taken one sees again, nearest first."""
-        facing, store = self._facing(id), self.keyframes.set_of[id]
+        facing, segment = self._facing(id), self.keyframes.set_of[id]
         if not facing:
             return []
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
-        there, back = frame_distances(store, directed, ROTATION_WEIGHT).chunk(2)
+        there, back = frame_distances(segment, directed, ROTATION_WEIGHT).chunk(2)
         limit = MAX_FLOW_DISTANCE * self.grid.camera.long_edge
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
         return [facing[n] for n in order[distance < limit].tolist()]
@@ -165,8 +165,12 @@ class LoopDetector:
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
-        gap, store = self._order[id] - self.config.min_gap, self.keyframes.set_of[id]
-        return frozenset(k for k in self.table.keyframes[max(gap, 0) :] if k in store)
+        segment, recent = self.keyframes.set_of[id], self.table.keyframes[self._first_near(id) :]
+        return frozenset(k for k in recent if k in segment)
+
+    def _first_near(self, id: int) -> int:
+        """Rank of the first keyframe at most ``min_gap`` keyframes before one."""
+        return max(self._order[id] - self.config.min_gap, 0)
 
     def _depths(self) -> Depths:
         """What is known of the depth of all keyframes now; they are replaced, never changed."""
@@ -175,12 +179,11 @@ class LoopDetector:
 
     def _facing(self, id: int) -> list[int]:
         """The earlier keyframes nearest by that look roughly the same way; there are never many."""
-        store = self.keyframes.set_of[id]
-        gap = max(self._order[id] - self.config.min_gap, 0)
-        old = np.array(self.table.keyframes[:gap], np.int64)
-        depth = 1 / float(store[id].inverse_depth.median())
+        segment = self.keyframes.set_of[id]
+        old = np.array(self.table.keyframes[: self._first_near(id)], np.int64)
+        depth = 1 / float(segment[id].inverse_depth.median())
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
-        return list(islice((k for k in around.tolist() if k in store), MEASURED))
+        return list(islice((k for k in around.tolist() if k in segment), MEASURED))
 
     def _decide(self, settled: Sequence[Pair]) -> list[Loop]:
         """The loops among the candidates of the keyframe whose turn it is."""
