@@ -39,11 +39,7 @@ from geogs.loop.relative_pose import relative_poses
 from geogs.mapping.map_update import anchor_transforms
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import RelativePoses
-from oracles.pose_graph_reference import (
-    gauss_newton_step,
-    match_residuals,
-    relative_residuals,
-)
+from oracles.pose_graph_reference import gauss_newton_step, match_residuals, relative_residuals
 
 F64 = torch.float64
 KEYFRAMES = 200
@@ -329,11 +325,7 @@ FALSE = {
     "random 50 %": lambda d: [random_loops(20)],
     "twin room": lambda d: [twin_room(d, 15)],
     "next bay": lambda d: [next_bay(d, 12)],
-    "twin room, next bay and random": lambda d: [
-        twin_room(d, 8),
-        next_bay(d, 8),
-        random_loops(8),
-    ],
+    "twin room, next bay and random": lambda d: [twin_room(d, 8), next_bay(d, 8), random_loops(8)],
 }
 
 

@@ -74,10 +74,7 @@ class SparseCameraSystem:
     """
 
     def __init__(
-        self,
-        source: Int[Tensor, "e"],
-        target: Int[Tensor, "e"],
-        free_pose: Bool[Tensor, "n"],
+        self, source: Int[Tensor, "e"], target: Int[Tensor, "e"], free_pose: Bool[Tensor, "n"]
     ) -> None:
         self._free = free_pose
         self._count = n = int(free_pose.sum())

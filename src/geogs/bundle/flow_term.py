@@ -81,10 +81,7 @@ def linearised_sources(
 
 
 def weighed_residuals(
-    p: CellProjection,
-    pixels: Float[Tensor, "e p 2"],
-    weight: Float[Tensor, "e p 2"],
-    huber: float,
+    p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
     """Measured less projected positions r, and their weights: none behind the target.
 

@@ -69,10 +69,7 @@ class BlockSystem:
         return torch.equal(row, self._given[0]) and torch.equal(column, self._given[1])
 
     def solve(
-        self,
-        block: Float[Tensor, "b 7 7"],
-        gradient: Float[Tensor, "n 7"],
-        damping: float,
+        self, block: Float[Tensor, "b 7 7"], gradient: Float[Tensor, "n 7"], damping: float
     ) -> Float[Tensor, "n 7"] | None:
         """The solution after the diagonal was raised by a fraction of it; None if it is singular.
 

@@ -135,11 +135,7 @@ def _consensus(ratios: Float[Tensor, "m"]) -> tuple[float, float]:
 
 
 def _seen_through(
-    grid: SampleGrid,
-    source: Keyframe,
-    target: Keyframe,
-    T_ts: Float[Tensor, "4 4"],
-    scale: float,
+    grid: SampleGrid, source: Keyframe, target: Keyframe, T_ts: Float[Tensor, "4 4"], scale: float
 ) -> float:
     """Fraction of the source's surface in the target's view behind which the target has its own.
 

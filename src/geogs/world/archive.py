@@ -243,12 +243,7 @@ class Archived:
     __slots__ = ("__weakref__", "archive", "checksum", "dtype", "offset", "shape")
 
     def __init__(
-        self,
-        archive: Archive,
-        offset: int,
-        shape: tuple[int, ...],
-        dtype: np.dtype,
-        checksum: int,
+        self, archive: Archive, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
     ) -> None:
         self.archive = archive
         self.offset = offset

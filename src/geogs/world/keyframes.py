@@ -170,9 +170,7 @@ class Keyframe:
             known = known + self.prior.information
         return known / (1 + known * floor)
 
-    def depth_field(
-        self,
-    ) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
+    def depth_field(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
         """Inverse depth and its ``confident_information`` as images of cells, on the CPU."""
         grid = self.grid
         fields = torch.stack([self.inverse_depth, self.confident_information])

@@ -10,12 +10,7 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.linear_edges import (
-    EdgeArrays,
-    LinearisedEdges,
-    edge_costs,
-    joined_edges,
-)
+from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, edge_costs, joined_edges
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.bundle.protocols import BundleOptions, BundleResult

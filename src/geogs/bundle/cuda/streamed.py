@@ -16,12 +16,7 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.linear_edges import (
-    EdgeArrays,
-    LinearisedEdges,
-    edge_costs,
-    joined_edges,
-)
+from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, edge_costs, joined_edges
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.problem import StreamedProblem, source_chunks
 from geogs.bundle.protocols import BundleOptions, BundleResult

@@ -20,12 +20,7 @@ from torch import Tensor
 from geogs.bundle.flow_term import linearised_sources
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import (
-    CellProjection,
-    carried_over,
-    project,
-    relative_motion,
-)
+from geogs.bundle.projection import CellProjection, carried_over, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.bundle.uncertainty.marginals import Considered, pose_covariance

@@ -101,10 +101,7 @@ class Marginals:
 
 
 def marginals(
-    grid: SampleGrid,
-    problem: AnyProblem,
-    options: BundleOptions,
-    cells: int = 1024,
+    grid: SampleGrid, problem: AnyProblem, options: BundleOptions, cells: int = 1024
 ) -> Marginals:
     """Marginal variances at the present state of a problem, its matches as good as they say.
 
