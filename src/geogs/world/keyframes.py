@@ -413,10 +413,9 @@ class KeyframeSet:
 
 
 def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:
-    """Look whether sets that were read are of a table that was, and this of the camera of its grid.
+    """Check that sets that were read are of a table that was, and this of the camera of its grid.
 
-    Raises:
-        InputError: a keyframe is missing, of another camera, or not in its place.
+    Raises InputError if a keyframe is missing, of another camera, or not in its place.
     """
     sizes, seen = table.grid.sizes, set[int]()
     check_tables(KeyframeTable, table, sizes, {})

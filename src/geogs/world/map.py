@@ -155,10 +155,9 @@ class MapTable:
 
 
 def check_map(table: MapTable, keyframes: KeyframeTable, size: tuple[int, int]) -> None:
-    """Look whether a table that was read is of these keyframes; ``size`` is height and width.
+    """Check that a table that was read is of these keyframes; ``size`` is height and width.
 
-    Raises:
-        InputError: it is incomplete, or of other keyframes.
+    Raises InputError if it is incomplete, or of other keyframes.
     """
     height, width = size
     check_tables(MapTable, table, {}, {"keyframes": keyframes})

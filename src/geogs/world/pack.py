@@ -64,8 +64,7 @@ class Packed:
 def pack(kind: Any, record: object) -> Packed:
     """Take apart a record of a kind (a type as an annotation has it).
 
-    Raises:
-        TypeError: something in it is not of its declared type, or cannot be stored.
+    Raises TypeError if something in it is not of its declared type, or cannot be stored.
     """
     packed = Packed()
     packed.values = _Packer(packed).value(kind, record, "")
@@ -84,8 +83,7 @@ def unpack(
 
     ``name`` is the place of the record in the one that was packed.
 
-    Raises:
-        InputError: a part is missing, superfluous, or not of its declared type; the text names it.
+    Raises InputError, which names the part, if one is missing, superfluous, or of another type.
     """
     return _Unpacker(arrays, archives, torch.device(device)).value(kind, values, name)
 

@@ -235,11 +235,9 @@ class SegmentTable:
 
 
 def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -> None:
-    """Check segments that were read; their keyframes are attached to the table.
+    """Check segments that were read, of at most so many ``frames``; their keyframes are attached.
 
-    Raises:
-        InputError: one is of other keyframes or another camera, or the table is incomplete; there
-            cannot be more than so many ``frames``.
+    Raises InputError if one is of other keyframes or another camera, or the table is incomplete.
     """
     numbers = [segment.number for segment in table.segments]
     here = {table.main, table.current} if numbers else set[int]()
