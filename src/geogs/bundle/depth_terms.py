@@ -1,6 +1,7 @@
 """Terms of single inverse depths: what resists their change, and what a sensor has measured."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -21,11 +22,8 @@ class DepthDamping:
 
     curvature: Float[Tensor, "n p"]
     """Added to that of the matches, sum_e w |dp/dd|^2."""
-
-    @property
-    def information(self) -> None:
-        """None: it measures nothing."""
-        return
+    information: ClassVar[None] = None
+    """It measures nothing."""
 
     def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
         return DepthEquations.alone(self.curvature[frame])

@@ -80,7 +80,10 @@ class LensBlock:
         """Where the cells of the sources fall in the targets; depths are those of the sources."""
         T_ji = relative_motion(T_cw, source, target)
         y, valid, z = seen_from_targets(self.rays.rays, T_ji, inverse_depth)
-        return CellProjection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
+        x, c = y[..., :2] / z[..., None], self.lens.camera
+        growth = self.lens.growth(x.square().sum(-1, keepdim=True))
+        pixels = x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])
+        return CellProjection(pixels, valid, z)
 
 
 @dataclass(frozen=True)
@@ -108,9 +111,3 @@ def lens_rays(lens: RadialLens, pixels: Float[Tensor, "p 2"]) -> LensRays:
     x = distorted / growth[:, None]
     slope = torch.stack([-growth / steep, -square / steep, -square.square() / steep])
     return LensRays(torch.cat([x, torch.ones_like(x[:, :1])], -1), slope)
-
-
-def _to_pixels(lens: RadialLens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:
-    c = lens.camera
-    growth = lens.growth(x.square().sum(-1, keepdim=True))
-    return x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])
