@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from geogs.bundle.problem import BundleProblem
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
@@ -40,3 +40,18 @@ def disturbed(problem: BundleProblem, pose: float, depth: float, seed: int = 1) 
         T_cw=torch.where(problem.free_pose[:, None, None], retract(xi, problem.T_cw), problem.T_cw),
         inverse_depth=torch.where(problem.free_depth[:, None], d, problem.inverse_depth),
     )
+
+
+def streamed(p: BundleProblem) -> StreamedProblem:
+    """The same problem, whose matches are fetched when they are needed."""
+    return StreamedProblem(
+        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth, p.depth_terms,
+        p.pose_terms, matches=lambda e: (p.pixels[e], p.weight[e]),
+    )  # fmt: skip
+
+
+def on(p: BundleProblem, device: torch.device) -> BundleProblem:
+    """The same problem with its dense tensors on a device, poses and structure on the CPU."""
+    dense = {n: getattr(p, n).to(device) for n in ("inverse_depth", "pixels", "weight")}
+    terms = (replace(t, **{n: x.to(device) for n, x in vars(t).items()}) for t in p.depth_terms)
+    return replace(p, **dense, depth_terms=tuple(terms))

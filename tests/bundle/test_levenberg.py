@@ -9,14 +9,14 @@ from torch import Tensor
 
 import geogs.bundle.cuda.dense as cuda_dense
 import geogs.bundle.cuda.streamed as cuda_streamed
-from bundle_scenes import CAMERA, disturbed, scene
+from bundle_scenes import CAMERA, disturbed, on, scene, streamed
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle, DenseSchur
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.motion_term import MeasuredMotions
-from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.problem import BundleProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle, StreamedSchur
 from geogs.bundle.terms import BundleState
@@ -60,30 +60,12 @@ def told(pose: float = 0.02, depth: float = 0.05) -> tuple[SampleGrid, BundlePro
     )
 
 
-def streamed(p: BundleProblem) -> StreamedProblem:
-    return StreamedProblem(
-        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth, p.depth_terms,
-        p.pose_terms, matches=lambda e: (p.pixels[e], p.weight[e]),
-    )  # fmt: skip
-
-
-def on(p: BundleProblem, device: torch.device) -> BundleProblem:
-    """Dense tensors on the device."""
-    dense = {n: getattr(p, n).to(device) for n in ("inverse_depth", "pixels", "weight")}
-    return replace(p, **dense, depth_terms=tuple(_there(t, device) for t in p.depth_terms))
-
-
-def _there(term, device: torch.device):
-    return replace(term, **{n: x.to(device) for n, x in vars(term).items()})
-
-
 def costs(grid: SampleGrid, problem: BundleProblem, device: torch.device) -> dict[str, float]:
     """What each solver takes for the cost at the start."""
     options = replace(LEVENBERG, chunk=5)
     bundle = cuda_dense.CudaDenseBundle(SampleGrid(grid.camera, device))
     there = on(problem, device)
-    workspace = cuda_dense._Workspace(there, bundle._structure_of(there, device), bundle.kernels)
-    steps = cuda_dense._DenseSteps(bundle, there, options, workspace)
+    steps = cuda_dense._DenseSteps(bundle, there, options)
     many = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
     flow = LensFlow.of_pinhole(grid)
     state = problem.start

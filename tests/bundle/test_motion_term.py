@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bundle_scenes import CAMERA, disturbed, scene
+from bundle_scenes import CAMERA, disturbed, scene, streamed
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.motion_term import MeasuredMotions
-from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.problem import BundleProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
 from geogs.geometry.lie import move, retract, se3_exp, se3_inverse
@@ -80,12 +80,11 @@ def test_streamed_steps_are_those_of_the_dense_solver():
         p, source=p.source[near], target=p.target[near], pixels=p.pixels[near],
         weight=p.weight[near],
     )  # fmt: skip
-    streamed = StreamedProblem(
-        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth,
-        pose_terms=p.pose_terms, matches=lambda e: (p.pixels[e], p.weight[e]),
-    )  # fmt: skip
     options = BundleOptions(iterations=3, huber=0.5, chunk=3)
-    slow, fast = DenseBundle(grid).solve(p, options), StreamedBundle(grid).solve(streamed, options)
+    slow, fast = (
+        DenseBundle(grid).solve(p, options),
+        StreamedBundle(grid).solve(streamed(p), options),
+    )
     assert fast.finite
     torch.testing.assert_close(fast.T_cw, slow.T_cw, rtol=0, atol=1e-6)
     torch.testing.assert_close(fast.inverse_depth, slow.inverse_depth, rtol=1e-5, atol=1e-6)

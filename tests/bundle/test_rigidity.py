@@ -7,8 +7,8 @@ import geogs.bundle.cuda.rigidity as cuda_rigidity
 from bundle_scenes import scene
 from cuda_emulator import use_emulator
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import project, relative_motion
-from geogs.bundle.rigidity import BEHIND, DEPTH_RANGE, best_residuals
+from geogs.bundle.projection import INVERSE_DEPTHS, project, relative_motion
+from geogs.bundle.rigidity import BEHIND, best_residuals
 from geogs.world.grid import SampleGrid
 
 HUBER = 0.5
@@ -70,7 +70,7 @@ def test_unmatched_cells_have_no_residual_and_points_behind_a_large_one():
         problem.weight[:1],
     )  # fmt: skip
     assert float(left[0, 7:].min()) > 10
-    assert DEPTH_RANGE[0] < 0.05
+    assert INVERSE_DEPTHS[0] < 0.05
 
 
 @pytest.mark.parametrize("place", ["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
@@ -91,7 +91,7 @@ def test_the_kernel_leaves_what_pytorch_leaves(place, monkeypatch):
     T_ji = relative_motion(p.T_cw, p.source, p.target)[turned]
     found = cuda_rigidity.best_residuals(
         grid.camera, grid.rays.to(device), T_ji, p.inverse_depth.to(device), p.source[turned],
-        p.pixels[turned].to(device), p.weight[turned].to(device), HUBER, 3, DEPTH_RANGE, BEHIND,
+        p.pixels[turned].to(device), p.weight[turned].to(device), HUBER, 3, INVERSE_DEPTHS, BEHIND,
     ).cpu()  # fmt: skip
     off = (found - expected[turned]).abs() > 1e-3 + 1e-3 * expected[turned]
     assert float(off.float().mean()) < 0.002  # on the verge of lying behind

@@ -5,19 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bundle_scenes import disturbed, scene
+from bundle_scenes import disturbed, scene, streamed
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
-from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
-
-
-def streamed(p: BundleProblem) -> StreamedProblem:
-    return StreamedProblem(
-        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth, p.depth_terms,
-        matches=lambda e: (p.pixels[e], p.weight[e]),
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("chunk", [1, 100])

@@ -1,17 +1,16 @@
 """The GPU's adjustment of large problems against the dense solver of the CPU."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
 import geogs.bundle.cuda.streamed as cuda_streamed
-from bundle_scenes import disturbed, scene
+from bundle_scenes import disturbed, on, scene, streamed
 from cuda_emulator import use_emulator
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.motion_term import MeasuredMotions
-from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.protocols import BundleOptions
 from geogs.world.grid import SampleGrid
 
@@ -25,19 +24,6 @@ def device(request, monkeypatch) -> torch.device:
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")
     return torch.device("cuda")
-
-
-def streamed(p: BundleProblem, device: torch.device) -> StreamedProblem:
-    """Dense tensors on the device, poses and structure on the CPU."""
-    terms = (
-        replace(t, **{f.name: getattr(t, f.name).to(device) for f in fields(t)})
-        for t in p.depth_terms
-    )
-    return StreamedProblem(
-        p.T_cw, p.inverse_depth.to(device), p.source, p.target, p.free_pose, p.free_depth,
-        tuple(terms), p.pose_terms,
-        matches=lambda e: (p.pixels[e].to(device), p.weight[e].to(device)),
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("edges", [1, 6, 1024])
@@ -63,7 +49,7 @@ def test_steps_are_those_of_the_dense_solver(device, edges, monkeypatch):
     options = BundleOptions(iterations=2, huber=0.5)
     slow = DenseBundle(grid).solve(problem, options)
     solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
-    fast = solver.solve(streamed(problem, device), options)
+    fast = solver.solve(streamed(on(problem, device)), options)
     assert fast.finite
     assert float((slow.T_cw - problem.T_cw).abs().max()) > 0.01
     torch.testing.assert_close(fast.T_cw, slow.T_cw, rtol=0, atol=2e-5)
@@ -85,7 +71,7 @@ def test_measured_motions_count_as_in_the_dense_solver(device):
     slow, without = (
         DenseBundle(grid).solve(replace(problem, pose_terms=m), options) for m in ((motions,), ())
     )
-    fast = solver.solve(streamed(replace(problem, pose_terms=(motions,)), device), options)
+    fast = solver.solve(streamed(on(replace(problem, pose_terms=(motions,)), device)), options)
     assert float((slow.T_cw - without.T_cw).abs().max()) > 3e-4
     torch.testing.assert_close(fast.T_cw, slow.T_cw, rtol=0, atol=2e-5)
 
@@ -94,7 +80,7 @@ def test_steps_that_are_not_finite_are_refused(device):
     grid, problem = scene()
     pixels = problem.pixels.clone()
     pixels[0, 0] = torch.nan
-    bad = streamed(replace(problem, pixels=pixels), device)
+    bad = streamed(on(replace(problem, pixels=pixels), device))
     solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
     result = solver.solve(bad, BundleOptions())
     assert not result.finite
@@ -104,7 +90,7 @@ def test_steps_that_are_not_finite_are_refused(device):
 
 def test_small_steps_end_the_adjustment(device):
     grid, truth = scene()
-    start = streamed(disturbed(truth, 0.02, 0.05), device)
+    start = streamed(on(disturbed(truth, 0.02, 0.05), device))
     solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
     ended = solver.solve(start, BundleOptions(iterations=50, huber=10.0, tolerance=0.5))
     one = solver.solve(start, BundleOptions(iterations=1, huber=10.0))

@@ -1,6 +1,7 @@
 """Loops are verified by features, depth and flow; look-alikes of another shape are refused."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -186,6 +187,30 @@ def test_close_pairs_suppress_each_other(walk):
     for n, (a, b) in enumerate(pairs):
         assert b - a > 10
         assert all(abs(a - c) + abs(b - d) > search.SUPPRESSION for c, d in pairs[:n])
+
+
+def test_near_what_is_settled_nothing_is_looked_at(walk, monkeypatch):
+    store, operator = walk
+    checked = []
+    check = detect.dense_check
+    monkeypatch.setattr(
+        detect, "dense_check", lambda *of: checked.append((of[2].id, of[3].id)) or check(*of)
+    )
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
+    assert detector.update(store.ids[: LAP + 1], is_last=True, settled=[(0, LAP)]) == ()
+    assert checked == []
+    assert detector.update(store.ids[LAP + 1 : LAP + 2], is_last=True)
+    assert checked
+
+
+def test_what_two_loops_say_together_is_not_asked_again(walk, monkeypatch):
+    _suppress(monkeypatch, 1)
+    store, operator = walk
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
+    first = detector.update(store.ids, is_last=True)
+    assert {(loop.first % LAP, loop.second % LAP) for loop in first} & {(0, 0), (0, 1), (1, 1)}
+    implied = detector._is_implied(0, [replace(first[0], first=first[0].second)], ())
+    assert implied == (first[0].first <= 1)
 
 
 def test_update_is_deterministic(path):

@@ -10,18 +10,14 @@ from drifted_walk import closer_of, world
 from geogs.config import LoopConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.loop import detect, settled
-from geogs.loop.detect import LoopDetector
+from geogs.loop import settled
 from geogs.loop.settled import settled_pairs
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import RelativePoses
 from keyframe_samples import Sample, segment_of
-from lit_rooms import lit_room
-from loop_scenes import keyframes, orbit, room_views
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 COUNT, GAP, CHANGE = 30, 10, 0.002
-LAP, AGAIN = 18, 3
 
 
 @pytest.fixture
@@ -83,41 +79,6 @@ def test_only_recent_keyframes_matter(segment, monkeypatch):
     monkeypatch.setattr(settled, "RECENT", 10)
     known = relative(segment, 3, 18)
     assert settled_pairs(segment, known, [(2, 17), (5, 21)], GAP, CHANGE) == [(5, 21)]
-
-
-@pytest.fixture(scope="module")
-def laps():
-    """A lap of a room and the beginning of two more, 4 and 8 degrees aside."""
-    scene = lit_room(3).scene
-    poses = orbit(scene, LAP)
-    for lap in (1, 2):
-        poses += orbit(scene, LAP, np.radians(4 * lap))[:AGAIN]
-    return room_views(3, poses), poses
-
-
-def test_near_what_is_settled_nothing_is_looked_at(laps, monkeypatch):
-    store, operator = keyframes(*laps)
-    checked = []
-    check = detect.dense_check
-    monkeypatch.setattr(
-        detect, "dense_check", lambda *of: checked.append((of[2].id, of[3].id)) or check(*of)
-    )
-    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=GAP))
-    assert detector.update(store.ids[: LAP + 1], is_last=True, settled=[(0, LAP)]) == ()
-    assert checked == []
-    assert detector.update(store.ids[LAP + 1 : LAP + 2], is_last=True)
-    assert checked
-
-
-def test_what_two_loops_say_together_is_not_asked_again(laps, monkeypatch):
-    for module in ("search", "detect"):
-        monkeypatch.setattr(f"geogs.loop.{module}.SUPPRESSION", 1)
-    store, operator = keyframes(*laps)
-    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=GAP))
-    first = detector.update(store.ids[: LAP + AGAIN], is_last=True)
-    assert {(loop.first % LAP, loop.second % LAP) for loop in first} & {(0, 0), (0, 1), (1, 1)}
-    implied = detector._is_implied(0, [replace(first[0], first=first[0].second)], ())
-    assert implied == (first[0].first <= 1)
 
 
 def test_a_loop_that_moves_nothing_asks_for_no_closing():

@@ -74,10 +74,7 @@ class SparseCameraSystem:
     """
 
     def __init__(
-        self,
-        source: Int[Tensor, "e"],
-        target: Int[Tensor, "e"],
-        free_pose: Bool[Tensor, "n"],
+        self, source: Int[Tensor, "e"], target: Int[Tensor, "e"], free_pose: Bool[Tensor, "n"]
     ) -> None:
         self._free = free_pose
         self._count = n = int(free_pose.sum())
@@ -151,7 +148,7 @@ class SparseCameraSystem:
         self._gradient.index_add_(0, at[at >= 0], sums.gradient[at >= 0])
 
     def solve(self, damping: float, floor: float) -> Float[Tensor, "v"] | None:
-        """As of the dense system."""
+        """Steps of all poses, zero for the fixed; None where the system is not definite."""
         xi = torch.zeros(len(self._free), 6, dtype=torch.float64)
         if not self._count:
             return xi.reshape(-1)

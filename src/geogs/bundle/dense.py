@@ -32,7 +32,6 @@ class DenseBundle:
         self.flow = LensFlow.of_pinhole(grid)
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
-        """As in the protocol."""
         return DenseSchur(problem, self.flow, options).adjusted()
 
 
@@ -40,7 +39,6 @@ class DenseBundle:
 class LinearBundle:
     """A problem linearised at one state."""
 
-    state: BundleState
     system: DenseCameraSystem
     sources: list[SourceFlow]
     """With all terms of their depths."""
@@ -71,7 +69,7 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
             system.add(term.hyper_edges(state))
         for source in sources:
             self.information[source.frame] = source.information
-        return LinearBundle(state, system, sources)
+        return LinearBundle(system, sources)
 
     def flow_cost(self, state: BundleState) -> float:
         """Chunks of edges side by side."""
@@ -83,16 +81,13 @@ class DenseSchur(SchurBundle[BundleProblem, LinearBundle]):
         return sum(thread_map(work, source_chunks(problem.source, options.chunk)))
 
     def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
-        """By Cholesky's method; shared unknowns move by no more than they may at once."""
-        step, block = linear.system.solve(damping, self.floor), linear.state.block
-        if step is not None and block is not None:
-            step[6 * linear.system.frames :].clamp_(-block.largest_step, block.largest_step)
-        return step
+        """The solution by Cholesky's method."""
+        return linear.system.solve(damping, self.floor)
 
     def depth_steps(
         self, state: BundleState, linear: LinearBundle, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """By the couplings that were kept."""
+        """The depths that follow by the couplings that were kept."""
         delta = torch.zeros_like(state.inverse_depth)
         for source in linear.sources:
             if bool(self.problem.free_depth[source.frame]):

@@ -1,12 +1,13 @@
 """Terms of single inverse depths: what resists their change, and what a sensor has measured."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
+from geogs.bundle.hyper_edge import DepthEquations
 from geogs.bundle.terms import BundleState
 from geogs.geometry.robust import huber_cost, huber_weight
 
@@ -21,18 +22,14 @@ class DepthDamping:
 
     curvature: Float[Tensor, "n p"]
     """Added to that of the matches, sum_e w |dp/dd|^2."""
+    information: ClassVar[None] = None
+    """It measures nothing."""
 
-    @property
-    def information(self) -> None:
-        """None: it measures nothing."""
-        return
-
-    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
-        """As in the protocol."""
-        return of_depths(DepthEquations.alone(self.curvature[frame]))
+    def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
+        return DepthEquations.alone(self.curvature[frame])
 
     def cost(self, state: BundleState) -> float:
-        """None: it resists each step, wherever it begins."""
+        """Zero: it resists each step, wherever it begins."""
         return 0.0
 
 
@@ -44,21 +41,14 @@ class MeasuredDepths:
     information: Float[Tensor, "n p"]
     """Inverse variances; 0 where nothing was measured."""
 
-    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
-        """As in the protocol: a and a (measured - d), a the information times Huber's weight."""
+    def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
+        """a and a (measured - d), where a is the information times Huber's weight."""
         information = self.information[frame]
         residual = self.inverse_depth[frame] - state.inverse_depth[frame]
         norm = information.sqrt() * residual.abs()
         curvature = information * huber_weight(norm, MEASURED_HUBER)
-        return of_depths(DepthEquations.alone(curvature, curvature * residual, curvature))
+        return DepthEquations.alone(curvature, curvature * residual, curvature)
 
     def cost(self, state: BundleState) -> float:
-        """As in the protocol, by Huber's cost."""
         square = self.information * (self.inverse_depth - state.inverse_depth).square()
         return float(huber_cost(square, MEASURED_HUBER).sum(dtype=torch.float64))
-
-
-def of_depths(depth: DepthEquations) -> HyperEdge:
-    """A hyper-edge that joins the depths of a frame with nothing."""
-    none = torch.zeros(0, 0, dtype=torch.float64)
-    return HyperEdge(torch.zeros(0, dtype=torch.long), none, none[0:0].flatten(), depth=depth)

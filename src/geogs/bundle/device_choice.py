@@ -46,7 +46,7 @@ def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> Mo
 
 
 def grid_fields(grid: SampleGrid) -> GridFields:
-    """What works on the fields of a grid."""
+    """The operations on fields for the device of a grid."""
     if grid.on_gpu:
         from geogs.bundle.cuda.fields import CudaFields
 

@@ -13,7 +13,7 @@ from geogs.world.keyframes import Keyframe
 
 
 class GridFields:
-    """What works on fields over the cells of a grid, on the CPU."""
+    """Operations on fields over the cells of a grid, on the CPU."""
 
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid

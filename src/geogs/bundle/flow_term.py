@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import CellProjection
 from geogs.bundle.protocols import BundleOptions
@@ -21,8 +21,8 @@ from geogs.bundle.terms import BundleState
 from geogs.geometry.robust import huber_weight
 
 BEHIND = 10.0
-"""By how many of Huber's knees a cell counts as off whose target sees it from behind. No step is
-drawn by that, and none is taken that brings many there."""
+"""Residual of a cell that lies behind its target, in knees of Huber's cost. No step is drawn by
+that, and none is taken that brings many there."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,15 @@ class SourceFlow:
     """Diagonal of the chained equations before any depth is eliminated, where it is asked for."""
 
     @property
+    def depth(self) -> DepthEquations:
+        """Equations of the source's inverse depths."""
+        assert self.edges.depth is not None
+        return self.edges.depth
+
+    @property
     def information(self) -> Float[Tensor, "p"]:
         """Information of the source's inverse depths."""
-        assert self.edges.depth is not None
-        return self.edges.depth.information
+        return self.depth.information
 
 
 @runtime_checkable
@@ -67,9 +72,8 @@ def linearised_sources(
     """
     found = []
     for source in flow.sources(problem, state, options):
-        edges = source.edges
-        for term in problem.depth_terms:
-            edges = edges.joined(term.of_frame(source.frame, state))
+        others = (term.of_frame(source.frame, state) for term in problem.depth_terms)
+        edges = source.edges.with_depths(others)
         if bool(problem.free_depth[source.frame]):
             edges = edges.eliminated()
         found.append(replace(source, edges=edges))
@@ -77,10 +81,7 @@ def linearised_sources(
 
 
 def weighed_residuals(
-    p: CellProjection,
-    pixels: Float[Tensor, "e p 2"],
-    weight: Float[Tensor, "e p 2"],
-    huber: float,
+    p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"], huber: float
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
     """Measured less projected positions r, and their weights: none behind the target.
 

@@ -1,12 +1,15 @@
 """Residuals that share unknowns, linearised: what terms hand to solvers.
 
 A hyper-edge joins the poses of some frames, the inverse depths of one of them, and unknowns that
-the whole problem shares. It may be linearised in unknowns of its own, such as the relative motions
-of matches, with a chain to those of the problem. Depths are eliminated first, frame by frame, since
-each is tied to no other. Equations of depths are float32, all others float64.
+the whole problem shares, such as a lens. It may be linearised in unknowns of its own, such as the
+relative motions of matches, with a chain to those of the problem. Depths are eliminated first,
+frame by frame, since each is tied to no other. Equations of depths are float32, all others
+float64.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import torch
 from jaxtyping import Float, Int
@@ -42,7 +45,7 @@ class DepthEquations:
         )
 
     def plus(self, other: "DepthEquations") -> "DepthEquations":
-        """Both, where nothing but depths is in the other."""
+        """The sum, where nothing but depths is in the other."""
         return DepthEquations(
             self.coupling,
             self.curvature + other.curvature,
@@ -51,7 +54,7 @@ class DepthEquations:
         )
 
     def on_cells(self, cells: slice) -> "DepthEquations":
-        """Those of some of the cells; on the CPU."""
+        """The equations of some of the cells, on the CPU."""
         parts = (self.coupling, self.curvature, self.gradient, self.information)
         return DepthEquations(*(part[..., cells].cpu() for part in parts))
 
@@ -118,30 +121,13 @@ class HyperEdge:
     def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
         """Equations of its depths after a step of all poses and shared unknowns."""
         assert self.depth is not None
-        if not len(self.gradient):
-            return self.depth
         depth = replace(self.depth, coupling=self.chained_coupling())
         return depth.after(step[self.rows(frames)])
 
-    def joined(self, other: "HyperEdge") -> "HyperEdge":
-        """Both together, which share the depths of a frame."""
-        if self.depth is None or other.depth is None:
-            raise ValueError("Only hyper-edges of the depths of one frame are joined.")
-        if not len(other.gradient):
-            return replace(self, depth=self.depth.plus(other.depth))
-        poses = torch.unique(torch.cat([self.poses, other.poses]))
-        shared, size = max(self.shared, other.shared), 6 * len(poses)
-        depth = self.depth.plus(other.depth)
-        H = torch.zeros(size + shared, size + shared, dtype=torch.float64)
-        g, E = H.new_zeros(len(H)), depth.curvature.new_zeros(len(H), len(depth.curvature))
-        for part in (self, other):
-            places = torch.searchsorted(poses, part.poses)
-            at = replace(HyperEdge(places, H, g), shared=part.shared).rows(len(poses))
-            hessian, gradient = part.chained()
-            H[at[:, None], at] += hessian
-            g[at] += gradient
-            E[at] += part.chained_coupling()
-        return HyperEdge(poses, H, g, shared, replace(depth, coupling=E))
+    def with_depths(self, others: Iterable[DepthEquations]) -> "HyperEdge":
+        """Joined with what else is said of the same depths alone."""
+        assert self.depth is not None
+        return replace(self, depth=reduce(DepthEquations.plus, others, self.depth))
 
     def eliminated(self) -> "HyperEdge":
         """With the depths out of the equations of all else."""
@@ -169,7 +155,7 @@ class RelativeEdges(HyperEdge):
 
     @property
     def chain(self) -> Float[Tensor, "m c"]:
-        """As above."""
+        """From steps of all poses, the source's last, then of shared unknowns."""
         at = 6 * len(self.adjoint)
         eye = torch.eye(len(self.gradient), dtype=torch.float64, device=self.adjoint.device)
         source = torch.cat([-self.adjoint.flatten(0, 1), eye.new_zeros(self.shared, 6)])

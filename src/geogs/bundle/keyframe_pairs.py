@@ -7,11 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.geometry.lie import se3_inverse
 from geogs.world.keyframes import KeyframeSet
 
 LEAST_OVERLAP = 0.2
 """A pair of which no more than this fraction of the cells falls into the other image is far."""
+
+CELL_STEP = 2
+"""Rows and columns of cells from one to the next that a distance is taken over."""
 
 
 class KeyframePairs:
@@ -19,8 +21,7 @@ class KeyframePairs:
 
     def __init__(self, keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> None:
         self.grid = keyframes.grid
-        source, target = (keyframes.poses([e[k] for e in directed]) for k in (0, 1))
-        self.motion = target @ se3_inverse(source)
+        self.motion = keyframes.relative_poses(directed)
         self.inverse_depth = keyframes.inverse_depths([e[0] for e in directed])
 
     def project(self) -> Float[Tensor, "e p 2"]:
@@ -35,16 +36,16 @@ class KeyframePairs:
         moved = (self.project() - before).norm(dim=-1)
         return moved.masked_fill(~(weight[..., 0] > 0), torch.nan).nanmedian(dim=1).values
 
-    def distances(self, rotation_weight: float, step: int = 2) -> Float[Tensor, "e"]:
+    def distances(self, rotation_weight: float) -> Float[Tensor, "e"]:
         """DROID-SLAM's distance in pixels; infinite at little overlap.
 
         Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the
-        rest) over every ``step``-th of the cells that stay in front of the target; infinite where
+        rest) over every second of the cells that stay in front of the target; infinite where
         less than 3/4 do or where less than a fifth falls into the image.
         """
         grid, T = self.grid, self.motion
         keep = torch.zeros(grid.height, grid.width, dtype=torch.bool)
-        keep[::step, ::step] = True
+        keep[::CELL_STEP, ::CELL_STEP] = True
         keep = keep.reshape(-1)
         rays, pixels, d = grid.rays[keep], grid.pixels[keep], self.inverse_depth[:, keep]
         shift = T.clone()

@@ -7,7 +7,6 @@ c + F x (1 + k1 |x|^2 + k2 |x|^4), x = (X / Z, Y / Z), which is OpenCV's model w
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -36,11 +35,11 @@ class RadialLens:
         return RadialLens(camera, self.k1 + k1, self.k2 + k2)
 
     def growth(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Of a ray's distance from the axis, whose square is given."""
+        """Factor on a ray's distance from the axis, whose square is given."""
         return 1 + square * (self.k1 + square * self.k2)
 
     def steepness(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
+        """Slope of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
         ``_LEAST_SLOPE``."""
         return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=_LEAST_SLOPE)
 
@@ -56,11 +55,10 @@ class LensBlock:
     """Whether the focal length is a variable."""
     radial: bool = False
     """Whether k1 and k2 are variables."""
-    largest_step: ClassVar[float] = 0.3
 
     @property
     def free(self) -> tuple[bool, bool, bool]:
-        """As in the protocol."""
+        """Whether each unknown is a variable."""
         return self.focal, self.radial, self.radial
 
     @cached_property
@@ -69,7 +67,7 @@ class LensBlock:
         return lens_rays(self.lens, self.pixels)
 
     def moved(self, step: Float[Tensor, "3"]) -> "LensBlock":
-        """As in the protocol."""
+        """The block after a step of all unknowns, zero for those that are no variables."""
         return replace(self, lens=self.lens.moved(*step.tolist()))
 
     def project(
@@ -82,7 +80,10 @@ class LensBlock:
         """Where the cells of the sources fall in the targets; depths are those of the sources."""
         T_ji = relative_motion(T_cw, source, target)
         y, valid, z = seen_from_targets(self.rays.rays, T_ji, inverse_depth)
-        return CellProjection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
+        x, c = y[..., :2] / z[..., None], self.lens.camera
+        growth = self.lens.growth(x.square().sum(-1, keepdim=True))
+        pixels = x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])
+        return CellProjection(pixels, valid, z)
 
 
 @dataclass(frozen=True)
@@ -110,9 +111,3 @@ def lens_rays(lens: RadialLens, pixels: Float[Tensor, "p 2"]) -> LensRays:
     x = distorted / growth[:, None]
     slope = torch.stack([-growth / steep, -square / steep, -square.square() / steep])
     return LensRays(torch.cat([x, torch.ones_like(x[:, :1])], -1), slope)
-
-
-def _to_pixels(lens: RadialLens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:
-    c = lens.camera
-    growth = lens.growth(x.square().sum(-1, keepdim=True))
-    return x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])

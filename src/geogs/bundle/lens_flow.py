@@ -23,25 +23,25 @@ from geogs.geometry.lie import se3_adjoint
 from geogs.world.grid import SampleGrid
 
 Further = Callable[[BundleProblem], Float[Tensor, "e o p 2"]]
-"""By how much more unknowns that all edges share, at size one, move where cells fall."""
+"""Moves of where cells fall by more unknowns of size one that all edges share."""
 
 
 class LensFlow:
     """Dense flow of cells that are seen through the lens of a state, or one that is known."""
 
     def __init__(self, known: LensBlock | None = None, further: Further | None = None) -> None:
-        """A lens that is ``known`` is no unknown, whatever block the state has for other terms."""
+        """The lens of the state is an unknown where none is ``known``."""
         self._known, self._further = known, further
 
     @staticmethod
     def of_pinhole(grid: SampleGrid) -> "LensFlow":
-        """That of the cells of a grid, through its camera."""
+        """Dense flow of the cells of a grid, seen through its camera."""
         return LensFlow(LensBlock(RadialLens(grid.camera), grid.pixels))
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """As in the protocol; each with its diagonal where the lens is unknown."""
+        """The sources of all edges, in order; with their diagonal where the lens is unknown."""
         from geogs.bundle.lens_kernels import linearise_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
@@ -68,7 +68,6 @@ class LensFlow:
             yield SourceFlow(frame, found, None if self._known else found.chained()[0].diagonal())
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """As in the protocol."""
         from geogs.bundle.lens_kernels import cost_of_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)

@@ -34,7 +34,7 @@ def _seen(motion, x, y, d, nearest):
 
 @njit(**_PART)
 def _dot(left, right):
-    """Of two blocks."""
+    """Scalar product of two blocks."""
     total = _ZERO
     for n in range(2 * _BLOCK):
         total += left[n] * right[n]

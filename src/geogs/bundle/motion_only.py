@@ -14,7 +14,7 @@ from geogs.world.keyframes import Keyframe
 
 
 class MotionSolver:
-    """What finds the poses of frames seen from keyframes that stay as they are, on the CPU.
+    """Finds poses of frames seen from fixed keyframes, on the CPU.
 
     Matches are those of some cells of a grid, or of all of them.
     """

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.hyper_edge import HyperEdge, RelativeEdges
+from geogs.bundle.projection import relative_motion
 from geogs.bundle.terms import BundleState
 from geogs.geometry.lie import se3_adjoint, se3_inverse, se3_left_jacobian, se3_log
 from geogs.geometry.robust import cauchy_cost, cauchy_weight
@@ -29,11 +30,11 @@ class MeasuredMotions:
 
     def residual(self, T_cw: Float[Tensor, "n 4 4"]) -> Float[Tensor, "m 6"]:
         """What is between the motions by the poses and the measured: Log(T_t T_s^-1 T_ts^-1)."""
-        present = T_cw[self.target] @ se3_inverse(T_cw[self.source])
+        present = relative_motion(T_cw, self.source, self.target)
         return se3_log(present @ se3_inverse(self.T_ts))
 
     def robust_weight(self, residual: Float[Tensor, "m 6"]) -> Float[Tensor, "m"]:
-        """Cauchy's of each motion, ``KNEE`` deviations being one."""
+        """Cauchy's weight of each motion, ``KNEE`` deviations being one."""
         return cauchy_weight((self.information * residual.square()).sum(-1) / KNEE**2)
 
     def equations(
@@ -44,19 +45,18 @@ class MeasuredMotions:
         A step ``xi_rel = xi_t - Ad(T_ts) xi_s`` of the motion changes the residual e by
         ``Jl(e)^-1 xi_rel``.
         """
-        present = T_cw[self.target] @ se3_inverse(T_cw[self.source])
+        present = relative_motion(T_cw, self.source, self.target)
         e = self.residual(T_cw)
         J = torch.linalg.inv(se3_left_jacobian(e))
         JW = J.mT * (self.robust_weight(e)[:, None] * self.information)[:, None]
         return se3_adjoint(present), JW @ J, -(JW @ e[..., None])[..., 0]
 
     def cost(self, state: BundleState) -> float:
-        """As in the protocol, by Cauchy's loss."""
         square = (self.information * self.residual(state.T_cw).square()).sum(-1)
         return float(KNEE**2 * cauchy_cost(square / KNEE**2).sum())
 
     def hyper_edges(self, state: BundleState) -> list[HyperEdge]:
-        """As in the protocol: one for each motion."""
+        """One for each motion."""
         ends = torch.stack([self.target, self.source], 1)
         parts = (ends, *self.equations(state.T_cw))
         return [

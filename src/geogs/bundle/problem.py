@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.terms import BundleState, DepthTerm, PoseTerm, SharedBlock
+from geogs.bundle.terms import BundleState, DepthTerm, PoseTerm
 
 Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]]
 """Measured positions and their inverse variances for a slice of edges; asked from threads."""
@@ -29,13 +29,11 @@ class Problem:
     depth_terms: tuple[DepthTerm, ...] = ()
     """What is said of the depths of frames that are sources of edges."""
     pose_terms: tuple[PoseTerm, ...] = ()
-    block: SharedBlock | None = None
-    """Unknowns of these terms beside poses and depths; of problems with few frames only."""
 
     @property
     def start(self) -> BundleState:
         """Where the adjustment begins."""
-        return BundleState(self.T_cw, self.inverse_depth, self.block)
+        return BundleState(self.T_cw, self.inverse_depth)
 
     def joined(self) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
         """Sources and targets of all that joins poses, sorted by source."""

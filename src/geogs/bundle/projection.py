@@ -18,6 +18,8 @@ from geogs.geometry.lie import se3_inverse
 
 MIN_Z = 0.05
 """Points nearer than this fraction of the source's unit depth behind the target are ignored."""
+INVERSE_DEPTHS = 1e-3, 1e2
+"""Least and largest inverse depth that an adjustment gives to a cell, per map unit."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.problem import Problem
-from geogs.bundle.terms import SharedBlock
 from geogs.geometry.least_squares import Policy
 
 P = TypeVar("P", bound=Problem, contravariant=True)
@@ -17,8 +16,8 @@ MAX_DAMPING = 1.0
 TRIALS = 2
 """Steps that are tried for each that may be taken."""
 COST_ROUNDING = 1e-6
-"""By this part of itself a cost may be off, as pixels are float32: a step that seems to raise it by
-less says that there is nothing left to gain."""
+"""Relative error of a cost, as pixels are float32: a step that seems to raise it by less says that
+there is nothing left to gain."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,6 @@ class BundleOptions:
     """Damping of inverse depth relative to the mean curvature of its frame."""
     chunk: int = 24
     """Edges linearised at a time; bounds memory."""
-    min_inverse_depth: float = 1e-3
-    max_inverse_depth: float = 1e2
     tolerance: float = 0.0
     """A step that moves no pose by this much (units, radians) is the last one; the dense solver of
     a GPU waits for that only where it waits for the cost."""
@@ -51,7 +48,7 @@ class BundleOptions:
 
     @property
     def policy(self) -> Policy:
-        """The steps as the least-squares loop is told them."""
+        """The policy of the least-squares loop."""
         plain = Policy(self.iterations, self.damping, self.tolerance)
         if self.least_damping is None:
             return plain
@@ -75,8 +72,6 @@ class BundleResult:
     """Sum over a frame's edges of w |dp/dd|^2 before the last step, and the information of what was
     measured beside the matches."""
     finite: bool
-    block: SharedBlock | None = None
-    """The shared unknowns of a problem that has some."""
 
 
 @runtime_checkable

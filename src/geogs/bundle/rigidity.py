@@ -8,15 +8,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import MIN_Z, relative_motion
+from geogs.bundle.projection import INVERSE_DEPTHS, MIN_Z, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.robust import huber_weight
 
 BEHIND = 100.0
 """Residual of a match, in its deviations, whose cell would lie behind the target."""
-DEPTH_RANGE = 1e-3, 1e2
-"""Least and largest inverse depth of a cell, per map unit."""
 
 
 def best_residuals(
@@ -53,7 +51,7 @@ def best_residuals(
         T_ji = relative_motion(T_cw, source, target).cpu()
         return rigidity.best_residuals(
             camera, rays, T_ji, inverse_depth, source.cpu(), pixels, weight, huber, iterations,
-            DEPTH_RANGE, BEHIND,
+            INVERSE_DEPTHS, BEHIND,
         )  # fmt: skip
     T_ji = relative_motion(T_cw, source, target).to(inverse_depth)
     source = source.to(inverse_depth.device)
@@ -85,7 +83,7 @@ def best_residuals(
     ) -> Step[Tensor]:
         curvature, gradient = linear
         raised = damping * curvature.mean(1, keepdim=True) + 1e-8
-        return Step((d + gradient / (curvature + raised)).clamp(*DEPTH_RANGE))
+        return Step((d + gradient / (curvature + raised)).clamp(*INVERSE_DEPTHS))
 
     d = minimise(inverse_depth, linearised, step, Policy(iterations, damping=1e-3)).state
     *_, valid, _, _, norm = projected(d)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.problem import Problem
+from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Step, minimise
@@ -27,7 +28,7 @@ class SchurBundle(ABC, Generic[P, L]):
     def __init__(self, problem: P, options: BundleOptions) -> None:
         self.problem, self.options = problem, options
         self.information = problem.known_before()
-        """As in ``BundleResult``, where the problem was linearised last."""
+        """Information of every inverse depth, where the problem was linearised last."""
 
     @abstractmethod
     def linearise(self, state: BundleState) -> L:
@@ -54,7 +55,7 @@ class SchurBundle(ABC, Generic[P, L]):
         return self.flow_cost(state) + terms
 
     def step(self, state: BundleState, linear: L, damping: float) -> Step[BundleState] | None:
-        """As the loop asks for it."""
+        """The step of all unknowns; None where it is not finite."""
         step = self.solve_cameras(linear, damping)
         if step is None:
             return None
@@ -63,7 +64,8 @@ class SchurBundle(ABC, Generic[P, L]):
             return None
         poses = 6 * len(state.T_cw)
         xi = step[:poses].reshape(-1, 6)
-        T, d = stepped(self.problem, state, xi, delta, self.options)
+        T = torch.where(self.problem.free_pose[:, None, None], move(xi, state.T_cw), state.T_cw)
+        d = stepped_depths(self.problem, state.inverse_depth + delta)
         block = None if state.block is None else state.block.moved(step[poses:])
         return Step(BundleState(T, d, block), float(xi.abs().max()))
 
@@ -73,20 +75,10 @@ class SchurBundle(ABC, Generic[P, L]):
         cost = self.cost if o.lowers_cost else None
         solution = minimise(self.problem.start, self.linearise, self.step, o.policy, cost)
         s = solution.state
-        return BundleResult(s.T_cw, s.inverse_depth, self.information, solution.finite, s.block)
+        return BundleResult(s.T_cw, s.inverse_depth, self.information, solution.finite)
 
 
-def stepped(
-    problem: Problem,
-    state: BundleState,
-    xi: Float[Tensor, "n 6"],
-    delta: Float[Tensor, "n p"],
-    options: BundleOptions,
-) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n p"]]:
-    """Poses and inverse depths, each on its device, after a step of those that are free."""
-    T, d = state.T_cw, state.inverse_depth + delta
-    d = d.clamp(options.min_inverse_depth, options.max_inverse_depth)
-    return (
-        torch.where(problem.free_pose[:, None, None], move(xi, T), T),
-        torch.where(problem.free_depth[:, None].to(d.device), d, problem.inverse_depth),
-    )
+def stepped_depths(problem: Problem, moved: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
+    """Moved inverse depths within their range, where they are free; the problem's own elsewhere."""
+    free = problem.free_depth[:, None].to(moved.device)
+    return torch.where(free, moved.clamp(*INVERSE_DEPTHS), problem.inverse_depth)

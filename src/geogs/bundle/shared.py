@@ -1,4 +1,4 @@
-"""Bundle adjustment whose variables are also some that all edges share, such as a lens.
+"""Bundle adjustment with unknowns that all edges share: a lens.
 
 Levenberg-Marquardt on the tracker's cost (:mod:`geogs.bundle.dense`) with a block of unknowns
 beside poses and inverse depths: depths are eliminated frame by frame, then poses and block are
@@ -22,32 +22,29 @@ from geogs.bundle.flow_term import residual_norms
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.protocols import BundleOptions
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, minimise
 from geogs.geometry.lie import se3_inverse
 
 OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
 """How shared unknowns are adjusted; the iterations are linearisations at most."""
+LARGEST_STEP = 0.3
+"""Most that an unknown of the lens moves by at once."""
 LEAST_DECREASE = 1e-4
 """Fraction of the cost; a step that lowers it by no more is the last one."""
 
 
-@dataclass(frozen=True)
-class SharedResult:
+@dataclass(frozen=True, kw_only=True)
+class SharedResult(BundleResult):
     """The adjusted problem, and how well the block is known."""
 
     block: LensBlock
-    T_cw: Float[Tensor, "n 4 4"]
-    inverse_depth: Float[Tensor, "n p"]
-    information: Float[Tensor, "n p"]
-    """Sum over a frame's edges of w |dp/dd|^2."""
     cost: float
     """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
     covariance: Float[Tensor, "m m"]
     """Covariance of the block's unknowns, zero for those that are no variables; see
     :func:`solve_shared`."""
-    finite: bool
 
 
 def solve_shared(
@@ -77,13 +74,13 @@ def solve_shared(
     state, linear = found.state, found.linear or shared.linearise(found.state)
     covariance = _covariance(linear)
     return SharedResult(
-        cast(LensBlock, state.block),
         state.T_cw,
         state.inverse_depth,
         shared.information,
-        found.cost,
-        covariance,
         found.finite and bool(torch.isfinite(covariance).all()),
+        block=cast(LensBlock, state.block),
+        cost=found.cost,
+        covariance=covariance,
     )
 
 
@@ -96,7 +93,7 @@ class SharedSchur(DenseSchur):
         super().__init__(problem, LensFlow(), options)
 
     def linearise(self, state: BundleState) -> LinearBundle:
-        """As without shared unknowns, and the scale is kept."""
+        """The problem with a penalty that keeps the scale."""
         linear = super().linearise(state)
         system, T = linear.system, state.T_cw
         diagonal = torch.zeros_like(system.gradient)
@@ -110,6 +107,13 @@ class SharedSchur(DenseSchur):
         scale = scale / scale.norm().clamp(min=1e-12)
         system.hessian += diagonal.mean() * scale[:, None] * scale
         return linear
+
+    def solve_cameras(self, linear: LinearBundle, damping: float) -> Float[Tensor, "v"] | None:
+        """The solution with the step of the lens cut to ``LARGEST_STEP``."""
+        step = super().solve_cameras(linear, damping)
+        if step is not None:
+            step[6 * linear.system.frames :].clamp_(-LARGEST_STEP, LARGEST_STEP)
+        return step
 
     def cost(self, state: BundleState, linear: LinearBundle | None = None) -> float:
         """Mean over the matched cells; infinite where nothing is matched."""

@@ -34,7 +34,6 @@ class StreamedBundle:
         self.grid = grid
 
     def solve(self, problem: StreamedProblem, options: BundleOptions) -> BundleResult:
-        """As in the protocol."""
         return StreamedSchur(problem, self.grid, options).adjusted()
 
 
@@ -78,13 +77,13 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return sum(_few_at_a_time(work, self.chunks))
 
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
-        """By the Cholesky factor of a band."""
+        """The solution by the Cholesky factor of a band."""
         return linear.solve(damping, FLOOR)
 
     def depth_steps(
         self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """By matches that are linearised a second time."""
+        """The depths that follow by matches that are linearised a second time."""
 
         def work(chunk: slice) -> list[tuple[int, Tensor]]:
             part, frames, found = self.problem.part(chunk), len(state.T_cw), []
@@ -92,8 +91,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
                 if bool(part.free_depth[source.frame]):
                     depth = source.edges.depth_after(step, frames)
                     for term in part.depth_terms:
-                        own = term.of_frame(source.frame, state)
-                        depth = depth.plus(own.depth_after(step, frames))
+                        depth = depth.plus(term.of_frame(source.frame, state))
                     found.append((source.frame, depth.solution))
             return found
 

@@ -1,25 +1,22 @@
 """The terms of an adjustment: what a kind of measurement says of the unknowns.
 
 To add a kind of measurement, write a term in a file of its own and enter it where the problem is
-made (``FrameGraph.streamed_problem``). A ``DepthTerm`` says something of the inverse depths of a
-frame, and maybe of poses or shared unknowns along with them; a ``PoseTerm`` of poses and shared
-unknowns alone. Dense flow, which every problem has, is :mod:`geogs.bundle.flow_term`; shared
-unknowns, such as a lens, come with a ``SharedBlock``.
+made (``FrameGraph.streamed_problem``). A ``DepthTerm`` says something of single inverse depths, a
+``PoseTerm`` of poses. Dense flow, which every problem has, is :mod:`geogs.bundle.flow_term`.
 
-Both sides: the CPU's solvers take any term. The GPU's have kernels for what is best done there
-(:mod:`geogs.bundle.cuda.depth_terms`) and take what other terms say of depths or of poses alone.
+The CPU's solvers take any term; the GPU's any term of poses, and those of depths that they have a
+kernel for (:mod:`geogs.bundle.cuda.depth_terms`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.hyper_edge import HyperEdge
-
-B = TypeVar("B", bound="SharedBlock")
+from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
+from geogs.bundle.lens import LensBlock
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,8 @@ class BundleState:
     T_cw: Float[Tensor, "n 4 4"]
     """World to camera of each frame, float64."""
     inverse_depth: Float[Tensor, "n p"]
-    block: "SharedBlock | None" = None
+    block: LensBlock | None = None
+    """The lens, where it is adjusted along with them."""
 
 
 @runtime_checkable
@@ -41,8 +39,8 @@ class DepthTerm(Protocol):
         """Inverse variances of what it measures on its own, if it does."""
         ...
 
-    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
-        """The residuals of a frame linearised, with equations of its depths."""
+    def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
+        """The residuals of a frame linearised."""
         ...
 
     def cost(self, state: BundleState) -> float:
@@ -70,23 +68,4 @@ class PoseTerm(Protocol):
 
     def cost(self, state: BundleState) -> float:
         """Twice what is minimised: the squared residuals, as far as they count."""
-        ...
-
-
-@runtime_checkable
-class SharedBlock(Protocol):
-    """Unknowns that a whole problem shares, at their present values; never changed in place."""
-
-    @property
-    def free(self) -> Sequence[bool]:
-        """Whether each unknown is a variable."""
-        ...
-
-    @property
-    def largest_step(self) -> float:
-        """By which an unknown moves at once."""
-        ...
-
-    def moved(self: B, step: Float[Tensor, "m"]) -> B:
-        """After a step of all unknowns, zero for those that are no variables."""
         ...

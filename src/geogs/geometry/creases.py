@@ -11,14 +11,14 @@ edge."""
 MOST = 0.3
 """Part of the area around a vertex that has to be turned away so far: slivers make no edge."""
 _STEPS = 100
-"""Of a normal's coordinates, by which two of them count as the same."""
+"""Steps to a unit of a normal's coordinates; normals of the same steps count as one."""
 
 
 class CreasedFaces(NamedTuple):
     """Faces whose vertices are several where they meet at an edge, one for each side of it."""
 
     origin: Int[np.ndarray, "k"]
-    """Of which vertex each was made."""
+    """Vertex that each was made of."""
     faces: Int[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "k 3"]
     """Float32, of length one; zero where there is no area."""
@@ -74,9 +74,9 @@ def _means_of_alike(
     facing: Float[np.ndarray, "n 3"],
     limit: float,
 ) -> Float[np.ndarray, "n 3"]:
-    """Of each corner, in the order of its vertices, the normal of the faces there that lie alike.
+    """Normal at each corner, in the order of its vertices, of the faces there that lie alike.
 
-    ``area`` are their normals as long as they are large, ``facing`` of length one.
+    ``area`` are the faces' normals as long as they are large, ``facing`` of length one.
     """
     _, start, count = np.unique(vertex, return_index=True, return_counts=True)
     start, count = np.repeat(start, count), np.repeat(count, count)

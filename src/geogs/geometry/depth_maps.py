@@ -13,6 +13,7 @@ _SOURCE = Path(__file__).parent / "cuda" / "depth.cu"
 _BLOCK = (32, 8)
 _LEAST_REACH = 1e-6
 """Below which rounding alone tells pixels apart, and nothing would be averaged."""
+_ROUNDS = 2
 
 
 def normals_from_depth(
@@ -42,7 +43,6 @@ def averaged_over_planes(
     camera: Camera,
     radius: int,
     reach: float,
-    rounds: int = 2,
 ) -> Float[Tensor, "h w"]:
     """Depth whose noise is averaged over the tangent planes of the pixels around.
 
@@ -58,12 +58,12 @@ def averaged_over_planes(
     slope = (normal * camera.rays(depth.dtype, depth.device)).sum(-1)
     good = (depth > 0) & (slope.abs() > 0.1)
     inverse = torch.where(good, 1 / depth.clamp(min=1e-9), 0.0)
-    # Of the inverse depth, by its own value and per pixel to the right and down.
+    # Slope of the inverse depth over its own value, per pixel to the right and down.
     tilt = [
         normal[..., k] / slope.where(good, 1.0) / f for k, f in enumerate((camera.fx, camera.fy))
     ]
     one_round = averaged_once_on_gpu if depth.device.type == "cuda" else averaged_once
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         right, down = (inverse * t for t in tilt)
         inverse = torch.where(good, one_round(inverse, right, down, radius, reach), 0.0)
     return torch.where(good, 1 / inverse.clamp(min=1e-9), depth)
@@ -113,5 +113,5 @@ def averaged_once_on_gpu(
 
 
 def _shifted(size: int, by: int) -> tuple[slice, slice]:
-    """The places that have one so much farther on, and those ones."""
+    """The positions that have one so much farther on, and those that lie there."""
     return slice(max(0, -by), size - max(0, by)), slice(max(0, by), size - max(0, -by))

@@ -52,7 +52,7 @@ def distorted_pixels(
         return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
     coefficients = np.array(distortion, dtype=np.float64)
-    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), _matrix(camera), coefficients)
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, coefficients)
     return pixels[:, 0]
 
 
@@ -75,7 +75,7 @@ def undistorted_rays(
         return plane
     coefficients = np.array(distortion, dtype=np.float64)
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None]
-    rays = cv2.undistortPoints(points, _matrix(camera), coefficients)[:, 0]
+    rays = cv2.undistortPoints(points, camera.K, coefficients)[:, 0]
     for _ in range(_POLISHING):
         rays = rays + (pixels - distorted_pixels(rays, camera, distortion)) / (camera.fx, camera.fy)
     return rays
@@ -85,7 +85,7 @@ def lens_maps(
     target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
-    K, target_K, size = _matrix(source), _matrix(target), (target.width, target.height)
+    K, target_K, size = source.K, target.K, (target.width, target.height)
     D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
     if lens == "fisheye":
         maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
@@ -150,7 +150,3 @@ def _straight(radius: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
         is_below = _bent(middle, coefficients) < radius
         low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
     return (low + high) / 2
-
-
-def _matrix(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    return camera.matrix().numpy()

@@ -37,7 +37,7 @@ def in_front_of_both(
     T: Float64[np.ndarray, "4 4"],
     one: Float64[np.ndarray, "n 3"],
     two: Float64[np.ndarray, "n 3"],
-    unsure: float = 0.0,
+    parallel: float = 0.0,
 ) -> Bool[np.ndarray, "n"]:
     """Whether rays come nearest to each other in front of both cameras (cheirality).
 
@@ -48,13 +48,13 @@ def in_front_of_both(
         T: from the first camera to the second.
         one: rays of the first view.
         two: those that they were found at in the second.
-        unsure: angle, radians, below which rays count as parallel: what they see is far away.
+        parallel: angle, radians, below which rays count as such: what they see is far away.
     """
     a, b = one @ T[:3, :3].T, two
     aa, bb, ab = ((x * y).sum(axis=1) for x, y in ((a, a), (b, b), (a, b)))
     at, bt = a @ T[:3, 3], b @ T[:3, 3]
     in_front = (ab * bt > bb * at) & (aa * bt > ab * at)
-    return in_front | (ab > np.cos(unsure) * np.sqrt(aa * bb))
+    return in_front | (ab > np.cos(parallel) * np.sqrt(aa * bb))
 
 
 def homogeneous(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

@@ -15,9 +15,9 @@ class DepthJumps(NamedTuple):
     """Pixels at either end of a jump along a row or a column."""
 
     near: Bool[Tensor, "h w"]
-    """On the nearer surface."""
+    """Ends on the nearer surface."""
     far: Bool[Tensor, "h w"]
-    """On the farther surface."""
+    """Ends on the farther surface."""
 
     def around(self, reach: int) -> Bool[Tensor, "h w"]:
         """Pixels at most so many rows and columns from an end."""

@@ -24,7 +24,7 @@ class Step(Generic[S]):
 
     state: S
     size: float = math.inf
-    """By how much the state moves at most; infinite where nothing is to end by it."""
+    """Largest move of the state; infinite where nothing is to end by it."""
 
 
 @dataclass(frozen=True)
@@ -36,20 +36,20 @@ class Policy:
     """
 
     max_steps: int = sys.maxsize
-    """That are taken."""
+    """Steps that are taken at most."""
     damping: float = 0.0
     """At the start."""
     tolerance: float = 0.0
     """A step of a smaller size that is taken is the last one."""
 
     max_trials: int = sys.maxsize
-    """Steps that are taken, or not."""
+    """Steps that are tried at most, taken or not."""
     max_damping: float = math.inf
-    """No more is tried."""
+    """Damping beyond which no step is tried."""
     least_damping: float = 0.0
-    """It falls no further."""
+    """Damping below which it does not fall."""
     least_raised: float = 0.0
-    """It rises as if it had been no less."""
+    """Damping from which it rises at least."""
     retries_unsolvable: bool = False
     """Whether equations without a solution are damped more; otherwise they are the end."""
     least_decrease: float = 0.0

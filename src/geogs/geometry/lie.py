@@ -105,7 +105,7 @@ def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
     """``Ad`` with ``T Exp(xi) T^-1 = Exp(Ad xi)``."""
     R = T[..., :3, :3]
     tR = so3_hat(T[..., :3, 3]) @ R
-    return torch.cat([torch.cat([R, tR], -1), torch.cat([torch.zeros_like(R), R], -1)], -2)
+    return torch.cat([torch.cat([R, tR], -1), pad(R, (3, 0))], -2)
 
 
 def _integral_of_exponential(M: Tensor) -> Tensor:
@@ -159,14 +159,9 @@ def sim3_adjoint(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7 7"]:
     """``Ad`` with ``S Exp(xi) S^-1 = Exp(Ad xi)``."""
     s, t = sim3_scale(S), S[..., :3, 3]
     R = S[..., :3, :3] / s[..., None, None]
-    zero = torch.zeros_like(R)
-    column = torch.zeros_like(t)[..., None]
     top = torch.cat([S[..., :3, :3], so3_hat(t) @ R, -t[..., None]], -1)
-    middle = torch.cat([zero, R, column], -1)
-    bottom = torch.cat(
-        [zero[..., :1, :], zero[..., :1, :], torch.ones_like(column[..., :1, :])], -1
-    )
-    return torch.cat([top, middle, bottom], -2)
+    last = pad(torch.ones_like(t[..., None, :1]), (6, 0))
+    return torch.cat([top, pad(R, (3, 1)), last], -2)
 
 
 def sim3_small_adjoint(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
@@ -174,10 +169,8 @@ def sim3_small_adjoint(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
     tau, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6, None, None]
     turn = so3_hat(phi)
     eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
-    column = torch.zeros_like(tau)[..., None]
     top = torch.cat([sigma * eye + turn, so3_hat(tau), -tau[..., None]], -1)
-    middle = torch.cat([torch.zeros_like(turn), turn, column], -1)
-    return torch.cat([top, middle, torch.zeros_like(top[..., :1, :])], -2)
+    return pad(torch.cat([top, pad(turn, (3, 1))], -2), (0, 0, 0, 1))
 
 
 def sim3_left_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
@@ -209,7 +202,7 @@ def sim3_inverse_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
 
 def se3_left_jacobian(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
     """``J`` with ``Exp(xi + d) = Exp(J d) Exp(xi)`` to first order, of rigid motions."""
-    return sim3_left_jacobian(torch.nn.functional.pad(xi, (0, 1)))[..., :6, :6]
+    return sim3_left_jacobian(pad(xi, (0, 1)))[..., :6, :6]
 
 
 def retract(xi: Float[Tensor, "*b k"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:

@@ -1,11 +1,32 @@
 """A sparse symmetric system of 7 x 7 blocks that is solved again and again with other numbers."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 BLOCK = 7
+
+
+@dataclass(frozen=True)
+class BlockEquations:
+    """Contributions to normal equations in blocks of one keyframe each; float64."""
+
+    row: Int[Tensor, "b"]
+    column: Int[Tensor, "b"]
+    block: Float[Tensor, "b 7 7"]
+    """Added to the matrix at keyframes (row, column)."""
+    gradient: Float[Tensor, "n 7"]
+    """Right-hand side, the direction of descent."""
+
+    def without_scale(self) -> "BlockEquations":
+        """The same equations with nothing that moves a scale."""
+        rigid = torch.ones(7, dtype=torch.float64)
+        rigid[6] = 0
+        block = self.block * rigid[:, None] * rigid
+        return BlockEquations(self.row, self.column, block, self.gradient * rigid)
 
 
 class BlockSystem:
@@ -48,10 +69,7 @@ class BlockSystem:
         return torch.equal(row, self._given[0]) and torch.equal(column, self._given[1])
 
     def solve(
-        self,
-        block: Float[Tensor, "b 7 7"],
-        gradient: Float[Tensor, "n 7"],
-        damping: float,
+        self, block: Float[Tensor, "b 7 7"], gradient: Float[Tensor, "n 7"], damping: float
     ) -> Float[Tensor, "n 7"] | None:
         """The solution after the diagonal was raised by a fraction of it; None if it is singular.
 

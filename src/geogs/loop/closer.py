@@ -56,7 +56,7 @@ class _Asked:
     answer: Future[LoopClosure | None]
     world: Tracker
     age: int
-    """That of the world then."""
+    """Age of the world then."""
 
 
 class LoopCloser:
@@ -101,8 +101,8 @@ class LoopCloser:
     def update(self, result: TrackResult, is_last: bool = False) -> tuple[int, ...]:
         """After a frame: look for loops at the keyframes that became final, and act on them.
 
-        Returns the ids of final keyframes that became part of the world; whether it was corrected,
-        its segment of the store tells.
+        Returns the ids of final keyframes that became part of the world. Corrections are taken
+        from its keyframes (``KeyframeSet.take_corrections``).
         """
         if not self.config.enabled:
             return ()
@@ -130,9 +130,9 @@ class LoopCloser:
             for e, v in world.map.graph.edges.items()
             if order[e[1]] - order[e[0]] not in (2, 3)
         }
-        held = of_poses(world.keyframes, sorted(world.segment.fixed))
+        fixed = of_poses(world.keyframes, sorted(world.segment.fixed))
         self.table.constraints[world.segment.number] = SegmentConstraints(
-            joined([held, of_edges(world.keyframes, edges)])
+            joined([fixed, of_edges(world.keyframes, edges)])
         )
         self._retire(world)
 
@@ -171,7 +171,7 @@ class LoopCloser:
         known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
         ends = sorted({loop.first, loop.second})
         poses, placed = first.keyframes.poses(ends), between_positions(constraint, ends)
-        depth = 1 / first.keyframes.inverse_depths(ends).median(1).values.cpu().double()
+        depth = first.keyframes.median_depths(ends)
         differs = differences(poses, placed, depth) >= self.config.min_change
         errors = squared_errors(poses, placed)
         known.pending += bool((differs & (errors > self.config.residual)).any())
@@ -328,13 +328,12 @@ class LoopCloser:
 
     def _change(self, correction: PoseCorrection) -> float:
         """How far a correction moves the keyframe that it moves most."""
-        store, ids = self.segments.main.keyframes, sorted(correction.before)
+        keyframes, ids = self.segments.main.keyframes, sorted(correction.before)
         scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
         S = torch.stack([correction.after[k] for k in ids])
         S[:, :3] *= scale[:, None, None]
         before = torch.stack([correction.before[k] for k in ids])
-        depth = 1 / store.inverse_depths(ids).median(1).values.cpu().double()
-        return float(disagreement(S, before, depth).max())
+        return float(disagreement(S, before, keyframes.median_depths(ids)).max())
 
 
 def _rescale(known: SegmentConstraints, correction: PoseCorrection) -> None:

@@ -46,7 +46,7 @@ class LoopClosure:
     """What closing loops brought."""
 
     correction: PoseCorrection
-    """For tracker and map, by keyframe id."""
+    """What tracker and map follow, by keyframe id."""
     accepted: Bool[Tensor, "e"]
     """Marks the relative poses given that were kept."""
     inverse_depth: Float[Tensor, "n p"] | None
@@ -120,13 +120,8 @@ def take_over_depths(
 
 def _without(matches: MatchedEdges, rejected: RelativePoses, kept: RelativePoses) -> MatchedEdges:
     """The matches but those between keyframes whose every relative pose was rejected."""
-    gone = _pairs(rejected) - _pairs(kept)
+    gone = {*rejected.pairs} - {*kept.pairs}
     ends = zip(matches.source.tolist(), matches.target.tolist(), strict=True)
     stays = torch.tensor([(min(e), max(e)) not in gone for e in ends], dtype=torch.bool)
     columns = ("source", "target", "pixels", "weight")
     return replace(matches, **{c: getattr(matches, c)[stays] for c in columns})
-
-
-def _pairs(relative: RelativePoses) -> set[tuple[int, int]]:
-    ends = zip(relative.source.tolist(), relative.target.tolist(), strict=True)
-    return {(min(e), max(e)) for e in ends}

@@ -33,7 +33,7 @@ class Drift:
     """What odometry may have drifted from the first keyframe to each, in the frame of the world."""
 
     covariance: Float[Tensor, "n 7 7"]
-    """That of what is new at every step, summed up."""
+    """Covariance of what is new at every step, summed up."""
     bias: Float[Tensor, "n 7 7"]
     """One column for each number of the tangent, were it wrong by the same amount at every step."""
 
@@ -45,10 +45,10 @@ class Drift:
 
 
 def odometry_drift(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Drift:
-    """Drift along the steps between consecutive keyframes, each by its surest trusted edge.
+    """Drift along the steps between consecutive keyframes, each by its best known trusted edge.
 
-    A step that no edge covers is as unsure as the worst that is covered. Raises GeogsError if no
-    edge joins consecutive keyframes.
+    A step that no edge covers is known as badly as the worst that is covered. Raises GeogsError if
+    no edge joins consecutive keyframes.
     """
     trusted = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
     edges = relative.select(trusted & (relative.information > 0).all(1))
@@ -58,7 +58,7 @@ def odometry_drift(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Dri
     order = torch.argsort(variance.sum(1), descending=True, stable=True)
     step = torch.minimum(edges.source, edges.target)
     chosen = variance[order[0]].repeat(len(T_cw) - 1, 1)
-    for e in order.tolist():  # the surest comes last and stays
+    for e in order.tolist():  # the best known comes last and stays
         chosen[step[e]] = variance[e]
     carry = sim3_adjoint(se3_inverse(T_cw[1:]))
     steps = DRIFT * (carry * chosen[:, None]) @ carry.mT

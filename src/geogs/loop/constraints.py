@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.relative_pose import LEAST_ROTATION, LEAST_SCALE, relative_poses
@@ -20,8 +21,8 @@ from geogs.world.loops import Loop, RelativePoses
 AGREEING_LOOPS = 2
 """Loops that have to agree before a segment is joined to another: one may be a look-alike."""
 JOIN_TOLERANCE = 0.12
-"""Within which they agree: radians, parts of the median depth, or of the scale; what segments drift
-by within themselves."""
+"""Largest difference between loops that agree: radians, fraction of the median depth, or of the
+scale. Segments drift by as much within themselves."""
 
 
 def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
@@ -96,7 +97,7 @@ def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
     if len(ids) < 2:
         return RelativePoses.none()
     T_cw = segment.poses(ids)
-    depth = 1 / segment.inverse_depths(ids[1:]).median(1).values.cpu().double()
+    depth = segment.median_depths(ids[1:])
     most = 1 / torch.tensor([LEAST_ROTATION] * 6 + [LEAST_SCALE]).double().square()
     information = most.repeat(len(ids) - 1, 1)
     information[:, :3] /= depth[:, None].square()
@@ -168,7 +169,7 @@ def thinned(relative: RelativePoses, most: int) -> RelativePoses:
 
 def squared_errors(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e"]:
     """Squared errors of relative poses between places at given poses, in their own variances."""
-    now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
+    now = relative_motion(T_cw, relative.source, relative.target)
     error = sim3_log(relative.G @ sim3_inverse(now))
     return (relative.information * error.square()).sum(-1)
 
@@ -178,7 +179,7 @@ def differences(
 ) -> Float[Tensor, "e"]:
     """How far relative poses between places lie from given poses, as :func:`disagreement` has it
     in the frames of their targets, whose median depth is ``depth``."""
-    now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
+    now = relative_motion(T_cw, relative.source, relative.target)
     return disagreement(relative.G, now, depth[relative.target])
 
 

@@ -42,11 +42,11 @@ class DenseCheck:
     scale: float = 1.0
     """Lengths of the second's depth per length of the first's."""
     matched: float = 0.0
-    """Share of the cells whose flow agrees with the pose, in the poorer direction."""
+    """Fraction of the cells whose flow agrees with the pose, in the poorer direction."""
     residual: float = math.inf
     """Median error of the reprojection in pixels, in the poorer direction."""
     contradiction: float = 1.0
-    """Share of one view's surface through which the other sees, in the poorer direction."""
+    """Fraction of one view's surface through which the other sees, in the poorer direction."""
     there: FlowMatch | None = None
     """The flow from the first to the second, one edge."""
     back: FlowMatch | None = None
@@ -68,7 +68,7 @@ def dense_check(
     agree at the poses.
     ``T_ji`` is in the first's lengths, ``scale`` as in :class:`DenseCheck`.
     """
-    limit = MAX_RESIDUAL * max(grid.camera.width, grid.camera.height)
+    limit = MAX_RESIDUAL * grid.camera.long_edge
     locator = FrameLocator(grid, operator, 0.0, limit, min_ncc=-1.0)
     T_ji = T_ji.to(first.T_cw)
     T_second = T_ji @ first.T_cw
@@ -80,11 +80,11 @@ def dense_check(
     T_there = there.T_cw @ se3_inverse(first.T_cw)
     T_back = back.T_cw @ se3_inverse(second.T_cw)
     ratios = _depth_ratios(grid, first, second, there, T_there)
-    scale_dense, agreeing = _consensus(ratios, DEPTH_TOLERANCE)
+    scale_dense, agreeing = _consensus(ratios)
     T_far = se3_inverse(scaled(T_there, scale_dense))
     contradiction = max(
-        _seen_through(grid, first, second, T_there, scale_dense, DEPTH_TOLERANCE),
-        _seen_through(grid, second, first, T_far, 1 / scale_dense, DEPTH_TOLERANCE),
+        _seen_through(grid, first, second, T_there, scale_dense),
+        _seen_through(grid, second, first, T_far, 1 / scale_dense),
     )
     turn = math.degrees(float(so3_log((T_back @ T_there)[:3, :3]).norm()))
     if matched < MIN_MATCHED:
@@ -126,23 +126,18 @@ def _depth_ratios(
     return (first.inverse_depth / (forward * own).clamp(min=1e-12))[good].log()
 
 
-def _consensus(ratios: Float[Tensor, "m"], tolerance: float) -> tuple[float, float]:
+def _consensus(ratios: Float[Tensor, "m"]) -> tuple[float, float]:
     """Median ratio, and the fraction of the ratios that keep to it."""
     if not len(ratios):
         return 1.0, 0.0
     middle = ratios.median()
-    return float(middle.exp()), float(((ratios - middle).abs() < tolerance).float().mean())
+    return float(middle.exp()), float(((ratios - middle).abs() < DEPTH_TOLERANCE).float().mean())
 
 
 def _seen_through(
-    grid: SampleGrid,
-    source: Keyframe,
-    target: Keyframe,
-    T_ts: Float[Tensor, "4 4"],
-    scale: float,
-    tolerance: float,
+    grid: SampleGrid, source: Keyframe, target: Keyframe, T_ts: Float[Tensor, "4 4"], scale: float
 ) -> float:
-    """Share of the source's surface in the target's view behind which the target has its own.
+    """Fraction of the source's surface in the target's view behind which the target has its own.
 
     Surface that the target has before it is occluded and does not count; 1 where nothing is left.
     """
@@ -159,9 +154,8 @@ def _seen_through(
     expected = (source.inverse_depth / (scale * forward.clamp(min=1e-6))).clamp(min=1e-9)
     ratio = (nearest.clamp(min=1e-9) / expected).log()[known]
     farthest = -torch.nn.functional.max_pool2d(-image, 3, 1, 1).reshape(-1)[cell]
-    behind = (ratio < -tolerance).sum()
-    same = (
-        (ratio >= -tolerance) & ((farthest.clamp(min=1e-9) / expected)[known].log() <= tolerance)
-    ).sum()
+    far_ratio = (farthest.clamp(min=1e-9) / expected)[known].log()
+    behind = (ratio < -DEPTH_TOLERANCE).sum()
+    same = ((ratio >= -DEPTH_TOLERANCE) & (far_ratio <= DEPTH_TOLERANCE)).sum()
     total = int(behind + same)
     return float(behind) / total if total else 1.0

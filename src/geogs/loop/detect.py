@@ -56,7 +56,7 @@ class LoopDetector:
         self,
         keyframes: KeyframeTable,
         operator: FlowOperator,
-        config: LoopConfig | None = None,
+        config: LoopConfig,
         waits: bool = True,
         mask: Bool[np.ndarray, "h w"] | None = None,
         table: LoopTable | None = None,
@@ -68,7 +68,7 @@ class LoopDetector:
         self.keyframes = keyframes
         self.grid = keyframes.grid
         self.operator = operator
-        self.config = config or LoopConfig()
+        self.config = config
         self._waits = waits
         # What the search reads was written in the stream of whoever made the detector.
         stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
@@ -77,12 +77,8 @@ class LoopDetector:
             initializer=lambda: None if stream is None else torch.cuda.set_stream(stream),
         )  # fmt: skip
         self.table = table or LoopTable()
-        self._order: dict[int, int] = {}
+        self._order = {id: rank for rank, id in enumerate(self.table.keyframes)}
         """Rank in time of each keyframe searched so far."""
-        self._ids = np.zeros(64, np.int64)
-        """Ids of the keyframes by their rank, with room for more."""
-        for id in self.table.keyframes:
-            self._rank(id)
         self._search = PlaceRecognition(self.grid, self.config, self._order, mask, self.table)
         self._pending: deque[Future[None] | None] = deque(None for _ in self.table.found)
         """The search for each keyframe that is not decided yet; none where it was done before."""
@@ -125,12 +121,12 @@ class LoopDetector:
 
     def candidates(self, id: int) -> list[int]:
         """Keyframes that the present poses say a taken one sees again, nearest first."""
-        facing, store = self._facing(id), self.keyframes.set_of[id]
+        facing, segment = self._facing(id), self.keyframes.set_of[id]
         if not facing:
             return []
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
-        there, back = frame_distances(store, directed, ROTATION_WEIGHT).chunk(2)
-        limit = MAX_FLOW_DISTANCE * max(self.grid.camera.width, self.grid.camera.height)
+        there, back = frame_distances(segment, directed, ROTATION_WEIGHT).chunk(2)
+        limit = MAX_FLOW_DISTANCE * self.grid.camera.long_edge
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
         return [facing[n] for n in order[distance < limit].tolist()]
 
@@ -141,19 +137,13 @@ class LoopDetector:
         return Query(id, features, near, by_pose, known, tuple(settled), self._depths())
 
     def _ranked(self, pairs: Sequence[Pair]) -> list[Pair]:
-        """Those of keyframes taken so far."""
+        """The pairs of keyframes taken so far."""
         return [p for p in pairs if p[0] in self._order and p[1] in self._order]
 
     def _enter(self, id: int) -> None:
         """Take a keyframe as the latest."""
         self.table.keyframes.append(id)
-        self._rank(id)
-
-    def _rank(self, id: int) -> None:
-        rank = self._order[id] = len(self._order)
-        if rank == len(self._ids):
-            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
-        self._ids[rank] = id
+        self._order[id] = len(self._order)
 
     def _found_near(self, id: int) -> list[Pair]:
         """Pairs of the loops found whose later keyframe is so near to one that they can rule out
@@ -168,17 +158,19 @@ class LoopDetector:
 
     def _is_implied(self, id: int, found: Sequence[Loop], settled: Sequence[Pair]) -> bool:
         """Whether a place was joined before with one that a loop of the same keyframe has found."""
-        for loop in found:
-            pair = min(id, loop.first), max(id, loop.first)
-            if self._search.is_suppressed(pair, self._found_near(pair[1]), settled):
-                return True
-        return False
+        pairs = ((min(id, loop.first), max(id, loop.first)) for loop in found)
+        return any(
+            self._search.is_suppressed(pair, self._found_near(pair[1]), settled) for pair in pairs
+        )
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
-        gap, store = self._order[id] - self.config.min_gap, self.keyframes.set_of[id]
-        recent = self._ids[max(gap, 0) : len(self._order)].tolist()
-        return frozenset(k for k in recent if k in store)
+        segment, recent = self.keyframes.set_of[id], self.table.keyframes[self._first_near(id) :]
+        return frozenset(k for k in recent if k in segment)
+
+    def _first_near(self, id: int) -> int:
+        """Rank of the first keyframe at most ``min_gap`` keyframes before one."""
+        return max(self._order[id] - self.config.min_gap, 0)
 
     def _depths(self) -> Depths:
         """What is known of the depth of all keyframes now; they are replaced, never changed."""
@@ -187,11 +179,11 @@ class LoopDetector:
 
     def _facing(self, id: int) -> list[int]:
         """The earlier keyframes nearest by that look roughly the same way; there are never many."""
-        store = self.keyframes.set_of[id]
-        old = self._ids[: max(self._order[id] - self.config.min_gap, 0)]
-        depth = 1 / float(store[id].inverse_depth.median())
+        segment = self.keyframes.set_of[id]
+        old = np.array(self.table.keyframes[: self._first_near(id)], np.int64)
+        depth = 1 / float(segment[id].inverse_depth.median())
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
-        return list(islice((k for k in around.tolist() if k in store), MEASURED))
+        return list(islice((k for k in around.tolist() if k in segment), MEASURED))
 
     def _decide(self, settled: Sequence[Pair]) -> list[Loop]:
         """The loops among the candidates of the keyframe whose turn it is."""

@@ -20,7 +20,7 @@ from geogs.bundle.projection import linearise, project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_adjoint, sim3_inverse
 from geogs.geometry.robust import huber_cost
-from geogs.loop.graph_terms import BlockEquations, GraphState
+from geogs.loop.block_system import BlockEquations
 
 HUBER = 3.0
 """Standard deviations beyond which a residual counts linearly."""
@@ -34,21 +34,13 @@ CHUNK = 24
 
 
 @dataclass(frozen=True)
-class MatchedEdges:
-    """Directed edges with a measured position in the target for every cell of the source."""
+class GraphState:
+    """What a pose graph adjusts, at its present values; on the CPU, also where tracking is not."""
 
-    camera: Camera
-    rays: Float[Tensor, "p 3"]
-    """K^-1 (x, y, 1) of each cell."""
-    inverse_depth: Float[Tensor, "n p"]
-    """That of every keyframe of the graph, in its own unit of length."""
-    source: Int[Tensor, "e"]
-    """Index of a keyframe; ascending."""
-    target: Int[Tensor, "e"]
-    pixels: Float[Tensor, "e p 2"]
-    """Where the cells of the source are seen in the target."""
-    weight: Float[Tensor, "e p 2"]
-    """Inverse variance of x and y, 1 / pixel^2; 0 where nothing was matched."""
+    S: Float[Tensor, "n 4 4"]
+    """World to camera in each keyframe's own unit of length, float64."""
+    inverse_depth: Float[Tensor, "n p"] | None = None
+    """In the keyframe's unit; none without matches."""
 
 
 def relative_similarity(
@@ -59,23 +51,34 @@ def relative_similarity(
 
 
 @dataclass(frozen=True)
-class MatchTerm:
-    """The term of matched edges in a pose graph."""
+class MatchedEdges:
+    """Directed edges with a measured position in the target for every cell of the source."""
 
-    edges: MatchedEdges
+    camera: Camera
+    rays: Float[Tensor, "p 3"]
+    """K^-1 (x, y, 1) of each cell."""
+    inverse_depth: Float[Tensor, "n p"]
+    """Inverse depth of every keyframe of the graph, in its own unit of length."""
+    source: Int[Tensor, "e"]
+    """Index of a keyframe; ascending."""
+    target: Int[Tensor, "e"]
+    pixels: Float[Tensor, "e p 2"]
+    """Where the cells of the source are seen in the target."""
+    weight: Float[Tensor, "e p 2"]
+    """Inverse variance of x and y, 1 / pixel^2; 0 where nothing was matched."""
 
     def linearise(self, state: GraphState) -> "LinearMatches":
-        """At a state, which has inverse depths."""
-        edges, d = self.edges, state.inverse_depth
+        """The edges at a state, which has inverse depths."""
+        d = state.inverse_depth
         assert d is not None
         sources: list[LinearSource] = []
-        valid = [torch.zeros(0, edges.weight.shape[1], dtype=torch.bool)]
-        for chunk in source_chunks(edges.source, CHUNK):
-            i, j = edges.source[chunk], edges.target[chunk]
+        valid = [torch.zeros(0, self.weight.shape[1], dtype=torch.bool)]
+        for chunk in source_chunks(self.source, CHUNK):
+            i, j = self.source[chunk], self.target[chunk]
             S_ji = relative_similarity(state.S, i, j)
-            p = linearise(edges.camera, edges.rays, S_ji, d[i])
+            p = linearise(self.camera, self.rays, S_ji, d[i])
             valid.append(p.valid)
-            r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], HUBER)
+            r, w = weighed_residuals(p, self.pixels[chunk], self.weight[chunk], HUBER)
             w = FACTOR * w
             J, D = p.pose_jacobian, p.depth_jacobian
             wJ = J * w.mT[:, None]
@@ -88,7 +91,7 @@ class MatchTerm:
                 c = curvature[e].sum(0)
                 depth = DepthEquations(coupling[e].flatten(0, 1), c, b[e].sum(0), c)
                 sources.append(LinearSource(frame, j[e], adjoint[e], H[e], v[e], depth))
-        return LinearMatches(edges, len(state.S), sources, torch.cat(valid))
+        return LinearMatches(self, len(state.S), sources, torch.cat(valid))
 
 
 @dataclass(frozen=True)

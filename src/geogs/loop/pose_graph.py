@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import (
     retract,
@@ -26,9 +27,8 @@ from geogs.geometry.lie import (
     sim3_scale,
     sim3_small_adjoint,
 )
-from geogs.loop.block_system import BlockSystem
-from geogs.loop.graph_terms import BlockEquations, GraphState
-from geogs.loop.matched_edges import LinearMatches, MatchedEdges, MatchTerm
+from geogs.loop.block_system import BlockEquations, BlockSystem
+from geogs.loop.matched_edges import GraphState, LinearMatches, MatchedEdges
 from geogs.types import PoseCorrection
 from geogs.world.loops import RelativePoses
 
@@ -48,8 +48,6 @@ this is left, in squared standard deviations."""
 DAMPING, MAX_DAMPING = 1e-8, 1e4
 """Levenberg damping at the start, relative to the diagonal; a stage ends when even the second
 brings no decrease."""
-INVERSE_DEPTHS = 1e-3, 1e2
-"""Least and largest that is given to a cell."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +73,7 @@ class PoseGraphResult:
     inverse_depth: Float[Tensor, "n p"] | None
     """In the keyframe's unit of before; None without matches."""
     loop_weight: Float[Tensor, "e"]
-    """Share of each relative pose that the kernel left in force, in [0, 1]; 1 for trusted ones."""
-
-    @property
-    def scale(self) -> Float[Tensor, "n"]:
-        """Unit of length of the world over the keyframe's unit of before."""
-        return sim3_scale(self.S)
+    """Weight of each relative pose by the kernel, in [0, 1]; 1 for trusted ones."""
 
 
 def relative_errors(S: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e 7"]:
@@ -107,7 +100,7 @@ def solve(graph: PoseGraph) -> PoseGraphResult:
     Every step lowers the cost at its stage; the result is deterministic.
     """
     matches, relative = graph.matches, RelativeTerm.of(graph.relative)
-    others = [] if matches is None else [MatchTerm(matches)]
+    others = [] if matches is None else [matches]
     depth = None if matches is None else matches.inverse_depth
     state = GraphState(graph.start.double(), depth)
     problem = _Problem(graph)
@@ -190,7 +183,7 @@ class RelativeTerm:
         return torch.where(self.relative.is_loop, weight, torch.ones_like(weight))
 
     def linearise(self, state: GraphState) -> "LinearRelative":
-        """At a state."""
+        """The relative poses at a state."""
         return LinearRelative(self, state.S)
 
 
@@ -237,7 +230,7 @@ class _Problem:
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
-        self.terms: list[RelativeTerm | MatchTerm] = []
+        self.terms: list[RelativeTerm | MatchedEdges] = []
         self._system: BlockSystem | None = None
         """Solver of the last step; the next has the same blocks."""
 
@@ -248,7 +241,7 @@ class _Problem:
     def step(
         self, state: GraphState, linear: Sequence[LinearTerm], damping: float
     ) -> Step[GraphState] | None:
-        """As the loop asks for it."""
+        """The step of all similarities and depths; None where there is no solution."""
         parts = [term.equations(damping) for term in linear]
         if self.graph.is_metric:
             parts = [part.without_scale() for part in parts]

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.flow_term import weighed_residuals
-from geogs.bundle.projection import LinearProjection, linearise
+from geogs.bundle.projection import LinearProjection, linearise, relative_motion
 from geogs.geometry.least_squares import Policy, Step, minimise
-from geogs.geometry.lie import move, se3_inverse
+from geogs.geometry.lie import move
 from geogs.loop.matched_edges import CHUNK, HUBER, MatchedEdges
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import RelativePoses
@@ -54,8 +54,8 @@ def relative_poses(
 
     Matches and depths may be on a GPU; poses are on the CPU, and so is the result.
 
-    From the present poses on, or from ``start``, the motion of each edge in its source's unit;
-    with no ``steps`` that stays, where an adjustment has fitted it with more than it tells alone.
+    The solution begins at the present poses, or at ``start``, the motion of each edge in its
+    source's unit. Without ``steps`` that stays: an adjustment of all edges has found it.
 
     Covariance is ``sigma^2 diag(H^-1)`` with ``sigma^2 = sum w r^2`` divided not by the number of
     cells, but by ``INDEPENDENT``. A loop's scale is the median ratio of the depths at
@@ -64,7 +64,7 @@ def relative_poses(
     """
     G, information, kept = [], [], []
     if start is None:
-        start = T_cw[edges.target] @ se3_inverse(T_cw[edges.source])
+        start = relative_motion(T_cw, edges.source, edges.target)
     for first in range(0, len(edges.source), CHUNK):
         chunk = slice(first, first + CHUNK)
         solved, known, keep = _solve_edges(grid, edges, chunk, start[chunk], is_loop, steps)

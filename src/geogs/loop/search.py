@@ -38,7 +38,7 @@ class Query:
 
     id: int
     features: Future[ImageFeatures]
-    """Those of its image."""
+    """Features of its image."""
     near: frozenset[int]
     """Keyframes that cannot be its loops, for being of the same time."""
     by_pose: tuple[int, ...]
@@ -120,7 +120,7 @@ class PlaceRecognition:
         by_appearance = self._similar(self.table.features[id], query.near)
         alternating: list[LoopCandidate] = []
         for n in range(max(len(by_pose), len(by_appearance))):
-            # Where the poses agree with the looks, the flow may start from them if features fail.
+            # Where the poses propose it, too, the flow may start from them if features fail.
             alternating += [
                 LoopCandidate(k, id, "geometry" if k in by_pose else "appearance")
                 for k in by_appearance[n : n + 1]

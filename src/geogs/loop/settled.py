@@ -27,7 +27,7 @@ def settled_pairs(
 
     By a loop whose relative poses, between ids, lie within ``min_change`` (radians, parts of the
     median depth, or of the scale) of the present poses, so that no keyframe would be moved by more;
-    or by matches that tracking holds, or held, between keyframes ``min_gap`` or more apart, which
+    or by matches that tracking has, or had, between keyframes ``min_gap`` or more apart, which
     the present poses fit.
     """
     ids = segment.ids
@@ -38,16 +38,13 @@ def settled_pairs(
     places = between_positions(relative, ids)
     relative = relative.select((places.source - places.target).abs() >= min_gap)
     place = {k: n for n, k in enumerate(ids)}
-    held = {
+    tracked = {
         (i, j) for i, j in edges if j >= first_recent and i < j and place[j] - place[i] >= min_gap
     }
     if not len(relative):
-        return sorted(held)
+        return sorted(tracked)
     known = sorted({*relative.source.tolist(), *relative.target.tolist()})
     at, T_cw = between_positions(relative, known), segment.poses(known)
-    depth = 1 / segment.inverse_depths(known).median(1).values.cpu().double()
-    differs = relative.is_loop & (differences(T_cw, at, depth) >= min_change)
-    ends = zip(relative.source.tolist(), relative.target.tolist(), strict=True)
-    pairs = [(min(e), max(e)) for e in ends]
-    open_ones = {p for p, d in zip(pairs, differs.tolist(), strict=True) if d}
-    return sorted(held | ({*pairs} - open_ones))
+    differs = differences(T_cw, at, segment.median_depths(known)) >= min_change
+    changing = relative.select(relative.is_loop & differs)
+    return sorted(tracked | ({*relative.pairs} - {*changing.pairs}))

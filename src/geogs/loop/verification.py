@@ -71,8 +71,8 @@ class TwoViewVerifier:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._K = camera.matrix().numpy()
-        self._edge = max(camera.width, camera.height)
+        self._K = camera.K
+        self._edge = camera.long_edge
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
     def verify(self, first: FeatureView, second: FeatureView) -> TwoViewMatch:
@@ -216,7 +216,7 @@ class TwoViewVerifier:
         middle = float(np.median(ratio))
         if abs(middle) > np.log(MAX_SCALE):
             return None, f"the depths differ by a factor of {np.exp(abs(middle)):.1f}"
-        share = float((np.abs(ratio - middle) < DEPTH_TOLERANCE).mean())
-        if share < MIN_CONSISTENT:
-            return None, f"the depths agree at only {share:.0%} of the matches"
+        agreeing = float((np.abs(ratio - middle) < DEPTH_TOLERANCE).mean())
+        if agreeing < MIN_CONSISTENT:
+            return None, f"the depths agree at only {agreeing:.0%} of the matches"
         return float(np.exp(middle)), ""

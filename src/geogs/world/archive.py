@@ -62,8 +62,7 @@ class Archive:
     def put(self, array: np.ndarray) -> "Archived":
         """Write an array.
 
-        Raises:
-            OutputError: the disk is full, or cannot be written.
+        Raises OutputError if the disk is full, or cannot be written.
         """
         with self._lock:
             self._collect()
@@ -78,8 +77,7 @@ class Archive:
     def read(self, archived: "Archived") -> np.ndarray:
         """An array as it was written.
 
-        Raises:
-            OutputError: the file has been cut off.
+        Raises OutputError if the file has been cut off.
         """
         array = np.empty(archived.shape, archived.dtype)
         rest, offset = _bytes(array), archived.offset
@@ -95,8 +93,7 @@ class Archive:
     def settle(self, folder: "NamedFiles") -> "SettledArchive":
         """Put all that was written on the disk under its name in a folder; what to open it by.
 
-        Raises:
-            OutputError: the disk is full, or cannot be written.
+        Raises OutputError if the disk is full, or cannot be written.
         """
         try:
             if not self._is_settled or self.folder != folder.path:
@@ -120,8 +117,7 @@ class Archive:
     def reopened(cls, folder: "NamedFiles", name: str, settled: "SettledArchive") -> "Archive":
         """The archive as it was when it was settled; what was written later is cut off.
 
-        Raises:
-            InputError: the file is missing, too short, or what is said of it cannot be.
+        Raises InputError if the file is missing, too short, or what is said of it cannot be.
         """
         parts = [(0, settled.end), *settled.free]
         if any(min(p) < 0 or sum(p) > settled.end for p in parts):
@@ -142,8 +138,7 @@ class Archive:
     ) -> "Archived":
         """An array that a checkpoint says is in the file; it is read to be sure.
 
-        Raises:
-            InputError: it is not there, or has changed.
+        Raises InputError if it is not there, or has changed.
         """
         if min(offset, *shape, 0) < 0 or offset + math.prod(shape) * dtype.itemsize > self._end:
             raise InputError(f"{self.name} does not reach as far as it should")
@@ -243,12 +238,7 @@ class Archived:
     __slots__ = ("__weakref__", "archive", "checksum", "dtype", "offset", "shape")
 
     def __init__(
-        self,
-        archive: Archive,
-        offset: int,
-        shape: tuple[int, ...],
-        dtype: np.dtype,
-        checksum: int,
+        self, archive: Archive, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
     ) -> None:
         self.archive = archive
         self.offset = offset

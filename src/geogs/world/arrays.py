@@ -37,8 +37,7 @@ class ArrayTable:
     def put(self, name: str, id: int, array: np.ndarray, recent: bool = False) -> None:
         """Write an array; one that stays in memory must not be changed.
 
-        Raises:
-            OutputError: the disk is full, or cannot be written.
+        Raises OutputError if the disk is full, or cannot be written.
         """
         self.pieces.setdefault(name, {})[id] = self.archive.put(array)
         if recent:

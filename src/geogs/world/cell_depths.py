@@ -17,7 +17,7 @@ class KeyframePrior:
 
     kind: DepthKind
     values: Float32[Tensor, "p"]
-    """As the prior gave them, on the grid."""
+    """What the prior gave, on the grid."""
     inverse_depth: Annotated[Float32[Tensor, "p"], AT_LEAST_0]
     """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
     scale: Float32[Tensor, "k"]

@@ -14,6 +14,7 @@ from torch import Tensor
 from geogs.config.setting import Range
 from geogs.geometry.camera import Camera
 from geogs.limits import POSITIVE, KeyframeId, Pose
+from geogs.world.arrays import NOT_STORED
 from geogs.world.grid import SampleGrid
 
 MAX_WEIGHT = 6e4
@@ -35,7 +36,7 @@ class MeasuredEdge:
     """Where the cells fell when the flow was measured."""
     damping: Annotated[Float32[Tensor, "p"], Range(0)] | None = None
     """Damping of the source's inverse depth, if the operator gives one."""
-    memory: Any = field(default=None, metadata={"stored": False})
+    memory: Any = field(default=None, metadata=NOT_STORED)
     """What the operator keeps of this edge, and can do without."""
 
 
@@ -58,7 +59,7 @@ class PackedEdge:
     """The source's when the flow was measured."""
     damping: Annotated[Float32[Tensor, "p"], Range(0)] | None = None
     """Damping of the source's inverse depth, if the operator gives one."""
-    memory: Any = field(default=None, metadata={"stored": False})
+    memory: Any = field(default=None, metadata=NOT_STORED)
     """What the operator keeps of this edge, and can do without."""
 
     def moved(self, camera: Camera, shift: Float[Tensor, "p 2"]) -> "PackedEdge":
@@ -103,7 +104,7 @@ def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Flo
 
 def position_step(camera: Camera) -> float:
     """Pixels between two packed positions that differ by one."""
-    return 2.0**-15 * max(camera.width, camera.height)
+    return 2.0**-15 * camera.long_edge
 
 
 def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 2"]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from geogs.config.setting import Range
 from geogs.limits import RIGID, AtLeast0, KeyframeId, Number, Pose, Positive
 from geogs.types import SeenRows
+from geogs.world.arrays import NOT_STORED
 from geogs.world.keyframes import Keyframe
 
 
@@ -58,7 +59,7 @@ class FrameRecord:
     """Relative to earlier frames: what is left to go by where there is no depth."""
     image: UInt8[np.ndarray, "h w 3"] | None = None
     """Kept until the keyframes around are final and the flow from them is measured."""
-    encoded: Any = field(default=None, metadata={"stored": False})
+    encoded: Any = field(default=None, metadata=NOT_STORED)
     """The flow operator's form of the image, or None where it has to be computed again."""
     is_found: bool = False
     """Whether it was lost, and placed after the stream by frames that were not."""
@@ -84,7 +85,7 @@ class FrameLog:
     rows: dict[Number, SeenRows] = field(default_factory=dict)
     """Rectified rows of a rolling shutter, by the indices of the frames."""
     open_rows: SeenRows | None = None
-    """Those of every frame where none are rectified, and nobody knows whether they should be."""
+    """Rows of every frame where none are rectified, and nobody knows whether they should be."""
 
     def set_readout(self, factor: float, doubt: float) -> None:
         """Have rows seen over a readout that is so many times what they were rectified by, with its

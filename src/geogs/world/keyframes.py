@@ -24,7 +24,7 @@ from geogs.world.pose_table import PoseTable
 from geogs.world.tables import check_arrays, check_tables
 
 Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
-"""A flow operator's form of an image."""
+"""A flow operator's encoding of an image."""
 
 KEYFRAME_ARRAYS = {
     "image": UInt8[np.ndarray, "h w 3"],
@@ -64,7 +64,7 @@ class Keyframe:
     measured: MeasuredCells | None = None
     """What a depth sensor says; none without, or where the map is not metric."""
     pose: MeasuredPose | None = None
-    """By another tracker, in its own world; none where there is none."""
+    """Pose by another tracker, in its own world; none where there is none."""
     table: "KeyframeTable" = field(init=False, repr=False, metadata=NOT_STORED)
     """Which has it; given by the table."""
     own_encoded: Any = field(default=None, repr=False, metadata=NOT_STORED)
@@ -93,7 +93,7 @@ class Keyframe:
 
     @property
     def encoded(self) -> Any:
-        """The flow operator's form of the image, computed again where it is no longer kept."""
+        """The encoded image, computed again where it is no longer kept."""
         encode = self.table.encode
         if encode is None:
             return self.own_encoded
@@ -122,14 +122,14 @@ class Keyframe:
         self.table.arrays.put("sensor depth", self.id, metres.astype(np.float16))
 
     def copied_to(self, table: "KeyframeTable") -> "Keyframe":
-        """A copy for another table, which stays what this one is now; its pose is not copied."""
+        """A snapshot for another table, without the pose."""
         twin = copy.copy(self)
         twin.prior, twin.measured = copy.copy(self.prior), copy.copy(self.measured)
         twin.table = table
         return twin
 
     def as_it_is(self) -> "Keyframe":
-        """A copy with its pose that stays what this one is now, in no table that others see."""
+        """A snapshot with its pose, in a table of its own."""
         twin = self.copied_to(self.table.mirror())
         twin.T_cw = self.T_cw
         return twin
@@ -170,9 +170,7 @@ class Keyframe:
             known = known + self.prior.information
         return known / (1 + known * floor)
 
-    def depth_field(
-        self,
-    ) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
+    def depth_field(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
         """Inverse depth and its ``confident_information`` as images of cells, on the CPU."""
         grid = self.grid
         fields = torch.stack([self.inverse_depth, self.confident_information])
@@ -193,12 +191,12 @@ class KeyframeTable:
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     lens: FoundLens | None = None
-    """By which images and depths were straightened at the end; none where they are as they were
-    tracked."""
+    """Lens by which images and depths were straightened at the end; none where they are as they
+    were tracked."""
     frame_lenses: dict[Id, FrameLens] = field(default_factory=dict)
     """What the lenses of keyframes had of their own then, where they had."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
-    """Of matches and depths, with the camera that saw what they are of."""
+    """Grid of matches and depths, with the camera that saw them."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
     """The pinhole that the images are of, or will be once they are straight. That of the grid is
     another only while the lens is being found."""
@@ -305,7 +303,7 @@ class KeyframeSet:
 
     @property
     def camera(self) -> Camera:
-        """Of the images."""
+        """Camera of the images."""
         return self.table.camera
 
     @property
@@ -370,12 +368,16 @@ class KeyframeSet:
         return target @ se3_inverse(source)
 
     def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
-        """On the grid."""
+        """Inverse depths on the grid."""
         return torch.stack([self[i].inverse_depth for i in ids])
 
     def informations(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
-        """On the grid, pixels^2 per inverse depth^2."""
+        """Information on the grid, pixels^2 per inverse depth^2."""
         return torch.stack([self[i].information for i in ids])
+
+    def median_depths(self, ids: Sequence[int]) -> Float[Tensor, "n"]:
+        """Median depth of each keyframe's cells, float64, on the CPU."""
+        return 1 / self.inverse_depths(ids).median(1).values.cpu().double()
 
     def rescale(self, factor: float) -> None:
         """Multiply every length by ``factor``."""
@@ -411,10 +413,9 @@ class KeyframeSet:
 
 
 def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:
-    """Look whether sets that were read are of a table that was, and this of the camera of its grid.
+    """Check that sets that were read are of a table that was, and this of the camera of its grid.
 
-    Raises:
-        InputError: a keyframe is missing, of another camera, or not in its place.
+    Raises InputError if a keyframe is missing, of another camera, or not in its place.
     """
     sizes, seen = table.grid.sizes, set[int]()
     check_tables(KeyframeTable, table, sizes, {})

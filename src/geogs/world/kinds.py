@@ -19,18 +19,18 @@ class Part(NamedTuple):
 
     place: str
     kind: Any
-    """Without what is said of it besides."""
+    """Without the marks of ``Annotated``."""
     marks: tuple[object, ...]
     value: Any
 
 
 def plain(kind: Any) -> Any:
-    """A kind without what is said of it besides."""
+    """A kind without the marks of ``Annotated``."""
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
 def marks_of(kind: Any) -> tuple[object, ...]:
-    """What is said of a kind besides."""
+    """The marks of ``Annotated`` on a kind."""
     return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
 
 

@@ -13,6 +13,7 @@ from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.limits import SIMILARITY, KeyframeId, Number, Pose, Positive, Reference
 from geogs.types import FlowMatch
+from geogs.world.edges import Pair
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.tables import check_tables
 
@@ -140,16 +141,19 @@ class RelativePoses:
     def __len__(self) -> int:
         return len(self.source)
 
+    @property
+    def pairs(self) -> list[Pair]:
+        """The two ends of each edge, the earlier first."""
+        ends = zip(self.source.tolist(), self.target.tolist(), strict=True)
+        return [(min(pair), max(pair)) for pair in ends]
+
     def select(self, keep: Bool[Tensor, "e"]) -> "RelativePoses":
         """The edges that are marked."""
         parts = (self.source, self.target, self.G, self.information, self.is_loop)
         return RelativePoses(*(p[keep] for p in parts))
 
     def rescaled(self, scale: Float[Tensor, "n"]) -> "RelativePoses":
-        """The same measurements after the unit of each keyframe was divided by ``scale``.
-
-        To be applied to edges kept beyond a correction, with :attr:`PoseGraphResult.scale`.
-        """
+        """The same measurements after the unit of each keyframe was divided by ``scale``."""
         here, there = scale[self.source], scale[self.target]
         G = self.G.clone()
         G[:, :3, :3] *= (here / there)[:, None, None]
@@ -186,16 +190,15 @@ class LoopTable:
     keyframes: list[KeyframeId] = field(default_factory=list)
     """Searched for loops so far, earliest first."""
     features: dict[KeyframeId, ImageFeatures] = field(default_factory=dict)
-    """By keyframe."""
     vocabulary: Vocabulary = field(default_factory=Vocabulary)
     found: list[list[VerifiedCandidate]] = field(default_factory=list)
     """Candidates of the latest keyframes, about which the flow has not decided yet."""
     loops: list[Loop] = field(default_factory=list)
     """Verified, earliest first."""
     between: list[Loop] = field(default_factory=list)
-    """Those between two segments."""
+    """Loops between two segments."""
     constraints: dict[int, SegmentConstraints] = field(default_factory=dict)
-    """By the number of the segment."""
+    """Relative poses by the number of the segment."""
     closures: int = 0
     """Corrections by loops so far."""
 

@@ -29,7 +29,7 @@ class LruCache(Generic[K, V]):
         return key in self._values
 
     def peek(self, key: K) -> V | None:
-        """The value of a key if it is here; asking is no use."""
+        """The value of a key if it is here; it does not count as used."""
         return self._values.get(key)
 
     def items(self) -> list[tuple[K, V]]:

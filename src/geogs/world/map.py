@@ -131,7 +131,7 @@ class MapTable:
     disks: GaussianMap
     random: RandomState
     views: dict[KeyframeId, ViewRow] = field(default_factory=dict)
-    """By keyframe, in the order in which mapping came to know them."""
+    """Rows by keyframe, in the order in which mapping came to know them."""
     arrays: ArrayTable = field(default_factory=ArrayTable)
     """Masks, dense depths with confidences and normals, and depths rendered from the disks."""
     resident: list[KeyframeId] = field(default_factory=list)
@@ -140,7 +140,7 @@ class MapTable:
     mapped: list[KeyframeId] = field(default_factory=list)
     """Keyframes whose depth is part of the map."""
     given: list[KeyframeId] = field(default_factory=list)
-    """Those of a saved map, which stay as they are."""
+    """Keyframes of a saved map, which stay as they are."""
     unit: Positive | None = None
     """Median depth of the first keyframe, map units; none until it is mapped."""
     place: TrainingPlace = TrainingPlace()
@@ -155,10 +155,9 @@ class MapTable:
 
 
 def check_map(table: MapTable, keyframes: KeyframeTable, size: tuple[int, int]) -> None:
-    """Look whether a table that was read is of these keyframes; ``size`` is height and width.
+    """Check that a table that was read is of these keyframes; ``size`` is height and width.
 
-    Raises:
-        InputError: it is incomplete, or of other keyframes.
+    Raises InputError if it is incomplete, or of other keyframes.
     """
     height, width = size
     check_tables(MapTable, table, {}, {"keyframes": keyframes})

@@ -56,16 +56,15 @@ class Packed:
 
     values: Values = None
     arrays: dict[str, Tensor] = field(default_factory=dict)
-    """By their place in the record, such as ``mapper.map.position``; copies on the CPU."""
+    """Copies on the CPU, by their place in the record, such as ``mapper.map.position``."""
     archives: dict[str, Archive] = field(default_factory=dict)
-    """Those that arrays of the record lie in, by name."""
+    """Archives that arrays of the record lie in, by name."""
 
 
 def pack(kind: Any, record: object) -> Packed:
     """Take apart a record of a kind (a type as an annotation has it).
 
-    Raises:
-        TypeError: something in it is not of its declared type, or cannot be stored.
+    Raises TypeError if something in it is not of its declared type, or cannot be stored.
     """
     packed = Packed()
     packed.values = _Packer(packed).value(kind, record, "")
@@ -84,8 +83,7 @@ def unpack(
 
     ``name`` is the place of the record in the one that was packed.
 
-    Raises:
-        InputError: a part is missing, superfluous, or not of its declared type; the text names it.
+    Raises InputError, which names the part, if one is missing, superfluous, or of another type.
     """
     return _Unpacker(arrays, archives, torch.device(device)).value(kind, values, name)
 

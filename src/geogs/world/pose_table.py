@@ -51,8 +51,8 @@ class PoseTable:
         return self._centres[np.asarray(ids, np.int64)]
 
     def nearest(self, id: int, ids: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:
-        """Those of some keyframes whose cameras were nearest to one's, at most ``count``, nearest
-        first; of equally near ones the first."""
+        """The ``count`` of some keyframes whose cameras were nearest to one's, nearest first; of
+        equally near ones the first."""
         distance = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
         if count < len(ids):
             # Whatever is as near as the last of them takes part, so that the first are taken.
@@ -65,8 +65,8 @@ class PoseTable:
     def around(
         self, id: int, ids: Int64[np.ndarray, "n"], angle: float, distance: float
     ) -> Int64[np.ndarray, "m"]:
-        """Those of some keyframes less than a ``distance`` from one's camera that look the same way
-        to less than an ``angle`` in degrees; nearest first."""
+        """Keyframes among some that are less than a ``distance`` from one's camera and whose view
+        differs by less than an ``angle`` in degrees; nearest first."""
         away = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
         within = np.flatnonzero(away < distance)
         within = within[np.argsort(away[within], kind="stable")]

@@ -18,16 +18,8 @@ from torch import Tensor
 from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp, se3_log
-from geogs.limits import (
-    RIGID,
-    UNBOUNDED,
-    AtLeast0,
-    Id,
-    KeyframeId,
-    Number,
-    Pose,
-    Positive,
-)
+from geogs.limits import RIGID, UNBOUNDED, AtLeast0, Id, KeyframeId, Number, Pose, Positive
+from geogs.world.arrays import NOT_STORED
 from geogs.world.edges import Edge, Pair
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
@@ -110,7 +102,7 @@ class ReferenceView:
     image: UInt8[np.ndarray, "h w 3"]
     R: Annotated[Float64[Tensor, "3 3"], RIGID] | None
     """The camera that was located last to this one; none where nothing links them."""
-    encoded: Any = field(default=None, metadata={"stored": False})
+    encoded: Any = field(default=None, metadata=NOT_STORED)
     """The flow operator's form of the image, or None where it has to be computed again."""
 
 
@@ -140,7 +132,7 @@ class TrackStatus:
     misses: Number = 0
     """Frames since the camera was last located."""
     frames_lost: Number = 0
-    """Those of them with texture that show more than a rotation."""
+    """Frames among them that have texture and show more than a rotation."""
 
     @property
     def has_map(self) -> bool:
@@ -243,15 +235,14 @@ class SegmentTable:
 
 
 def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -> None:
-    """Check segments that were read; their keyframes are attached to the table.
+    """Check segments that were read, of at most so many ``frames``; their keyframes are attached.
 
-    Raises:
-        InputError: one is of other keyframes or another camera, or the table is incomplete; there
-            cannot be more than so many ``frames``.
+    Raises InputError if one is of other keyframes or another camera, or the table is incomplete.
     """
     numbers = [segment.number for segment in table.segments]
     here = {table.main, table.current} if numbers else set[int]()
-    if not here <= {*numbers} or any(n >= table.count for n in numbers) or _repeats(numbers):
+    is_unique = len({*numbers}) == len(numbers)
+    if not here <= {*numbers} or any(n >= table.count for n in numbers) or not is_unique:
         raise InputError("a segment is missing, or has the number of another")
     sizes = keyframes.grid.sizes
     for segment in table.segments:
@@ -263,10 +254,6 @@ def check_segments(table: SegmentTable, keyframes: KeyframeTable, frames: int) -
             raise InputError(f"the frames of segment {segment.number} are not in their order")
         if not _ascends(segment.final):
             raise InputError(f"the keyframes of segment {segment.number} are not in their order")
-
-
-def _repeats(numbers: list[int]) -> bool:
-    return len(set(numbers)) < len(numbers)
 
 
 def _ascends(numbers: list[int]) -> bool:

@@ -14,7 +14,7 @@ from geogs.geometry.distortion import RESAMPLING, distorted_pixels, lens_maps
 from geogs.types import FoundLens, FrameLens
 
 FARTHEST, ENTRIES = 4.0, 1 << 14
-"""Of the table by which rays are straightened: its end, in diagonals of the image, and its entries;
+"""End of the table by which rays are straightened, in diagonals of the image, and its entries;
 linear between them, which is exact to 1e-5 pixels."""
 RADII = 64
 """Rays by which two lenses in turn become one."""
@@ -63,7 +63,7 @@ class StraightView:
         )
 
     def of_frame(self, own: FrameLens) -> "StraightView":
-        """That of a frame whose lens has something of its own."""
+        """The view of a frame whose lens has something of its own."""
         return replace(self, lens=self.lens.of_frame(own))
 
     # --- points ----------------------------------------------------------------------------
@@ -104,8 +104,8 @@ class StraightView:
     # --- images ----------------------------------------------------------------------------
 
     def image(self, bent: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """As the pinhole sees it. What is beyond the border gets its colour; what was masked out
-        stays black."""
+        """The image that the pinhole sees. What is beyond the border gets its colour; what was
+        masked out stays black."""
         straight = cv2.remap(bent, *self._maps, RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
         black = bent[..., 0] | bent[..., 1] | bent[..., 2]  # one after the other: quicker
         straight[self.nearest(black) == 0] = 0

@@ -41,7 +41,7 @@ class World:
     uncertainty: Uncertainty | None = None
     """How well frames are known, by the last adjustment of all keyframes after the stream."""
     metric_scale: MetricScale | None = None
-    """By what lengths were brought to metres."""
+    """The factor by which lengths were brought to metres."""
 
 
 def check_world(world: World) -> None:

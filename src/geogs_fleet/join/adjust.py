@@ -17,7 +17,7 @@ from torch import Tensor
 from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.device_choice import grid_fields
-from geogs.bundle.schur import stepped
+from geogs.bundle.schur import stepped_depths
 from geogs.bundle.streamed import StreamedSchur
 from geogs.bundle.terms import BundleState
 from geogs.config import Config
@@ -249,7 +249,7 @@ def follow(job: StepJob) -> PoseSums | None:
     if job.step is not None and job.T_before is not None:
         before, step = BundleState(job.T_before[numbers], d), job.step[numbers]
         delta = schur.depth_steps(before, schur.system, step.reshape(-1))
-        d = stepped(problem, before, step, delta, options)[1]
+        d = stepped_depths(problem, d + delta)
     information = graph.keyframes.informations(own)
     sums: PoseSums | None = None
     if not job.is_last:

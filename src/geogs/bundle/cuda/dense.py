@@ -1,6 +1,5 @@
 """Dense bundle adjustment on the GPU: a handful of launches per step, one wait per solve."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,17 +10,13 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.linear_edges import (
-    EdgeArrays,
-    LinearisedEdges,
-    edge_costs,
-    joined_edges,
-)
+from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, edge_costs, joined_edges
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import INVERSE_DEPTHS
 from geogs.bundle.protocols import BundleOptions, BundleResult
-from geogs.bundle.terms import BundleState, SharedBlock
+from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Step, minimise
-from geogs.gpu.kernels import Kernel, kernels_for
+from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device, upload_indices
 from geogs.world.grid import SampleGrid
 
@@ -103,19 +98,6 @@ def _system_parts(
     return places, first, part[order]
 
 
-class _Cameras:
-    """The camera system on the device."""
-
-    def __init__(self, structure: _Structure, like: Float[Tensor, "m"]) -> None:
-        size, pairs = 6 * structure.poses, len(structure.edges.pair_a)
-        self.system = like.new_empty((size + 1) * size)
-        """The right-hand side is its last row."""
-        self.inverses = like.new_empty(-(-size // PANEL) * PANEL * PANEL)
-        self.good = like.new_empty(1, dtype=torch.int32)
-        self.xi = like.new_zeros(6 * structure.frames)
-        self.blocks, self.vectors = like.new_empty(144 * pairs), like.new_empty(12 * pairs)
-
-
 @dataclass(frozen=True)
 class _State:
     """What is adjusted, on the device."""
@@ -123,7 +105,6 @@ class _State:
     memory: Float[Tensor, "m"]
     """Poses and the sign of failure, which travel back together."""
     inverse_depth: Float[Tensor, "n p"]
-    block: SharedBlock | None
 
     @staticmethod
     def at_start(problem: BundleProblem) -> "_State":
@@ -131,7 +112,7 @@ class _State:
         d, T = problem.inverse_depth, problem.T_cw
         memory = torch.zeros(T.numel() + 1, dtype=torch.float64, device=d.device)
         memory[:-1].copy_(to_device(T.reshape(-1), d.device))
-        return _State(memory, d, problem.block)
+        return _State(memory, d)
 
     @property
     def T(self) -> Float[Tensor, "m"]:
@@ -145,46 +126,17 @@ class _State:
 
     @property
     def everything(self) -> BundleState:
-        """As terms see it."""
-        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth, self.block)
+        """The state that terms are given."""
+        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth)
 
     @property
     def with_poses_here(self) -> BundleState:
-        """As terms of poses see it; waits."""
-        return BundleState(self.T.reshape(-1, 4, 4).cpu(), self.inverse_depth, self.block)
+        """The state that terms of poses are given; waits."""
+        return BundleState(self.T.reshape(-1, 4, 4).cpu(), self.inverse_depth)
 
     def copy(self) -> "_State":
-        """For a step to change."""
-        return _State(self.memory.clone(), self.inverse_depth.clone(), self.block)
-
-
-class _Workspace:
-    """What one solve keeps on the device beside the state that is adjusted."""
-
-    def __init__(
-        self, problem: BundleProblem, structure: _Structure, kernels: Mapping[str, Kernel]
-    ) -> None:
-        d = problem.inverse_depth
-        self.structure = structure
-        self.delta = d.new_empty(d.numel())
-        self.edges = LinearisedEdges(kernels, structure.edges, d)
-        self.cameras = _Cameras(structure, d.new_empty(0, dtype=torch.float64))
-        self.depth_terms = KernelDepthTerms.of(problem.depth_terms)
-
-
-def _add_pose_terms(c: _Cameras, state: _State, problem: BundleProblem, damping: float) -> None:
-    """Add what is said of poses alone to the assembled camera system, which waits for them."""
-    if not problem.pose_terms:
-        return
-    poses, here = DenseCameraSystem(problem.free_pose.cpu()), state.with_poses_here
-    for term in problem.pose_terms:
-        poses.add(term.hyper_edges(here))
-    hessian = poses.hessian[poses.free[:, None], poses.free]
-    # Of the system on the device only the lower blocks are in use.
-    diagonal = hessian.diagonal()
-    diagonal += damping * diagonal.abs()
-    added = torch.cat([hessian, poses.gradient[poses.free][None]])
-    c.system += to_device(added.reshape(-1), c.system.device)
+        """A copy for a step to change."""
+        return _State(self.memory.clone(), self.inverse_depth.clone())
 
 
 class CudaDenseBundle:
@@ -202,14 +154,12 @@ class CudaDenseBundle:
         self._last: tuple[tuple[bytes, ...], _Structure] | None = None
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
-        """As in the protocol; poses are returned where they were given.
+        """Take the steps; poses are returned where they were given.
 
         Where steps need not lower the cost nobody waits for one to end, be it small
         (``tolerance``) or not finite.
         """
-        device = problem.inverse_depth.device
-        w = _Workspace(problem, self._structure_of(problem, device), self.kernels)
-        steps = _DenseSteps(self, problem, options, w)
+        steps = _DenseSteps(self, problem, options)
         cost = steps.cost if options.lowers_cost else None
         found = minimise(
             _State.at_start(problem), steps.linearise, steps.step, options.policy, cost
@@ -217,39 +167,45 @@ class CudaDenseBundle:
         memory = found.state.memory.cpu()
         T = memory[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
         finite = found.finite and int(memory[-1:].view(torch.int32)[0]) == 0
-        return BundleResult(T, found.state.inverse_depth, w.edges.information, finite)
+        return BundleResult(T, found.state.inverse_depth, steps.edges.information, finite)
 
-    def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
-        """That of the last problem, if it is the same: edges are adjusted in rounds."""
+    def structure_of(self, problem: BundleProblem) -> _Structure:
+        """The structure of the last problem, if it is the same: edges are adjusted in rounds."""
         parts = (problem.source, problem.target, problem.free_pose, problem.free_depth)
         key = tuple(x.cpu().numpy().tobytes() for x in parts)
         if self._last is None or self._last[0] != key:
-            self._last = key, _structure(problem, device)
+            self._last = key, _structure(problem, problem.inverse_depth.device)
         return self._last[1]
 
 
 class _DenseSteps:
-    """One adjustment as the least-squares loop sees it; what is linearised is in the workspace."""
+    """One adjustment as the least-squares loop sees it, and what it keeps on the device."""
 
     def __init__(
-        self,
-        bundle: CudaDenseBundle,
-        problem: BundleProblem,
-        options: BundleOptions,
-        workspace: _Workspace,
+        self, bundle: CudaDenseBundle, problem: BundleProblem, options: BundleOptions
     ) -> None:
         self.grid, self.problem, self.options = bundle.grid, problem, options
         self.kernels, self.solvers = bundle.kernels, bundle.solvers
         self.matches = problem.pixels.contiguous(), problem.weight.contiguous()
-        self.workspace = workspace
+        d = problem.inverse_depth
+        self.structure = s = bundle.structure_of(problem)
+        self.edges = LinearisedEdges(self.kernels, s.edges, d)
+        self.depth_terms = KernelDepthTerms.of(problem.depth_terms)
+        size, pairs = 6 * s.poses, len(s.edges.pair_a)
+        like = d.new_empty(0, dtype=torch.float64)
+        self.system = like.new_empty((size + 1) * size)
+        """The camera system; the right-hand side is its last row."""
+        self.inverses = like.new_empty(-(-size // PANEL) * PANEL * PANEL)
+        self.good = like.new_empty(1, dtype=torch.int32)
+        self.xi, self.delta = like.new_zeros(6 * s.frames), d.new_empty(d.numel())
+        """Steps of the poses, and of the inverse depths."""
+        self.blocks, self.vectors = like.new_empty(144 * pairs), like.new_empty(12 * pairs)
 
     def linearise(self, state: _State) -> bool:
         """Edges, summed up by source; that they are."""
-        w = self.workspace
-        w.edges.fill(
-            self.grid, state.T, state.inverse_depth, self.matches, self.options, w.depth_terms,
-            range(w.structure.frames), state.everything,
-        )  # fmt: skip
+        self.edges.fill(
+            self.grid, state.T, state.inverse_depth, self.matches, self.options, self.depth_terms
+        )
         return True
 
     def step(self, state: _State, linear: bool, damping: float) -> Step[_State] | None:
@@ -260,14 +216,14 @@ class _DenseSteps:
             return Step(moved)
         if bool(moved.failed.any()):
             return None
-        return Step(moved, float(self.workspace.cameras.xi.abs().max()))
+        return Step(moved, float(self.xi.abs().max()))
 
     def cost(self, state: _State, linear: bool) -> float:
-        """As of the CPU's solvers; waits."""
-        p, edges = self.problem, self.workspace.structure.edges
+        """Twice what is minimised; waits."""
+        p = self.problem
         matched = edge_costs(
-            self.kernels, edges, self.grid, state.T, state.inverse_depth, self.matches,
-            self.options.huber,
+            self.kernels, self.structure.edges, self.grid, state.T, state.inverse_depth,
+            self.matches, self.options.huber,
         )  # fmt: skip
         terms = sum(term.cost(state.everything) for term in p.depth_terms)
         if p.pose_terms:
@@ -276,44 +232,59 @@ class _DenseSteps:
         return float(matched.sum()) + terms
 
     def _solve_cameras(self, state: _State, damping: float) -> None:
-        w = self.workspace
-        s, c = w.structure, w.cameras
+        s = self.structure
         if not s.poses:
             return
-        w.edges.eliminate(c.blocks, c.vectors)
+        self.edges.eliminate(self.blocks, self.vectors)
         self.kernels["assemble_system"](
-            len(s.places), 256, s.places, s.first_part, s.parts, c.blocks, c.vectors, s.poses,
-            damping, c.system,
+            len(s.places), 256, s.places, s.first_part, s.parts, self.blocks, self.vectors, s.poses,
+            damping, self.system,
         )  # fmt: skip
-        _add_pose_terms(c, state, self.problem, damping)
+        self._add_pose_terms(state, damping)
         if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
-            self.solvers["solve_few_poses"](1, threads, c.system, s.slot, s.poses, s.frames, c.xi)
+            self.solvers["solve_few_poses"](
+                1, threads, self.system, s.slot, s.poses, s.frames, self.xi
+            )
         else:
-            self._solve_many_poses(s, c)
+            self._solve_many_poses()
 
-    def _solve_many_poses(self, s: _Structure, c: _Cameras) -> None:
+    def _add_pose_terms(self, state: _State, damping: float) -> None:
+        """Add what is said of poses alone to the assembled camera system, which waits for them."""
+        problem = self.problem
+        if not problem.pose_terms:
+            return
+        poses, here = DenseCameraSystem(problem.free_pose.cpu()), state.with_poses_here
+        for term in problem.pose_terms:
+            poses.add(term.hyper_edges(here))
+        hessian = poses.hessian[poses.free[:, None], poses.free]
+        # Of the system on the device only the lower blocks are in use.
+        diagonal = hessian.diagonal()
+        diagonal += damping * diagonal.abs()
+        added = torch.cat([hessian, poses.gradient[poses.free][None]])
+        self.system += to_device(added.reshape(-1), self.system.device)
+
+    def _solve_many_poses(self) -> None:
         """Cholesky's method panel by panel."""
-        size = 6 * s.poses
+        s, size = self.structure, 6 * self.structure.poses
         for k in range(0, size, PANEL):
-            self.solvers["factor_panel"](1, 256, c.system, size, k, c.inverses, c.good)
+            self.solvers["factor_panel"](1, 256, self.system, size, k, self.inverses, self.good)
             # The right-hand side is a row below every panel.
             tiles = -(-(size + 1 - min(k + PANEL, size)) // TILE)
-            self.solvers["substitute_panel"](tiles, 256, c.system, size, k, c.inverses)
+            self.solvers["substitute_panel"](tiles, 256, self.system, size, k, self.inverses)
             if k + PANEL < size:
-                self.solvers["update_rest"]((tiles, tiles), 256, c.system, size, k)
+                self.solvers["update_rest"]((tiles, tiles), 256, self.system, size, k)
         threads = min(1024, 32 * s.poses)
         self.solvers["substitute_back"](
-            1, threads, c.system, size, c.inverses, c.good, s.slot, s.frames, c.xi
+            1, threads, self.system, size, self.inverses, self.good, s.slot, s.frames, self.xi
         )
 
     def _moved(self, state: _State) -> _State:
-        w, options, moved = self.workspace, self.options, state.copy()
-        s, edges = w.structure, w.edges
-        edges.find_depth_steps(w.cameras.xi, w.delta, moved.failed)
+        s, edges, moved = self.structure, self.edges, state.copy()
+        edges.find_depth_steps(self.xi, self.delta, moved.failed)
         self.kernels["take_steps"](
             (-(-edges.cells // edges.block), s.frames), edges.block, s.slot, s.edges.free_depth,
-            w.cameras.xi, w.delta, edges.cells, options.min_inverse_depth,
-            options.max_inverse_depth, moved.failed, moved.T, moved.inverse_depth,
+            self.xi, self.delta, edges.cells, *INVERSE_DEPTHS, moved.failed, moved.T,
+            moved.inverse_depth,
         )  # fmt: skip
         return moved

@@ -34,7 +34,7 @@ class CudaFields(GridFields):
     def fill(
         self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
     ) -> Float[Tensor, "*n p"]:
-        """As on the CPU, all fields in one launch."""
+        """All fields in one launch."""
         values, confidence = values.contiguous(), confidence.contiguous()
         out, size = torch.empty_like(values), _pyramid_size(self.grid)
         count = out.numel() // self.grid.size
@@ -50,7 +50,6 @@ class CudaFields(GridFields):
         inverse_depth: Float[Tensor, "p"],
         information: Float[Tensor, "p"],
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """As on the CPU."""
         first = torch.zeros(1, dtype=torch.long)
         depth, propagated = self._propagate(
             T_ji[None], torch.eye(4).to(T_ji)[None], first, inverse_depth[None], information[None],
@@ -61,7 +60,6 @@ class CudaFields(GridFields):
     def reproject(
         self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
     ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-        """As on the CPU."""
         rows = {k.id: k for k in keyframes}
         slot = {id: n for n, id in enumerate(rows)}
         return self._propagate(

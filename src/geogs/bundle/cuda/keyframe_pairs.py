@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.cuda.linear_edges import block_size
-from geogs.bundle.keyframe_pairs import KeyframePairs
+from geogs.bundle.keyframe_pairs import CELL_STEP, KeyframePairs
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.keyframes import KeyframeSet
@@ -33,7 +33,6 @@ class CudaPairs(KeyframePairs):
         return len(self.source)
 
     def project(self) -> Float[Tensor, "e p 2"]:
-        """As on the CPU."""
         grid, c = self.grid, self.grid.camera
         pixels = self.inverse_depth.new_empty(len(self), grid.size, 2)
         self._kernel("project_pairs")(
@@ -45,7 +44,6 @@ class CudaPairs(KeyframePairs):
     def moved(
         self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
     ) -> Float[Tensor, "e"]:
-        """As on the CPU."""
         grid, c = self.grid, self.grid.camera
         median = self.inverse_depth.new_empty(len(self))
         self._kernel("moved_pairs")(
@@ -55,14 +53,13 @@ class CudaPairs(KeyframePairs):
         )  # fmt: skip
         return median
 
-    def distances(self, rotation_weight: float, step: int = 2) -> Float[Tensor, "e"]:
-        """As on the CPU."""
+    def distances(self, rotation_weight: float) -> Float[Tensor, "e"]:
         grid, c = self.grid, self.grid.camera
         distance = self.inverse_depth.new_empty(len(self))
         self._kernel("pair_distances")(
             len(self), min(block_size(grid.size), 128), self.T_cw, self.inverse_depth, self.source,
-            self.target, grid.rays, grid.pixels, grid.width, grid.height, step, c.fx, c.fy, c.cx,
-            c.cy, c.width - 2, c.height - 2, rotation_weight, distance,
+            self.target, grid.rays, grid.pixels, grid.width, grid.height, CELL_STEP, c.fx, c.fy,
+            c.cx, c.cy, c.width - 2, c.height - 2, rotation_weight, distance,
         )  # fmt: skip
         return distance
 

@@ -3,7 +3,7 @@
 The dense and the streamed solver share these launches.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.depth_terms import MEASURED_HUBER
 from geogs.bundle.flow_term import BEHIND
 from geogs.bundle.protocols import BundleOptions
-from geogs.bundle.terms import BundleState
 from geogs.gpu.kernels import Kernel
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import SampleGrid
@@ -116,25 +116,19 @@ class LinearisedEdges:
         matches: tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]],
         options: BundleOptions,
         terms: KernelDepthTerms,
-        frames: Iterable[int],
-        state: BundleState,
     ) -> None:
-        """Linearise all edges; sum up what they and all terms say of each source's depths.
-
-        ``frames`` are the sources by their numbers in ``state``.
-        """
+        """Linearise all edges; sum up what they and all terms say of each source's depths."""
         a, c, (curvature, gradient) = self.arrays, grid.camera, self.per_edge
         self.kernels["linearise_edges"](
             len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
             self.cells, c.fx, c.fy, c.cx, c.cy, options.huber, self.motion, self.normal,
             self.coupling, curvature, gradient,
         )  # fmt: skip
-        damping, *measured = terms.arguments
         self.kernels["sum_sources"](
             len(depth), self.block, a.first, curvature, gradient, self.cells,
-            options.depth_damping, damping, depth, *measured, self.information, *self.depths,
+            options.depth_damping, terms.damping, depth, terms.measured, terms.information,
+            MEASURED_HUBER, self.information, *self.depths,
         )  # fmt: skip
-        terms.add_others(frames, state, self.information, *self.depths)
 
     def eliminate(self, blocks: Tensor, vectors: Tensor) -> None:
         """What each pair of edges says of the poses: four blocks and two vectors, depths gone."""

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.cuda.linear_edges import block_size, edges_by_frame
@@ -11,7 +11,6 @@ from geogs.bundle.motion_only import MotionSolver
 from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KNOWN, Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
@@ -26,20 +25,11 @@ class CudaMotion(MotionSolver):
     Poses and ``frame`` of a problem may be on the CPU; poses are returned where they were given.
     """
 
-    def __init__(self, grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> None:
-        self.grid = grid
-        self.rays = (grid.rays if cells is None else grid.rays[cells]).contiguous()
-
     def solve(
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-        """As on the CPU."""
-        T_cw, d, frame, c = (
-            problem.T_cw,
-            problem.inverse_depth,
-            problem.frame.cpu(),
-            self.grid.camera,
-        )
+        T_cw, d, frame = problem.T_cw, problem.inverse_depth, problem.frame.cpu()
+        c = self.grid.camera
         n, device = len(T_cw), d.device
         first, order = edges_by_frame(frame, n, device)
         poses = to_device(torch.cat([T_cw, problem.T_source]), device)
@@ -62,7 +52,6 @@ class CudaMotion(MotionSolver):
         huber: float,
         limit: float,
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "7"]]:
-        """As on the CPU."""
         grid, c, known = self.grid, self.grid.camera, keyframe.information
         device, threads = known.device, block_size(grid.size, MOST_THREADS)
         # Both poses in one piece; behind them what is found.

@@ -29,7 +29,7 @@ def best_residuals(
     between: tuple[float, float],
     behind: float,
 ) -> Float[Tensor, "e p"]:
-    """As :func:`geogs.bundle.rigidity.best_residuals`, from the motions along the edges.
+    """Residuals as of :func:`geogs.bundle.rigidity.best_residuals`, from the motions along edges.
 
     These and ``source`` are on the CPU, all else on the GPU, where nothing waits.
     """

@@ -16,12 +16,7 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.linear_edges import (
-    EdgeArrays,
-    LinearisedEdges,
-    edge_costs,
-    joined_edges,
-)
+from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, edge_costs, joined_edges
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.problem import StreamedProblem, source_chunks
 from geogs.bundle.protocols import BundleOptions, BundleResult
@@ -45,7 +40,7 @@ class _Chunk:
     frames: Tensor
     """Sources, then the other frames that their edges reach."""
     arrays: EdgeArrays
-    """By the new numbers."""
+    """The edges between frames by their new numbers."""
     added: Tensor
     """Blocks of the elimination that are added to the camera system as they are..."""
     added_to: Tensor
@@ -70,7 +65,6 @@ class CudaStreamedBundle:
         self.kernels = kernels_for(source, torch.device(grid.device))
 
     def solve(self, problem: StreamedProblem, options: BundleOptions) -> BundleResult:
-        """As in the protocol."""
         return _CudaStreamedSchur(problem, self, options).adjusted()
 
 
@@ -119,13 +113,13 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         return float(cost)
 
     def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
-        """On the CPU."""
+        """The solution, found on the CPU."""
         return linear.solve(damping, FLOOR)
 
     def depth_steps(
         self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
     ) -> Float[Tensor, "n p"]:
-        """By edges that are linearised a second time."""
+        """The depths that follow by edges that are linearised a second time."""
         d, xi = state.inverse_depth, step.reshape(-1, 6)
         delta = torch.zeros_like(d)
         failed = torch.zeros(1, dtype=torch.int32, device=d.device)
@@ -142,7 +136,7 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         edges = LinearisedEdges(self.kernels, chunk.arrays, depth)
         edges.fill(
             self.grid, self._poses(state, chunk), depth, self._matches(chunk), self.options,
-            self.depth_terms.of_rows(own), chunk.sources.tolist(), state,
+            self.depth_terms.of_rows(own),
         )  # fmt: skip
         return edges
 

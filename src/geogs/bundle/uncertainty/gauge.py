@@ -17,9 +17,9 @@ class PoseDeviations(NamedTuple):
     """Standard deviations of poses, all axes together."""
 
     position: Float[Tensor, "n"]
-    """Of the cameras' centres, in the unit of the poses."""
+    """Deviation of each camera's centre, in the unit of the poses."""
     rotation: Float[Tensor, "n"]
-    """Of their orientations, radians."""
+    """Deviation of each orientation, radians."""
 
 
 def deviations_after_alignment(
@@ -28,7 +28,7 @@ def deviations_after_alignment(
     """Deviations of poses once the similarity is taken out that fits their errors best.
 
     That is how a trajectory is compared with the truth, which has a frame and a unit of its own.
-    Whatever pose was held fixed for the covariance, and whatever length, the answer is the same.
+    Whatever pose was fixed for the covariance, and whatever length, the answer is the same.
 
     Args:
         T_cw: world to camera, float64.

@@ -20,12 +20,7 @@ from torch import Tensor
 from geogs.bundle.flow_term import linearised_sources
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import (
-    CellProjection,
-    carried_over,
-    project,
-    relative_motion,
-)
+from geogs.bundle.projection import CellProjection, carried_over, project, relative_motion
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.bundle.uncertainty.marginals import Considered, pose_covariance
@@ -47,7 +42,7 @@ error (docs/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Deviations of the radial sizes before any match is asked."""
 CENTRE, GIVEN_CENTRE = 0.03, 0.002
-"""Of the principal point, of a lens that nobody told of and of one that was measured."""
+"""Deviation of the principal point, of a lens that nobody measured and of one that somebody did."""
 STANDARD_ERRORS = 3.0
 """Standard errors of the matches' own estimate that are taken for a deviation of the lens: matches
 of different keyframes err alike, too. Errors are 1 to 7 of them in rendered rooms."""
@@ -55,7 +50,7 @@ FOCAL_LEFT = 0.05
 """What the focal length is off by after its correction, of the correction, whatever matches say: 0
 to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
 PARTS, SURE = 6, 5.0
-"""Of a video, whose focal lengths are compared; deviations by which they differ by chance."""
+"""Parts of a video whose focal lengths are compared; deviations by which they differ by chance."""
 
 
 def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
@@ -66,7 +61,7 @@ def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
 
 
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "5 *b 2"]:
-    """By how much a pinhole's pixel lies off what is seen, for each size of one, to first order."""
+    """Offset of a pinhole's pixel from what is seen, for each size of one, to first order."""
     centre = pixels.new_tensor([camera.cx, camera.cy])
     off = pixels - centre
     square = (off / pixels.new_tensor([camera.fx, camera.fy])).square().sum(-1, keepdim=True)
@@ -151,17 +146,17 @@ class LensEvidence:
     """Normal equations of the sizes of a lens' error, poses and depths eliminated."""
 
     information: Float[Tensor, "s k k"]
-    """Of each source frame, whose sum is that of all."""
+    """Information of each source frame; their sum is that of all."""
     gradient: Float[Tensor, "s k"]
     """The direction of descent; likewise."""
     moves: Float[Tensor, "m k"]
-    """By how much an error of size one moves all poses, left perturbations; m = 6n."""
+    """Moves of all poses by an error of size one, left perturbations; m = 6n."""
     depth_moves: Float[Tensor, "n c k"]
-    """And the inverse depths of some cells of each frame, as parts of these; none (c = 0) where
-    nobody asked."""
+    """Moves of the inverse depths of some cells of each frame, as fractions of these; none (c = 0)
+    where nobody asked."""
 
     def joined(self, other: "LensEvidence") -> "LensEvidence":
-        """Of both, poses of one after those of the other."""
+        """The evidence of both, poses of one after those of the other."""
         return LensEvidence(
             torch.cat([self.information, other.information]),
             torch.cat([self.gradient, other.gradient]),
@@ -171,13 +166,13 @@ class LensEvidence:
 
     @property
     def bend(self) -> "LensEstimate":
-        """Of k1 and k2, focal length and principal point being right."""
+        """Estimate of k1 and k2, focal length and principal point being right."""
         return self._of(range(1, RADIAL))
 
     @property
     def focal_change(self) -> float:
-        """By how much parts of the video want focal lengths that differ, as a part of them, beyond
-        what each leaves open; 0 where they agree.
+        """Difference of the focal lengths that parts of the video want, as a fraction of them,
+        beyond what each leaves open; 0 where they agree.
 
         Each by its own residuals, poses and depths as all want them together. Where somebody zooms
         these are hard to explain by one lens, however well each part is explained by itself.
@@ -197,12 +192,12 @@ class LensEvidence:
         return max(0.0, most - least - SURE * float(deviation[ends].norm()))
 
     def whole(self, with_centre: bool = True) -> "LensEstimate":
-        """Of all sizes together; but for those of a principal point that is right."""
+        """Estimate of all sizes together, but for those of a principal point that is right."""
         every = range(self.gradient.shape[1])
         return self._of([n for n in every if with_centre or not RADIAL <= n < SHAPES])
 
     def _of(self, asked: Sequence[int]) -> "LensEstimate":
-        """Of some sizes, the others being right."""
+        """Estimate of some sizes, the others being right."""
         sizes = list(asked)
         information = self.information[:, sizes][:, :, sizes]
         least = tuple((*LEAST, LEAST_OF_READOUT)[n] for n in sizes)
@@ -211,15 +206,15 @@ class LensEvidence:
     def considered(
         self, corrected: float = 1.0, doubt: float = 0.0, focal_deviation: float = 0.0
     ) -> Considered:
-        """The error that the lens has, and what it does to poses and depths.
+        """Second moments of what the error of the lens does to poses and depths.
 
-        By what matches say of it and what was known of it (:func:`lens_prior`) together: their
-        estimate moves them as far as it would if it were taken off, and what it leaves open does
-        too; and by what is left of a focal length that was ``corrected`` by a factor, which they do
-        not tell of. Of a readout that was asked for, too, ``doubt`` is the deviation as a part of
-        it. Without ``LEAST``: what matches have wrong in common is taken for an error of the lens
-        that hardly moves a pose, and three sizes that were each so unsure would move them two to
-        five times as far.
+        The matches' estimate is combined with the prior (:func:`lens_prior`). Poses and depths move
+        by the estimate, as if it were taken off, and by what it leaves open; besides by what is
+        left of a focal length that was ``corrected`` by a factor, which matches do not tell of.
+        ``doubt`` is the deviation of a readout that is one more size, as a fraction of it.
+        ``LEAST`` is not added: errors that matches have in common pass for one of the lens that
+        hardly moves a pose, and three sizes of such deviations would move poses two to five times
+        as far.
         """
         said = _estimate(self.information, self.gradient)
         expected = (*lens_prior(focal_deviation), doubt)
@@ -249,12 +244,12 @@ class LensEstimate(NamedTuple):
         return self.covariance.diagonal().sqrt()
 
     def without(self, size: int) -> "LensEstimate":
-        """The others where one is held at zero: all where it is told to be exactly that."""
-        told, left = self.told(size, 0.0, 0.0), torch.arange(len(self.size)) != size
-        return LensEstimate(told.size[left], told.covariance[left][:, left])
+        """The estimate of the others where one is known to be zero."""
+        known, left = self.told(size, 0.0, 0.0), torch.arange(len(self.size)) != size
+        return LensEstimate(known.size[left], known.covariance[left][:, left])
 
     def told(self, size: int, value: float, deviation: float) -> "LensEstimate":
-        """With what was known of one size before."""
+        """The estimate with what was known of one size before: a value and its deviation."""
         column = self.covariance[:, size]
         gain = column / (column[size] + deviation**2)
         moved = self.size + gain * (value - self.size[size])
@@ -344,14 +339,14 @@ class _Reduced(NamedTuple):
     rows: Int[Tensor, "c"]
     poses: Float[Tensor, "c c"]
     pull: Float[Tensor, "c k"]
-    """Of matches that are off by a size of one on the poses."""
+    """Gradient on the poses of matches that are off by a size of one."""
     descent: Float[Tensor, "c"]
-    """Of the residuals on the poses."""
+    """Gradient of the residuals on the poses."""
     on_depth: Float[Tensor, "k p"]
-    """Of matches that are off by a size of one on the depths."""
+    """Gradient on the depths of matches that are off by a size of one."""
     information: Float[Tensor, "k k"]
     gradient: Float[Tensor, "k"]
-    """Direction of descent of the sizes, poses being held."""
+    """Direction of descent of the sizes, poses being fixed."""
 
 
 def _reduced(
@@ -374,7 +369,6 @@ def _reduced(
         state = BundleState(part.T_cw, part.inverse_depth, thinned.lens)
         for source in linearised_sources(flow, part, state, options):
             edges = source.edges
-            assert edges.depth is not None
             hessian, gradient = edges.chained()
             c = len(gradient) - edges.shared
             yield _Reduced(
@@ -382,7 +376,7 @@ def _reduced(
                 hessian[:c, :c],
                 -hessian[:c, c:],
                 gradient[:c],
-                -edges.depth.coupling[-edges.shared :],
+                -source.depth.coupling[-edges.shared :],
                 hessian[c:, c:],
                 gradient[c:],
             )

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, weighed_residuals
-from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import sources_within
 from geogs.bundle.projection import linearise, relative_motion
@@ -47,7 +46,7 @@ class Considered(NamedTuple):
     """Second moments of the moves of a solution by errors that are not solved for."""
 
     covariance: Float[Tensor, "m m"]
-    """Of all poses, as that of :class:`Marginals`."""
+    """Second moments of all poses, in the order of :class:`Marginals`."""
     relative_depth: Float[Tensor, "n c"]
     """Squares of the moves of its cells' inverse depths, as parts of these."""
     focal: float = 0.0
@@ -63,7 +62,7 @@ class Marginals:
     """
 
     covariance: Float[Tensor, "m m"]
-    """Of the left perturbations of all poses, m = 6n; float64."""
+    """Covariance of the left perturbations of all poses, m = 6n; float64."""
     relative_depth: Float[Tensor, "n c"]
     """Deviation of the inverse depth of some cells of each frame, as a part of it."""
     normalised_residual: Float[Tensor, "n"]
@@ -71,9 +70,9 @@ class Marginals:
     dimensions), each counted by what it says: 1.2 where errors are as expected, more where the
     scene is not as modelled."""
     focal_variance: float = 0.0
-    """Of the focal length, as a part of it."""
+    """Variance of the focal length, as a fraction of it."""
     focal_change: float = 0.0
-    """By how much parts of the video want focal lengths that differ, as a part of them."""
+    """Difference of the focal lengths that parts of the video want, as a fraction of them."""
     lens_change: float = 0.0
     """Part of the matches' cost that a lens of each frame of its own would take off."""
 
@@ -96,16 +95,13 @@ class Marginals:
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
-        """That of the ``BEST_KNOWN`` of its cells whose depths are known best; infinite where fewer
-        have matches."""
+        """Worst deviation among the ``BEST_KNOWN`` fraction of each frame's cells; infinite where
+        fewer have matches."""
         return self.relative_depth.quantile(BEST_KNOWN, -1, interpolation="higher")
 
 
 def marginals(
-    grid: SampleGrid,
-    problem: AnyProblem,
-    options: BundleOptions,
-    cells: int = 1024,
+    grid: SampleGrid, problem: AnyProblem, options: BundleOptions, cells: int = 1024
 ) -> Marginals:
     """Marginal variances at the present state of a problem, its matches as good as they say.
 
@@ -130,7 +126,7 @@ def marginals(
     for source in part.sources(options):
         frame = source.frame
         if bool(problem.free_depth[frame]):
-            sigma = _depth_variance(source.edges, covariance).sqrt()
+            sigma = _depth_variance(source, covariance).sqrt()
             relative[frame] = sigma / part.inverse_depth[frame].clamp(min=1e-12)
     return Marginals(covariance, relative, _normalised_residual(problem, part, options))
 
@@ -192,8 +188,7 @@ def _common_pulls(
         pose, own = p.pose_jacobian * unit.mT[:, None], (p.depth_jacobian * unit).mT
         sources = linearised_sources(flow, part, part.start, options)
         for source, (frame, e) in zip(sources, sources_within(i), strict=True):
-            depth, chain = source.edges.depth, source.edges.chain
-            assert depth is not None
+            depth, chain = source.depth, source.edges.chain
             follow = depth.coupling / depth.curvature * float(part.free_depth[frame])
             along = torch.einsum("se,ekap->asekp", size[:, e], pose[e]).flatten(0, 1).flatten(1, 2)
             owns = torch.einsum("se,eap->asp", size[:, e], own[e]).flatten(0, 1)
@@ -236,9 +231,9 @@ def _normalised_residual(
 ) -> Float[Tensor, "n"]:
     """Median residual from each frame; infinite without matches.
 
-    On a bare wall the flow goes on as it does around: residuals of matches that say next to nothing
-    are a small part of their deviations, however well or badly the others fit, so that by number
-    alone the more of an image is bare, the better all would seem to be known.
+    Matches count by their information. On a bare wall the flow continues what is around it, so its
+    residuals are small however badly the others fit: counted by number, an image would seem the
+    better known the more of it is bare.
     """
     found = torch.full((len(problem.T_cw),), torch.inf)
     for frame, norm, information in part.residuals(options):
@@ -254,11 +249,10 @@ def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
     return along / along.norm().clamp(min=1e-12)
 
 
-def _depth_variance(edges: HyperEdge, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
+def _depth_variance(source: SourceFlow, covariance: Float[Tensor, "m m"]) -> Float[Tensor, "c"]:
     """Variance of a source's inverse depths, by its matches and the covariance of its poses."""
-    depth, rows = edges.depth, edges.rows(len(covariance) // 6)
-    assert depth is not None
-    E = edges.chained_coupling()
+    depth, rows = source.depth, source.edges.rows(len(covariance) // 6)
+    E = source.edges.chained_coupling()
     among = covariance[rows[:, None], rows].to(E)
     through_poses = (E * (among @ E)).sum(0) / depth.curvature.square()
     return torch.where(depth.information > 0, ALIKE / depth.curvature + through_poses, torch.inf)

@@ -4,14 +4,14 @@ Linearised on the CPU, some edges at a time, wherever the matches lie.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, residual_norms
-from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.hyper_edge import DepthEquations
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
@@ -45,17 +45,16 @@ class ThinnedProblem:
     def depth_moves(
         self, source: SourceFlow, pull: Float[Tensor, "c k"], moves: Float[Tensor, "m k"]
     ) -> Float[Tensor, "c k"]:
-        """By how much errors of matches, of size one each, move the inverse depths of a source.
+        """Moves of the inverse depths of a source by errors of matches of size one each.
 
-        As parts of these: ``C^-1 (pull - E^T moves)``, with what they pull at the depths and the
-        ``moves`` of all poses by them. Zero for what is fixed, or no match tells of.
+        As fractions of these: ``C^-1 (pull - E^T moves)``, with their ``pull`` at the depths and
+        the ``moves`` of all poses by them. Zero for what is fixed, or has no match.
         """
-        depth, rows = source.edges.depth, source.edges.rows(len(moves) // 6)
-        assert depth is not None
+        depth, rows = source.depth, source.edges.rows(len(moves) // 6)
         left = pull - source.edges.chained_coupling().mT @ moves[rows].to(pull)
         scale = depth.curvature * self.inverse_depth[source.frame].clamp(min=1e-12)
-        told = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
-        return torch.where(told[:, None], left / scale[:, None], 0.0)
+        known = (depth.information > 0) & self._problem.free_depth[source.frame].cpu()
+        return torch.where(known[:, None], left / scale[:, None], 0.0)
 
     def residuals(
         self, options: BundleOptions
@@ -95,10 +94,8 @@ class _ThinnedTerm:
     cells: slice
     information: None = None
 
-    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
-        edges = self.term.of_frame(frame, self.state)
-        assert edges.depth is not None
-        return replace(edges, depth=edges.depth.on_cells(self.cells))
+    def of_frame(self, frame: int, state: BundleState) -> DepthEquations:
+        return self.term.of_frame(frame, self.state).on_cells(self.cells)
 
     def cost(self, state: BundleState) -> float:
         return self.term.cost(self.state)
