@@ -14,9 +14,8 @@ from geogs.mesh.decimation.deviation import (
     triangle_distances,
 )
 from geogs.mesh.decimation.deviation_kernels import triangle_distance
-from geogs.mesh.device import surface
-from geogs.mesh.device.surface import device_surface
 from geogs.mesh.tensor_mesh import TensorMesh
+from geogs.mesh.volume.device_marching import device_surface
 from geogs.mesh.volume.free_space import SeenFree
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import SparseTsdf
@@ -75,7 +74,7 @@ def assert_same_surface(made: TensorMesh, expected: TensorMesh) -> None:
 @DEVICES
 @pytest.mark.parametrize("batch", [5, 100_000])
 def test_the_surface_is_that_of_the_host(device, batch, monkeypatch):
-    monkeypatch.setattr(surface, "_BATCH", batch)
+    monkeypatch.setattr("geogs.mesh.volume.device_marching._BATCH", batch)
     tsdf = volume(device)
     assert len(tsdf) > 50
     assert_same_surface(device_surface(tsdf, 1.5), extract_surface(host(tsdf), 1.5))

@@ -1,4 +1,4 @@
-"""What is removed from an extracted mesh, and which of its holes are closed, on its device."""
+"""Cleaning of an extracted mesh on its device: specks removed, small holes closed."""
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def cleaned(
 
 
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:
-    """As :func:`without_degenerate_faces`, with normals and colours."""
+    """:func:`without_degenerate_faces` of a mesh with normals and colours."""
     if not len(mesh.faces):
         return mesh
     return keep_faces(mesh, _have_areas(TensorMesh.of(mesh.vertices, mesh.faces)).numpy())

@@ -87,7 +87,7 @@ def add_compiled(
     total: Float[Tensor, "n 3"],
     weight: Float[Tensor, "n"],
 ) -> None:
-    """As :func:`add_reference`, by compiled loops, for float32 tensors on the CPU."""
+    """:func:`add_reference` by compiled loops, for float32 tensors on the CPU."""
     from geogs.mesh.colour_kernels import add_colours
 
     f, camera, n = np.float32, seen.camera, len(vertices)

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int, Int32, Int64
 from geogs.mesh.texture.candidates import Candidates
 
 SMOOTHNESS = 0.35
-"""What a neighbour with another view costs, beside 1 - score / best score."""
+"""Cost of a neighbour with another view, beside 1 - score / best score."""
 ODD_COLOUR = 40.0
 """Distance of a view's colour from the median of a face's views that makes it an odd one out."""
 _ROUNDS = 12

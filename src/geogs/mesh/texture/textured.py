@@ -37,10 +37,7 @@ class TexturedMesh:
 
 
 def texture_mesh(
-    mesh: Mesh,
-    views: Sequence[DepthMapView],
-    tolerance: float,
-    limit: int = 4096,
+    mesh: Mesh, views: Sequence[DepthMapView], tolerance: float, limit: int = 4096
 ) -> TexturedMesh:
     """Give a mesh an image, put together from those of the views.
 
