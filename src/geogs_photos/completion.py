@@ -27,7 +27,7 @@ def place_lost(
     seed: int,
     progress: StageProgress,
 ) -> FoundFrames:
-    """As asked of it in ``geogs.application.structure_from_motion.photos.place_lost``."""
+    """Implements ``geogs.application.structure_from_motion.photos.place_lost``."""
     features = frame_features(frames, progress)
     shown = [k for k, some in enumerate(features) if len(some) >= FEWEST_FEATURES]
     known = {place + 1: T for place, k in enumerate(shown) if (T := T_cw[k]) is not None}

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from geogs_photos.pycolmap_library import load_colmap
 
-ALIKE = 2.3
+COMMON_ERROR_FACTOR = 2.3
 """Times a deviation is larger than if all points erred by themselves: one that is seen a little
 beside its place is so in most views. Measured on videos with a truth (docs/photographs.md)."""
 
@@ -54,7 +54,7 @@ def pose_deviations(
         unknown = np.full(len(images), np.inf)
         return unknown, unknown.copy()
     centre, rotation = without_gauge(joint, T_cw, beside)
-    return ALIKE * error * centre, ALIKE * error * rotation
+    return COMMON_ERROR_FACTOR * error * centre, COMMON_ERROR_FACTOR * error * rotation
 
 
 def without_gauge(

@@ -14,8 +14,8 @@ from geogs_photos.incremental_mapping import (
     world_to_camera,
 )
 
-OUTLYING = 3.0
-"""Times the median deviation: where all are unsure, that is for the verdict to say."""
+OUTLIER_RATIO = 3.0
+"""Deviation over the median one: where all are unsure, that is for the verdict to say."""
 
 
 def of_known_places(model: Any, is_known: bool) -> Any:
@@ -35,7 +35,7 @@ def of_known_places(model: Any, is_known: bool) -> Any:
         error = float(model.compute_mean_reprojection_error())
         deviation, _ = pose_deviations(model, images, T_cw, error, is_known)
         allowed = MAX_POSITION_DEVIATION * extent_of(np.linalg.inv(T_cw))
-        unknown = deviation > max(allowed, OUTLYING * float(np.median(deviation)))
+        unknown = deviation > max(allowed, OUTLIER_RATIO * float(np.median(deviation)))
         if not unknown.any():
             break
         model = without_poses(model, [images[k].image_id for k in np.flatnonzero(unknown)])

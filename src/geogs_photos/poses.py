@@ -37,7 +37,7 @@ FEWEST_MATCHES = 15
 
 @dataclass(frozen=True, slots=True)
 class FoundPoses:
-    """What structure from motion came to."""
+    """Outcome of structure from motion."""
 
     left_out: tuple[tuple[str, str], ...]
     """Names of photographs that have no pose, each with the reason as a clause."""

@@ -26,10 +26,10 @@ from geogs_photos.incremental_mapping import (
     refine,
     world_to_camera,
 )
-from geogs_photos.only_turns import only_turns
 from geogs_photos.photo_features import frame_features
 from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import structure_of
+from geogs_photos.pure_rotation import only_rotates
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.rolling_rows import with_rows_at_once
 from geogs_photos.upright import upright_rotation
@@ -49,7 +49,7 @@ def place_frames(
     seed: int,
     progress: StageProgress,
 ) -> PlacedVideo:
-    """As asked of it in ``geogs.application.structure_from_motion.photos.place_frames``."""
+    """Implements ``geogs.application.structure_from_motion.photos.place_frames``."""
     colmap = load_colmap()
     begin = Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,
@@ -63,7 +63,7 @@ def place_frames(
         database = Path(work) / "database.db"
         parts, _ = structure_of(database, shared, entries, pairs, seed, progress)
         parts = rejoined(parts, database, count, shared, seed, progress)
-        if parts and only_turns(parts[0], database):
+        if parts and only_rotates(parts[0], database):
             raise InputError(
                 "The camera only turns: a turn alone explains what nearly all pairs of frames "
                 "show; move it sideways, too."

@@ -171,7 +171,7 @@ def test_a_reconstruction_of_too_few_points_is_none(monkeypatch):
     pytest.importorskip("pycolmap")
     room = render_room(4, 3, 160, 120)
     frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(room.images))
+    chosen = ChosenFrames(frames, np.arange(4) / 10)
     monkeypatch.setattr(incremental_mapping, "LEAST_POINTS", 10**6)
     with pytest.raises(InputError, match="no three tell where they were taken"):
-        chosen = ChosenFrames(frames, np.arange(4) / 10)
         video.place_frames(chosen, room.camera, True, False, False, 0, lambda *_: None)
