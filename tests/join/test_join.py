@@ -18,11 +18,18 @@ from one_process import OneProcess
 PLACES = [np.linspace(-0.8, 0.1, 6), np.linspace(-0.2, 0.8, 6)]
 
 
+def make_parts(folder):
+    """Two parts of a room and one of another."""
+    make_part(folder / "a", PLACES[0], 0)
+    make_part(folder / "b", PLACES[1], 1)
+    make_part(folder / "x", PLACES[0], 3, paint=9)
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("adjust", [False, True])
-def test_two_parts_of_a_room_become_one_and_another_room_stays_apart(tmp_path, adjust):
-    parts = [Part(n, make_part(tmp_path / n, p, k)) for k, (n, p) in enumerate(zip("ab", PLACES))]  # noqa: B905
-    parts.append(Part("x", make_part(tmp_path / "x", PLACES[0], 3, paint=9)))
+def test_two_parts_of_a_room_become_one_and_another_room_stays_apart(once, tmp_path, adjust):
+    folder = once("parts-of-two-rooms", make_parts)
+    parts = [Part(name, folder / name) for name in "abx"]
     joint = join_parts(parts, tmp_path / "out", Config(), OneProcess(), adjust=adjust)
     assert (joint.joined, joint.unjoined, joint.links >= 2) == (("a", "b"), ("x",), True)
     result = load_result(tmp_path / "out")
