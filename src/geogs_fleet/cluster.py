@@ -17,12 +17,13 @@ ASKS_FOR_TOKEN = 2, 59
 """Ray from which on a cluster that is started here asks for a token; its ports are open to the
 network, whatever address it is given."""
 _PASSING = "geogs: ends with its command"
-"""What a cluster has that another command must not rely on, where it finds it on this machine."""
+"""Resource of a cluster that ends with its command, so that no other command on this machine uses
+it."""
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """What one source gets of a node."""
+    """Resources of a node for one source."""
 
     cpus: int
     gpus: float
@@ -58,7 +59,7 @@ def ray_cluster(address: str) -> Iterator[Any]:
 
 
 def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
-    """What each source gets of the cluster, where settings leave that open.
+    """Allocation of each source, where settings leave it open.
 
     Raises:
         InputError: no node has as much as is asked for.
@@ -118,7 +119,7 @@ def as_task(
 
 
 def in_version(version: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function returns; raises InputError where another version of geogs is installed."""
+    """Call a function; raises InputError where another version of geogs is installed."""
     if __version__ != version:
         raise InputError(
             f"The machine {platform.node()} has geogs {__version__}, and the fleet is of "

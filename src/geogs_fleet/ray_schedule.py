@@ -45,7 +45,7 @@ def rows_of(
 
 
 def _row(ray: Any, reference: Any, job: FleetJob) -> Row:
-    """What came back; a crash where Ray lost the task."""
+    """The row that came back; a crash where Ray lost the task."""
     try:
         row: Row = ray.get(reference)
         return row

@@ -28,6 +28,10 @@ class StoragePath:
         address = self.address.removeprefix("file://")
         return None if "://" in address else expanded(address)
 
+    def absolute(self) -> "StoragePath":
+        """The same place by an absolute path, if it lies on this machine."""
+        return self if self.path is None else StoragePath(str(self.path.absolute()))
+
     @property
     def name(self) -> str:
         """The last part of the address."""
@@ -164,7 +168,7 @@ class StoragePath:
 
 
 def _limits(address: str) -> dict[str, Any]:
-    """By which a file system waits no longer than ``PATIENCE`` for a server that is silent."""
+    """Options by which a file system waits no longer than ``PATIENCE`` for a silent server."""
     protocol = address.partition("://")[0]
     if protocol in ("http", "https"):
         from aiohttp import ClientTimeout
