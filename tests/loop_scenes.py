@@ -62,16 +62,6 @@ def stretched(scene: Scene, factor: float) -> Scene:
     return replace(scene, size=scene.size * f, solids=replace(s, centre=s.centre * f, half=half))
 
 
-def rearranged(scene: Scene, seed: int = 0, reach: float = 0.35) -> Scene:
-    """The same things, but for the room itself, each moved by up to ``reach`` metres level."""
-    rng = np.random.default_rng(seed)
-    shift = rng.uniform(-reach, reach, (len(scene), 3)) * [1, 1, 0]
-    s = scene.solids
-    large = s.bounding_half.max(1) > 1.6
-    centre = np.where(large[:, None], s.centre, s.centre + shift)
-    return replace(scene, solids=replace(s, centre=centre))
-
-
 def keyframes(
     seen: Sequence[RenderedView], poses: Sequence[np.ndarray]
 ) -> tuple[KeyframeSet, ClassicalFlow]:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.config import Config, TrackingConfig
+from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama
@@ -115,15 +115,14 @@ def centre_error(tracker: Tracker, truth: Tensor) -> float:
 
 
 def planted_tracker(
-    count: int, camera: Camera = SMALL, sigma: float = 0.1, config: TrackingConfig | None = None
+    count: int, camera: Camera = SMALL, sigma: float = 0.1
 ) -> tuple[Tracker, Float[Tensor, "n 4 4"]]:
     """A tracker that holds the true walk with true depths, and the true poses."""
     grid = SampleGrid(camera)
     T = walk(count)
     d = true_inverse_depth(T, grid)
     T = T @ se3_inverse(T[0])  # the first pose is the identity
-    settings = Config(tracking=config or TrackingConfig())
-    tracker = lone_tracker(camera, settings, operator=PlantedFlow(grid, T, d, sigma))
+    tracker = lone_tracker(camera, Config(), operator=PlantedFlow(grid, T, d, sigma))
     for n in range(count):
         image = np.full((4, 4, 3), (n % 256, n // 256, 0), np.uint8)
         state = tracker.keyframes.add(n, n / 3, image, n, T[n].clone())

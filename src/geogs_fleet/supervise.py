@@ -40,7 +40,7 @@ def supervise(
     log: Path,
     limits: Limits,
     environment: Mapping[str, str],
-    meanwhile: Callable[[], None] = lambda: None,
+    meanwhile: Callable[[], None],
 ) -> ProcessEnd:
     """Run a command until it ends, or has to.
 

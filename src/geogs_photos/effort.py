@@ -23,7 +23,7 @@ _PAIRS = 20.0
 """Pairs that are matched for each photograph, where there are many."""
 
 
-def stages_of_poses(count: int, features: int = MAX_FEATURES) -> dict[str, float]:
+def stages_of_poses(count: int, features: int) -> dict[str, float]:
     """About how many seconds each stage takes that finds the poses of so many photographs."""
     part, cores = features / MAX_FEATURES, worker_count()
     pairs = min(0.5 * count * (count - 1), _PAIRS * count)
@@ -35,7 +35,7 @@ def stages_of_poses(count: int, features: int = MAX_FEATURES) -> dict[str, float
     }
 
 
-def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
+def seconds_to_find_poses(count: int, features: int) -> float:
     """About how many seconds all stages take together."""
     return sum(stages_of_poses(count, features).values())
 

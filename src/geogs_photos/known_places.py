@@ -32,8 +32,7 @@ def of_known_places(model: Any, is_known: bool) -> Any:
     """
     while len(images := placed_images(model)) > LEAST_IMAGES:
         T_cw = np.stack([world_to_camera(image) for image in images])
-        error = float(model.compute_mean_reprojection_error())
-        deviation, _ = pose_deviations(model, images, T_cw, error, is_known)
+        deviation, _ = pose_deviations(model, images, T_cw, is_known)
         allowed = MAX_POSITION_DEVIATION * extent_of(np.linalg.inv(T_cw))
         unknown = deviation > max(allowed, OUTLIER_RATIO * float(np.median(deviation)))
         if not unknown.any():

@@ -27,8 +27,7 @@ def model_of(places: np.ndarray) -> Any:
 
     images |= {n: frame(n, place) for n, place in enumerate(places)}
     return SimpleNamespace(
-        images=images, deregister_frame=deregister_frame, tear_down=lambda: None,
-        compute_mean_reprojection_error=lambda: 0.4,
+        images=images, deregister_frame=deregister_frame, tear_down=lambda: None
     )  # fmt: skip
 
 
@@ -36,7 +35,7 @@ def kept(monkeypatch: pytest.MonkeyPatch, places: np.ndarray, own: Sequence[floa
     """Frames that keep their place, each being known to what is its own and to a hundredth of the
     extent of all that are there, as one that lies far off takes part in what is aligned."""
 
-    def deviations(model, images, T_cw, error, is_known):
+    def deviations(model, images, T_cw, is_known):
         extent = known_places.extent_of(np.linalg.inv(T_cw))
         known = np.hypot(np.array(own)[[image.image_id for image in images]], 0.01 * extent)
         return known, np.zeros(len(images))

@@ -202,7 +202,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     with join.stopwatch("mesh"):
         mesh = join.surface(sum(len(part.views.T_cw) for part in parts), disks)
     seconds = join.stopwatch.seconds
-    summary = {
+    summary: dict[str, Any] = {
         **_statistics([part.result for part in parts], gauge, unjoined, adjust),
         "videos": [asdict(part.span) for part in parts],
         "frames": len(trajectory.timestamps),
