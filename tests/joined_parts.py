@@ -73,7 +73,7 @@ def seen(T_wc: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def image(T_wc: np.ndarray, paint: list[np.ndarray], camera: Camera = CAMERA) -> np.ndarray:
-    """What the camera takes."""
+    """Image that the camera takes."""
     _, wall, place = seen(T_wc, camera)
     shown = np.zeros((camera.height, camera.width, 3), np.uint8)
     for n, picture in enumerate(paint):

@@ -37,7 +37,7 @@ def lens_problem(
 
 
 def disturbed(problem: BundleProblem, pose: float, depth: float) -> BundleProblem:
-    """The same from other poses and inverse depths."""
+    """The problem from other poses and inverse depths."""
     g = torch.Generator().manual_seed(1)
     xi = pose * torch.randn(len(problem.T_cw), 6, generator=g, dtype=torch.float64)
     xi[0] = 0

@@ -19,7 +19,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
 
 CAMERA = Camera(fx=480.0, fy=480.0, cx=255.5, cy=143.5, width=512, height=288)
-"""Of a real run: 64 x 36 cells."""
+"""Camera of a real run: 64 x 36 cells."""
 SMALL = Camera(fx=75.0, fy=75.0, cx=39.5, cy=27.5, width=80, height=56)
 
 STEP = 0.12
@@ -42,7 +42,7 @@ def walk(count: int) -> Float[Tensor, "n 4 4"]:
 
 
 def true_inverse_depth(T_cw: Float[Tensor, "n 4 4"], grid: SampleGrid) -> Float[Tensor, "n p"]:
-    """Of a hall with floor, ceiling, wall and two far ends; seen from inside."""
+    """Inverse depths of a hall with floor, ceiling, wall and two far ends, seen from inside."""
     T_wc = se3_inverse(T_cw)
     direction = grid.rays.double() @ T_wc[:, :3, :3].mT
     centre = T_wc[:, None, :3, 3]
@@ -63,7 +63,7 @@ class PlantedFlow:
         return int(image[0, 0, 0]) + 256 * int(image[0, 0, 1])
 
     def texture(self, encoded: int) -> float:
-        """All have enough."""
+        """Enough in every image."""
         return 1.0
 
     def grey(self, encoded: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""What the tests of reconstruction from known poses share: a small scene, a room, the command."""
+"""A small scene and the command, for tests of reconstruction from known poses."""
 
 import subprocess
 import sys

@@ -29,7 +29,7 @@ from geogs_photos.incremental_mapping import (
     put_together,
     without_poses,
 )
-from geogs_photos.known_places import of_known_places
+from geogs_photos.known_positions import with_known_positions
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_VIEWS = 3
@@ -136,7 +136,7 @@ def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndar
 
 def _believed(parts: Sequence[Any], database: Path, is_known: bool) -> list[Any]:
     """The believed part of each reconstruction; the largest first."""
-    found = (of_known_places(believed(part, database), is_known) for part in parts)
+    found = (with_known_positions(believed(part, database), is_known) for part in parts)
     return sorted(found, key=lambda part: -_placed([part]))
 
 

@@ -68,7 +68,7 @@ def test_of_all_ways_the_one_that_puts_most_into_one(
 
     by_rest = by_way("without", without)
     monkeypatch.setattr(fragments, "believed", lambda part, _: part)
-    monkeypatch.setattr(fragments, "of_known_places", lambda part, _: part)
+    monkeypatch.setattr(fragments, "with_known_positions", lambda part, _: part)
     monkeypatch.setattr(fragments, "false_pairs", lambda *_: false)
     monkeypatch.setattr(fragments, "_without", lambda *given: (by_rest(*given), Path("pruned")))
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))

@@ -10,7 +10,7 @@ from geogs.errors import InputError
 from geogs.mesh.texture.atlas import draw_atlas
 from geogs.mesh.texture.candidates import find_candidates
 from geogs.mesh.texture.exposure import seam_corrections, view_gains
-from geogs.mesh.texture.labels import choose_views, face_neighbours, without_odd_colours
+from geogs.mesh.texture.labels import choose_views, face_neighbours, without_colour_outliers
 from geogs.mesh.texture.patches import Patches, cut_patches
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
@@ -61,7 +61,7 @@ def texture_mesh(
         raise InputError("No image shows any of the mesh, so there is no texture for it.")
     gains = view_gains(candidates, len(views))
     neighbours = face_neighbours(mesh.faces)
-    score = without_odd_colours(candidates, gains)
+    score = without_colour_outliers(candidates, gains)
     label = choose_views(candidates, score, neighbours)
     images = {int(v): views[int(v)] for v in np.unique(label[label >= 0])}
     patches = cut_patches(mesh, images, label, neighbours)

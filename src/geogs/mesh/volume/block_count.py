@@ -13,7 +13,7 @@ from torch import Tensor
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.mesh.volume.contraction import Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
-from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, followed, pack, unpack
+from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, footprint_points, pack, unpack
 
 COARSER = 1.1
 """Growth of the voxels from one trial to the next."""
@@ -61,7 +61,7 @@ def _surface(
     valid = view.valid() & (view.depth <= max_depth)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
     planes = PixelPlanes.of(view.depth.float(), valid, view.camera).grown(T_cw, contraction)
-    return followed(planes, T_cw, voxel, contraction)
+    return footprint_points(planes, T_cw, voxel, contraction)
 
 
 def _cells(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:

@@ -84,10 +84,10 @@ def blocks_seen(
     contraction: Contraction,
 ) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a depth map lies, with its band."""
-    return band_blocks(followed(planes, T_cw, voxel, contraction), voxel, truncation)
+    return band_blocks(footprint_points(planes, T_cw, voxel, contraction), voxel, truncation)
 
 
-def followed(
+def footprint_points(
     planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], voxel: float, contraction: Contraction
 ) -> Float[Tensor, "n 3"]:
     """Points of contracted space along the footprints of the pixels of a depth map, half a block

@@ -18,7 +18,7 @@ OUTLIER_RATIO = 3.0
 """Deviation over the median one: where all are unsure, that is for the verdict to say."""
 
 
-def of_known_places(model: Any, is_known: bool) -> Any:
+def with_known_positions(model: Any, is_known: bool) -> Any:
     """A reconstruction whose frames' places its matches tell; the others lose their poses.
 
     What sees little but far things, or the rest of the world along one direction alone, lies
