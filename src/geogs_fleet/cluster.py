@@ -5,6 +5,7 @@ import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from geogs.errors import InputError
@@ -87,35 +88,22 @@ def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
     return Allocation(cpus, gpus, memory_bytes, at_once)
 
 
-@dataclass(frozen=True)
-class Task:
-    """A function that nodes of the same version call."""
-
-    checked: Any
-    """``in_version`` as Ray has it."""
-    function: Callable[..., Any]
-
-    def remote(self, *arguments: Any) -> Any:
-        """Ray's reference to what it will return."""
-        return self.checked.remote(__version__, self.function, *arguments)
-
-
 def as_task(
     ray: Any, function: Callable[..., Any], allocation: Allocation, retries: int = 0
-) -> Task:
-    """A function as a task of Ray that gets so much of a node.
+) -> Callable[..., Any]:
+    """A function as a task of Ray that gets so much of a node; called, it gives Ray's reference.
 
     Ray calls it again, up to so many times, where its node or its process is lost. A node with
     another version of geogs refuses: the task raises InputError.
     """
-    task = ray.remote(in_version).options(
+    checked = ray.remote(in_version).options(
         num_cpus=allocation.cpus,
         num_gpus=allocation.gpus or None,
         memory=allocation.memory,
         max_retries=retries,
         scheduling_strategy="SPREAD",
     )
-    return Task(task, function)
+    return partial(checked.remote, __version__, function)
 
 
 def in_version(version: str, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -155,6 +155,6 @@ def with_closed_holes(
 
     border = border_edges(mesh).cpu().numpy()
     fans = closing_fans(border, len(vertices), look, most_edges, is_free)
-    new = [torch.from_numpy(part).to(device) for part in (fans.vertices, fans.normals, fans.faces)]
-    mesh = TensorMesh(torch.cat([vertices, new[0]]), torch.cat([mesh.faces, new[2]]))
-    return mesh, torch.cat([normals, new[1]])
+    middle, up, faces = (torch.from_numpy(part).to(device) for part in fans)
+    mesh = TensorMesh(torch.cat([vertices, middle]), torch.cat([mesh.faces, faces]))
+    return mesh, torch.cat([normals, up])

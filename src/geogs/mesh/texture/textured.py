@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from geogs.errors import InputError
-from geogs.mesh.texture.atlas import draw_atlas
+from geogs.mesh.texture.atlas import Atlas, draw_atlas
 from geogs.mesh.texture.candidates import find_candidates
 from geogs.mesh.texture.exposure import seam_corrections, view_gains
 from geogs.mesh.texture.labels import choose_views, face_neighbours, without_colour_outliers
@@ -69,7 +69,7 @@ def texture_mesh(
     corrections = seam_corrections(patches.corner_vertex, patches.edges(), colour)
     plain, swatches, swatch_of = _plain_colours(mesh, label)
     atlas = draw_atlas(patches, images, gains, corrections, swatches, limit)
-    return _assembled(mesh, patches, plain, swatch_of, atlas.corner, atlas.swatch, atlas.image)
+    return _assembled(mesh, patches, plain, swatch_of, atlas)
 
 
 def _corner_colours(
@@ -105,13 +105,7 @@ def _plain_colours(
 
 
 def _assembled(
-    mesh: Mesh,
-    patches: Patches,
-    plain: np.ndarray,
-    swatch_of: np.ndarray,
-    corner: np.ndarray,
-    swatch: np.ndarray,
-    image: np.ndarray,
+    mesh: Mesh, patches: Patches, plain: np.ndarray, swatch_of: np.ndarray, atlas: Atlas
 ) -> TexturedMesh:
     """Corners of the patches, then those of the plain faces, which share none."""
     count = len(patches.corner_vertex)
@@ -119,8 +113,8 @@ def _assembled(
     faces[patches.faces] = patches.corners
     faces[plain] = count + np.arange(3 * len(plain)).reshape(-1, 3)
     vertex = np.concatenate([patches.corner_vertex, mesh.faces[plain].ravel()])
-    place = np.concatenate([corner, np.repeat(swatch[swatch_of], 3, axis=0).reshape(-1, 2)])
+    uv = np.concatenate([atlas.corner, np.repeat(atlas.swatch[swatch_of], 3, axis=0)])
     seen = len(patches.faces) / len(mesh.faces)
     return TexturedMesh(
-        mesh.vertices[vertex], faces, mesh.normals[vertex], place.astype(np.float32), image, seen
+        mesh.vertices[vertex], faces, mesh.normals[vertex], uv.astype(np.float32), atlas.image, seen
     )
