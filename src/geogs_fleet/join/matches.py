@@ -193,10 +193,11 @@ def match(
     errors = _row_errors(grid, members, results, ids)
     shift: dict[Directed, Tensor] = {}
     if errors is not None:
-        measured = {(ids[a], ids[b]): edge for (a, b), edge in found.items()}
-        for part, (off, _) in edge_shifts(errors, segment, measured, lambda id: id):
-            steps = in_steps(grid.camera, off)
-            shift |= {(node[i], node[j]): s for (i, j), s in zip(part, steps, strict=True)}
+        shift = {
+            (node[i], node[j]): steps
+            for pairs, (off, _) in edge_shifts(errors, segment, graph.packed, lambda id: id)
+            for (i, j), steps in zip(pairs, in_steps(grid.camera, off), strict=True)
+        }
     ends = []
     for member, path in zip(members, after, strict=True):
         its = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
