@@ -9,7 +9,7 @@ from geogs.cli.main import main
 
 
 def done(*arguments: object, report: bool = True) -> str:
-    """What a command says on the standard error, which has to come to its end.
+    """Standard error of a command, which has to come to its end.
 
     Without ``report`` its result comes without the pictures of the report, which take longer than
     a small run.

@@ -34,7 +34,7 @@ jaxtyping.install_import_hook(_typed_modules(), "lazy_check.checked")
 
 
 Once = Callable[[str, Callable[[Path], object]], Path]
-"""Of a name and what fills a folder: the folder, filled by whoever asks first."""
+"""Folder of a name, which the function given fills for whoever asks first."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist asks for the groups

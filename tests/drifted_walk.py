@@ -20,7 +20,7 @@ from keyframe_samples import Sample, segment_of
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 NOTHING = TrackResult(TrackState.TRACKING)
-"""Of a frame that changes nothing."""
+"""Result of a frame that changes nothing."""
 COUNT = 8
 
 

@@ -73,7 +73,7 @@ def seen(T_wc: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def image(T_wc: np.ndarray, paint: list[np.ndarray], camera: Camera = CAMERA) -> np.ndarray:
-    """What the camera takes."""
+    """Image that the camera takes."""
     _, wall, place = seen(T_wc, camera)
     shown = np.zeros((camera.height, camera.width, 3), np.uint8)
     for n, picture in enumerate(paint):
@@ -113,22 +113,13 @@ def box_disks(T_wc: list[np.ndarray]) -> MapSnapshot:
     )  # fmt: skip
 
 
-def make_part(
-    folder: Path, places: np.ndarray, number: int, paint: int = 0, drift: float = 0.0
-) -> Path:
-    """A result whose keyframes are at some places of the walk, in the world ``gauge(number)``.
-
-    With a drift, lengths of the last keyframe's surroundings are wrong by so much, and the path
-    with them.
-    """
+def make_part(folder: Path, places: np.ndarray, number: int, paint: int = 0) -> Path:
+    """A result whose keyframes are at some places of the walk, in the world ``gauge(number)``."""
     S, pictures = gauge(number), walls(paint)
-    step = float(places[1] - places[0]) / FRAMES
-    frames = np.array([pose(s + k * step) for s in places for k in (-1, 0, 1)])
+    frames = true_frames(places)
     true = frames[1::FRAMES]
-    T_wc = _moved(frames, S)
-    if drift:
-        middle, far = T_wc[:, :3, 3].mean(0), np.linspace(0, 1, len(T_wc))
-        T_wc[:, :3, 3] += (drift * far**2)[:, None] * (T_wc[:, :3, 3] - middle)
+    T_wc = S.numpy() @ frames
+    T_wc[:, :3, :3] /= float(sim3_scale(S))
     times = np.arange(len(frames)) / 30
     T_cw = np.linalg.inv(T_wc[1::FRAMES])
     disks = box_disks(list(true))
@@ -153,9 +144,3 @@ def true_frames(places: np.ndarray) -> np.ndarray:
     """Camera to box of all frames of a part."""
     step = float(places[1] - places[0]) / FRAMES
     return np.array([pose(s + k * step) for s in places for k in (-1, 0, 1)])
-
-
-def _moved(T_wc: np.ndarray, S: torch.Tensor) -> np.ndarray:
-    moved = S.numpy() @ T_wc
-    moved[:, :3, :3] /= float(sim3_scale(S))
-    return moved

@@ -19,7 +19,7 @@ from geogs.world.map import MapTable
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What a keyframe is made of; without depth it has unit depth."""
+    """Parts of a keyframe; without depth it has unit depth."""
 
     frame_index: int
     image: UInt8[np.ndarray, "h w 3"]

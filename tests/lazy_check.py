@@ -19,7 +19,8 @@ from beartype.roar import BeartypeCallHintReturnViolation, BeartypeCallHintViola
 
 P, R = ParamSpec("P"), TypeVar("R")
 FIRST, EVERY = 8, 32
-"""Of the calls of a function in a test of the whole system: so many, and then one of so many."""
+"""Calls of a function that are checked in a test of the whole system: the first, then one of so
+many."""
 
 
 class Calls:
@@ -37,7 +38,7 @@ class Calls:
                 count[0] = 0
 
     def count_of(self, function: Callable) -> list[int]:
-        """What counts its calls; functions made again and again within another are one."""
+        """Counter of its calls; functions made again and again within another are one."""
         key = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
         return self._counts.setdefault(key, [0])
 
@@ -45,7 +46,7 @@ class Calls:
 CALLS = Calls()
 
 _inner: dict[tuple[str, str, str], Callable] = {}
-"""What checks functions within others, by module, name and annotations; made once for them all."""
+"""Checked versions of functions within others, by module, name and annotations; made once."""
 _jaxtyped = jaxtyping.jaxtyped
 _own_names = _jaxtyped("context")
 """In which sizes have names of their own, as in a call that is checked."""

@@ -15,12 +15,12 @@ GRID = SampleGrid(CAMERA)
 
 
 def lens_problem(
-    lens: RadialLens, frames: int = 5, noise: float = 0.0, seed: int = 0, motion: float = 1.0
+    lens: RadialLens, frames: int = 5, noise: float = 0.0, seed: int = 0
 ) -> BundleProblem:
     """Views of smooth random depth about 2 units away; noise in pixels, weights to match."""
     g = torch.Generator().manual_seed(7)
     size = torch.tensor([0.25, 0.25, 0.25, 0.12, 0.12, 0.12], dtype=torch.float64)
-    T = se3_exp(motion * size * torch.randn(frames, 6, generator=g, dtype=torch.float64))
+    T = se3_exp(size * torch.randn(frames, 6, generator=g, dtype=torch.float64))
     T[0] = torch.eye(4, dtype=torch.float64)
     d = 0.4 + 0.3 * torch.rand(frames, GRID.size, generator=g)
     pairs = [(i, j) for i in range(frames) for j in range(frames) if i != j]
@@ -37,7 +37,7 @@ def lens_problem(
 
 
 def disturbed(problem: BundleProblem, pose: float, depth: float) -> BundleProblem:
-    """The same from other poses and inverse depths."""
+    """The problem from other poses and inverse depths."""
     g = torch.Generator().manual_seed(1)
     xi = pose * torch.randn(len(problem.T_cw), 6, generator=g, dtype=torch.float64)
     xi[0] = 0

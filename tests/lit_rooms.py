@@ -8,5 +8,5 @@ from geogs_synth.raycast.raycaster import Raycaster
 
 @functools.cache
 def lit_room(seed: int) -> Raycaster:
-    """What renders the room of a seed, by one thread. Nobody may change its scene."""
+    """Renderer of the room of a seed, by one thread. Nobody may change its scene."""
     return Raycaster(make_room(seed), threads=1)

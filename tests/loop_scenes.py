@@ -45,7 +45,7 @@ def views(scene: Scene, poses: Sequence[np.ndarray]) -> list[RenderedView]:
 
 
 def room_views(seed: int, poses: Sequence[np.ndarray]) -> list[RenderedView]:
-    """What cameras see of a furnished room."""
+    """Views of a furnished room."""
     return _rendered(lit_room(seed), poses)
 
 
@@ -54,7 +54,7 @@ def _rendered(caster: Raycaster, poses: Sequence[np.ndarray]) -> list[RenderedVi
 
 
 def stretched(scene: Scene, factor: float) -> Scene:
-    """The same room with everything longer along y: its pictures show the same things."""
+    """The room with everything longer along y: its pictures show the same things."""
     f = np.array([1.0, factor, 1.0])
     s = scene.solids
     along = np.abs(np.einsum("nij,i->nj", s.rotation, np.array([0.0, 1.0, 0.0])))

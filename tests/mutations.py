@@ -15,7 +15,7 @@ WORDS = (
     "٣", "../../../../etc/passwd", "/etc/passwd", "/dev/zero", "/dev/stdin", "FOV", "PINHOLE",
     "OPENCV", "a" * 5000, "\ufeff", "\u2028", "0x10", "-", "+", ".", "..", "/",
 )  # fmt: skip
-"""What may stand where another word belongs."""
+"""Words that replace others."""
 
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, 1, -1, 2**31, 2**63, 2**64, 10**400, 0.5, -0.0, 1e308, 1e-308, 1e9, 1e-9,
@@ -23,7 +23,7 @@ VALUES: tuple[Any, ...] = (
     "/dev/zero", "\ud800", [], [[]], [None], [1], [1, 2, 3, 4], ["x"], {}, {"x": None}, 11 * [0.1],
     [float("nan")] * 4, 1.5, [[0.0] * 4] * 4, [[1.0] * 4] * 3,
 )  # fmt: skip
-"""What may stand in a document where another value belongs."""
+"""Values that replace others in a document."""
 
 FIELDS = (
     b"\0" * 4, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\0\0\xc0\x7f", b"\0\0\x80\x7f",
@@ -31,7 +31,7 @@ FIELDS = (
     struct.pack("<d", float("nan")), struct.pack("<d", float("-inf")), struct.pack("<d", 1e-308),
     struct.pack("<Q", 2**40), struct.pack("<I", 10**6), b"\x01", b"\xff", b"\0", b"\x80",
 )  # fmt: skip
-"""What may stand in a binary file instead of as many other bytes."""
+"""Bytes that replace as many others in a binary file."""
 
 
 @st.composite

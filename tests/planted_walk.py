@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.config import Config, TrackingConfig
+from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.geometry.umeyama import umeyama
@@ -19,7 +19,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
 
 CAMERA = Camera(fx=480.0, fy=480.0, cx=255.5, cy=143.5, width=512, height=288)
-"""Of a real run: 64 x 36 cells."""
+"""Camera of a real run: 64 x 36 cells."""
 SMALL = Camera(fx=75.0, fy=75.0, cx=39.5, cy=27.5, width=80, height=56)
 
 STEP = 0.12
@@ -42,7 +42,7 @@ def walk(count: int) -> Float[Tensor, "n 4 4"]:
 
 
 def true_inverse_depth(T_cw: Float[Tensor, "n 4 4"], grid: SampleGrid) -> Float[Tensor, "n p"]:
-    """Of a hall with floor, ceiling, wall and two far ends; seen from inside."""
+    """Inverse depths of a hall with floor, ceiling, wall and two far ends, seen from inside."""
     T_wc = se3_inverse(T_cw)
     direction = grid.rays.double() @ T_wc[:, :3, :3].mT
     centre = T_wc[:, None, :3, 3]
@@ -63,7 +63,7 @@ class PlantedFlow:
         return int(image[0, 0, 0]) + 256 * int(image[0, 0, 1])
 
     def texture(self, encoded: int) -> float:
-        """All have enough."""
+        """Enough in every image."""
         return 1.0
 
     def grey(self, encoded: int) -> Tensor:
@@ -115,15 +115,14 @@ def centre_error(tracker: Tracker, truth: Tensor) -> float:
 
 
 def planted_tracker(
-    count: int, camera: Camera = SMALL, sigma: float = 0.1, config: TrackingConfig | None = None
+    count: int, camera: Camera = SMALL, sigma: float = 0.1
 ) -> tuple[Tracker, Float[Tensor, "n 4 4"]]:
     """A tracker that holds the true walk with true depths, and the true poses."""
     grid = SampleGrid(camera)
     T = walk(count)
     d = true_inverse_depth(T, grid)
     T = T @ se3_inverse(T[0])  # the first pose is the identity
-    settings = Config(tracking=config or TrackingConfig())
-    tracker = lone_tracker(camera, settings, operator=PlantedFlow(grid, T, d, sigma))
+    tracker = lone_tracker(camera, Config(), operator=PlantedFlow(grid, T, d, sigma))
     for n in range(count):
         image = np.full((4, 4, 3), (n % 256, n // 256, 0), np.uint8)
         state = tracker.keyframes.add(n, n / 3, image, n, T[n].clone())

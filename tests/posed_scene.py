@@ -1,4 +1,4 @@
-"""What the tests of reconstruction from known poses share: a small scene, a room, the command."""
+"""A small scene and the command, for tests of reconstruction from known poses."""
 
 import subprocess
 import sys
@@ -28,13 +28,6 @@ def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=1800)
 
 
-def make_room(folder: Path) -> Path:
-    """Sixty frames of a synthetic room with exact poses, 256 x 192."""
-    done = geogs("synth", folder, "--frames", 60, "--width", 256, "--height", 192)
-    assert done.returncode == 0, done.stderr
-    return folder
-
-
 def vertices(path: Path) -> np.ndarray:
     """Vertex positions of a PLY file."""
     return read_surface(path).vertices
@@ -45,14 +38,12 @@ def surface_points(path: Path, count: int = 5000) -> np.ndarray:
     return sample_surface(read_surface(path), count, np.random.default_rng(0))[0]
 
 
-def ball_and_wall(
-    scale: float = 1.0, config: ReconstructConfig = SMALL, far: float = 0.0
-) -> Reconstruction:
+def ball_and_wall(scale: float = 1.0, far: float = 0.0) -> Reconstruction:
     """The views of the depth tests, without what a tracker knew.
 
     Lengths times ``scale``, then moved by ``far`` along each axis.
     """
-    scene = Reconstruction(WORKING, config)
+    scene = Reconstruction(WORKING, SMALL)
     for view in make_scene().views:
         T_wc = np.linalg.inv(view.T_cw)
         T_wc[:3, 3] = scale * T_wc[:3, 3] + far

@@ -48,7 +48,7 @@ def rolling_image(
     distortion: tuple[float, ...] = (),
     lens: LensModel = "polynomial",
 ) -> np.ndarray:
-    """What a sensor reads whose middle row is seen at ``time``."""
+    """Image of a sensor whose middle row is seen at ``time``."""
     lines = np.arange(camera.height) / (camera.height - 1) - 0.5
     poses = np.stack([path(time + s * readout) for s in lines])
     v, u = np.mgrid[: camera.height, : camera.width].astype(float)
@@ -59,11 +59,11 @@ def rolling_image(
 
 
 def global_image(path: Path, time: float, camera: Camera = CAMERA) -> np.ndarray:
-    """The same with a global shutter."""
+    """Image of a global shutter."""
     return render(path(time), camera)[0]
 
 
 def rolling_frames(path: Path, count: int, readout: float = READOUT) -> list[Frame]:
-    """A video of it."""
+    """Video of a rolling shutter."""
     times = np.arange(count) / RATE
     return [Frame(k, t, rolling_image(path, t, readout)) for k, t in enumerate(times)]

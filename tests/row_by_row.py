@@ -51,14 +51,13 @@ def clip_of(
     points: np.ndarray,
     readout: float,
     images: int = 30,
-    noise: float = 0.05,
     rate: float = RATE,
 ) -> ClipTracks:
-    """What is seen of points, with that many pixels of noise; every tenth view is missing."""
+    """Views of points with a twentieth of a pixel of noise; every tenth view is missing."""
     rng = np.random.default_rng(0)
     times = (np.arange(images) - images // 2) / rate
     pixels = np.stack([seen(path, points, t, readout) for t in times])
-    pixels += rng.normal(0, noise, pixels.shape)
+    pixels += rng.normal(0, 0.05, pixels.shape)
     rays = np.stack([WIDE.rays(p) for p in pixels])
     lines = np.stack([WIDE.line_times(p) for p in pixels])
     here = rng.uniform(size=lines.shape) > 0.1

@@ -22,14 +22,14 @@ def plane(z: float, half: float = 1.0, cells: int = 4) -> Surface:
 
 
 def joined(*parts: Surface) -> Surface:
-    """All in one mesh."""
+    """The surfaces in one mesh."""
     offsets = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
     faces = np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)])
     return Surface(np.concatenate([p.vertices for p in parts]), faces)
 
 
 def moved(surface: Surface, x: float, y: float, z: float) -> Surface:
-    """Shifted."""
+    """The surface, shifted."""
     return Surface(surface.vertices + np.array([x, y, z]), surface.faces)
 
 

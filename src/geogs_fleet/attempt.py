@@ -28,7 +28,7 @@ CHILD = (sys.executable, "-m", "geogs_fleet.child")
 
 @dataclass(frozen=True)
 class FleetJob:
-    """What a node is to do."""
+    """One source for a node to compute."""
 
     source: FleetSource
     output: str
@@ -98,7 +98,7 @@ def _attempt(job: FleetJob) -> tuple[State, str, dict[str, Any]]:
 
 
 def judged(ending: ProcessEnd, limits: Limits, log: str) -> tuple[State, str]:
-    """What the ending of a process means: a state, and a sentence unless it is done."""
+    """Meaning of a process's ending: a state, and a sentence unless it is done."""
     if ending.exceeded == "time":
         limit = duration(limits.seconds or 0)
         return "failed", f"It took longer than {limit}; with more --time-limit it goes on."

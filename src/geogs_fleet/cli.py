@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Sequence
-from typing import cast
+from typing import TypeVar, cast
 
 from geogs.cli.options import Given, parse_options
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 from geogs_fleet.fleet_options import FleetOptions, JoinOptions
 
+Options = TypeVar("Options", bound=FleetOptions)
 EXIT_FAILED = 1
 """Exit code where all has been tried, and a source failed."""
 
@@ -39,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _join(words: Sequence[str]) -> int:
-    options = parse_options(JoinOptions, words, "fleet join", _join_defaults)
+    options = _parsed(JoinOptions, words, "fleet join")
 
     from geogs_fleet.fleet_terminal import TerminalFleet
     from geogs_fleet.join_run import run_join
@@ -58,14 +59,12 @@ def parse(argv: Sequence[str]) -> FleetOptions:
         SystemExit: after ``--help``.
         InputError: an option is wrong or missing.
     """
-    return parse_options(FleetOptions, argv, "fleet run", _defaults)
+    return _parsed(FleetOptions, argv, "fleet run")
 
 
-def _defaults(given: Given) -> FleetOptions:
-    name = cast(Preset, given.get("preset", "default"))
-    return FleetOptions(config=preset(name), preset=name)
+def _parsed(kind: type[Options], argv: Sequence[str], command: str) -> Options:
+    def defaults(given: Given) -> Options:
+        name = cast(Preset, given.get("preset", "default"))
+        return kind(config=preset(name), preset=name)
 
-
-def _join_defaults(given: Given) -> JoinOptions:
-    name = cast(Preset, given.get("preset", "default"))
-    return JoinOptions(config=preset(name), preset=name)
+    return parse_options(kind, argv, command, defaults)

@@ -5,6 +5,7 @@ import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from geogs.errors import InputError
@@ -17,12 +18,13 @@ ASKS_FOR_TOKEN = 2, 59
 """Ray from which on a cluster that is started here asks for a token; its ports are open to the
 network, whatever address it is given."""
 _PASSING = "geogs: ends with its command"
-"""What a cluster has that another command must not rely on, where it finds it on this machine."""
+"""Resource of a cluster that ends with its command, so that no other command on this machine uses
+it."""
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """What one source gets of a node."""
+    """Resources of a node for one source."""
 
     cpus: int
     gpus: float
@@ -58,7 +60,7 @@ def ray_cluster(address: str) -> Iterator[Any]:
 
 
 def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
-    """What each source gets of the cluster, where settings leave that open.
+    """Allocation of each source, where settings leave it open.
 
     Raises:
         InputError: no node has as much as is asked for.
@@ -86,39 +88,26 @@ def allocation_for(ray: Any, settings: FleetOptions) -> Allocation:
     return Allocation(cpus, gpus, memory_bytes, at_once)
 
 
-@dataclass(frozen=True)
-class Task:
-    """A function that nodes of the same version call."""
-
-    checked: Any
-    """``in_version`` as Ray has it."""
-    function: Callable[..., Any]
-
-    def remote(self, *arguments: Any) -> Any:
-        """Ray's reference to what it will return."""
-        return self.checked.remote(__version__, self.function, *arguments)
-
-
 def as_task(
     ray: Any, function: Callable[..., Any], allocation: Allocation, retries: int = 0
-) -> Task:
-    """A function as a task of Ray that gets so much of a node.
+) -> Callable[..., Any]:
+    """A function as a task of Ray that gets so much of a node; called, it gives Ray's reference.
 
     Ray calls it again, up to so many times, where its node or its process is lost. A node with
     another version of geogs refuses: the task raises InputError.
     """
-    task = ray.remote(in_version).options(
+    checked = ray.remote(in_version).options(
         num_cpus=allocation.cpus,
         num_gpus=allocation.gpus or None,
         memory=allocation.memory,
         max_retries=retries,
         scheduling_strategy="SPREAD",
     )
-    return Task(task, function)
+    return partial(checked.remote, __version__, function)
 
 
 def in_version(version: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function returns; raises InputError where another version of geogs is installed."""
+    """Call a function; raises InputError where another version of geogs is installed."""
     if __version__ != version:
         raise InputError(
             f"The machine {platform.node()} has geogs {__version__}, and the fleet is of "

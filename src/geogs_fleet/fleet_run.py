@@ -27,7 +27,7 @@ _BETWEEN_TABLES = 5.0
 
 @dataclass(frozen=True)
 class FleetResult:
-    """What became of a fleet."""
+    """Outcome of a fleet."""
 
     output: str
     rows: list[Row]
@@ -53,7 +53,9 @@ def run_fleet(
     """
     progress, begin = progress or FleetProgress(), time.monotonic()
     sources = find_sources(settings.source)
-    output = _absolute(settings.output)
+    if not settings.output:
+        raise InputError("The results need a folder; give one (-o).")
+    output = StoragePath(settings.output).absolute()
     with _alone(output):
         digest = _digest(_run_settings(settings, "auto"))
         rows = {row.name: row for s in sources if (row := _done(output, s, digest)) is not None}
@@ -61,8 +63,10 @@ def run_fleet(
         if missing:
             with ray_cluster(settings.address) as ray:
                 allocation = allocation_for(ray, settings)
-                jobs = [_job(settings, source, output, allocation, digest) for source in missing]
-                jobs = [replace(job, command=tuple(command)) for job in jobs]
+                jobs = [
+                    _job(settings, source, output, allocation, digest, command)
+                    for source in missing
+                ]
                 progress.begin(len(sources), len(rows), allocation.at_once)
                 pace, written = Pace(len(jobs), allocation.at_once), -_BETWEEN_TABLES
                 ended = rows_of(ray, jobs, allocation, settings.attempts)
@@ -87,6 +91,7 @@ def _job(
     output: StoragePath,
     allocation: Allocation,
     digest: str,
+    command: Sequence[str],
 ) -> FleetJob:
     return FleetJob(
         source,
@@ -94,6 +99,7 @@ def _job(
         _run_settings(settings, "cuda" if allocation.gpus else "cpu"),
         digest,
         Limits(settings.time_limit, allocation.memory),
+        tuple(command),
         threads=allocation.cpus,
     )
 
@@ -124,13 +130,6 @@ def _write(
     output: StoragePath, rows: dict[str, Row], sources: Sequence[FleetSource], seconds: float
 ) -> None:
     write_table(output, list(rows.values()), len(sources) - len(rows), seconds)
-
-
-def _absolute(address: str) -> StoragePath:
-    if not address:
-        raise InputError("The results need a folder; give one (-o).")
-    path = StoragePath(address).path
-    return StoragePath(address if path is None else str(path.absolute()))
 
 
 def _alone(output: StoragePath) -> AbstractContextManager[None]:

@@ -34,7 +34,7 @@ class TerminalFleet(FleetProgress):
 
 
 def closing_message(rows: list[Row], computed: int, output: str, seconds: float) -> str:
-    """What is said at the end, for the standard output."""
+    """Closing message for the standard output."""
     failed = sum(row.state != "done" for row in rows)
     doubtful = sum(row.is_reliable is False for row in rows)
     parts = [f"{len(rows) - failed} of {_sources(len(rows))} done"]

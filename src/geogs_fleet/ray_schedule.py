@@ -26,7 +26,7 @@ def rows_of(
     ``attempts`` times in all. When the caller stops listening, what is out is ended.
     """
     task = as_task(ray, attempt, allocation)
-    out: dict[Any, FleetJob] = {task.remote(job): job for job in jobs}
+    out: dict[Any, FleetJob] = {task(job): job for job in jobs}
     try:
         while out:
             ended, _ = ray.wait(list(out), num_returns=len(out), timeout=_LOOK)
@@ -35,7 +35,7 @@ def rows_of(
                 row = _row(ray, reference, job)
                 if row.state == "crashed" and job.attempt < attempts:
                     again = replace(job, attempt=job.attempt + 1)
-                    out[task.remote(again)] = again
+                    out[task(again)] = again
                 else:
                     yield replace(row, state="failed") if row.state == "crashed" else row
     finally:
@@ -45,7 +45,7 @@ def rows_of(
 
 
 def _row(ray: Any, reference: Any, job: FleetJob) -> Row:
-    """What came back; a crash where Ray lost the task."""
+    """The row that came back; a crash where Ray lost the task."""
     try:
         row: Row = ray.get(reference)
         return row

@@ -1,4 +1,4 @@
-"""What became of one source: a row of the fleet's table."""
+"""Outcome of one source: a row of the fleet's table."""
 
 import json
 import math
@@ -72,7 +72,7 @@ def _is_sound(row: Row) -> bool:
 
 
 def numbers_of(summary: Mapping[str, Any]) -> dict[str, float]:
-    """What the table shows of a ``summary.json``; what is not there is left out."""
+    """Numbers of a ``summary.json`` for the table; missing ones are left out."""
     names = ("frames", "keyframes", "disks", "mesh_faces", "peak_memory_bytes")
     found = {name: summary.get(name) for name in names}
     verdict = summary.get("verdict")

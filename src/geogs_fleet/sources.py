@@ -31,7 +31,7 @@ class FleetSource:
 
 
 def find_sources(given: Sequence[str]) -> list[FleetSource]:
-    """All sources that some words name, each once, in the order given.
+    """Sources that some words name, each once, in the order given.
 
     A word is a text file (.txt) with one address a line (empty lines and those that begin with #
     say nothing; paths are relative to the file), a pattern, a folder with videos and folders of
@@ -59,14 +59,14 @@ def _meant(word: str) -> Iterator[str]:
     elif path is None and word.lower().endswith(".txt"):
         yield from _lines(place, None)
     elif _PATTERN.search(word) and (path is None or not path.exists()):
-        found = [_absolute(address) for address in place.matching()]
+        found = [StoragePath(address).absolute().address for address in place.matching()]
         if not found:
             raise InputError(f"Nothing fits the pattern {word}; is it right?")
         yield from found
     elif path is not None and not path.exists():
         raise InputError(f"{word} does not exist; give a video, a folder, a pattern or a list.")
     else:
-        yield from _inside(place) or [_absolute(word)]
+        yield from _inside(place) or [place.absolute().address]
 
 
 def _lines(place: StoragePath, folder: Path | None) -> Iterator[str]:
@@ -88,12 +88,7 @@ def _inside(place: StoragePath) -> list[str]:
     is_data_set = not _TABLES.isdisjoint(plain)
     if is_data_set or (not videos and (plain or not folders)):
         return []
-    return [_absolute((place / name).address) for name in sorted([*videos, *folders])]
-
-
-def _absolute(address: str) -> str:
-    path = StoragePath(address).path
-    return address if path is None else str(path.absolute())
+    return [(place / name).absolute().address for name in sorted([*videos, *folders])]
 
 
 def _stem(address: str) -> str:

@@ -1,7 +1,7 @@
 """Files and folders by their address: a path of this machine, or whatever fsspec can reach."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -28,6 +28,10 @@ class StoragePath:
         address = self.address.removeprefix("file://")
         return None if "://" in address else expanded(address)
 
+    def absolute(self) -> "StoragePath":
+        """The same place by an absolute path, if it lies on this machine."""
+        return self if self.path is None else StoragePath(str(self.path.absolute()))
+
     @property
     def name(self) -> str:
         """The last part of the address."""
@@ -39,15 +43,12 @@ class StoragePath:
         Raises:
             InputError: it cannot be read.
         """
-        try:
+        with self._failing(InputError, "read"), suppress(FileNotFoundError, NotADirectoryError):
             if self.path is not None:
                 return read_text(self.path) if self.path.is_file() else None
             with self._reached() as (system, path):
                 return str(system.cat_file(path).decode("utf-8-sig"))
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{self.address} cannot be read ({_reason(error)}).") from error
+        return None
 
     def write(self, text: str) -> None:
         """Make a text file in UTF-8, completely or not at all.
@@ -58,24 +59,17 @@ class StoragePath:
         if self.path is not None:
             write_text(self.path, text)
             return
-        try:
-            with self._reached() as (system, path):
-                system.pipe_file(path, text.encode("utf-8", "backslashreplace"))
-        except OSError as error:
-            raise OutputError(f"{self.address} cannot be written ({_reason(error)}).") from error
+        with self._failing(OutputError, "written"), self._reached() as (system, path):
+            system.pipe_file(path, text.encode("utf-8", "backslashreplace"))
 
     def delete(self) -> None:
         """Remove a file, if it is there. Raises OutputError if it cannot be removed."""
-        try:
+        with self._failing(OutputError, "deleted"), suppress(FileNotFoundError):
             if self.path is not None:
                 self.path.unlink(missing_ok=True)
                 return
             with self._reached() as (system, path):
                 system.rm_file(path)
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise OutputError(f"{self.address} cannot be deleted ({_reason(error)}).") from error
 
     def listed(self) -> dict[str, bool]:
         """Names in a folder, and whether each is a folder; nothing if this is no folder.
@@ -83,20 +77,17 @@ class StoragePath:
         Raises:
             InputError: it cannot be read.
         """
-        try:
+        with self._failing(InputError, "read"), suppress(FileNotFoundError, NotADirectoryError):
             if self.path is not None:
                 return {p.name: p.is_dir() for p in self.path.iterdir()}
             with self._reached() as (system, path):
                 found = system.ls(path, detail=True)
-        except (FileNotFoundError, NotADirectoryError):
-            return {}
-        except OSError as error:
-            raise InputError(f"{self.address} cannot be read ({_reason(error)}).") from error
-        return {
-            PurePosixPath(entry["name"]).name: entry["type"] == "directory"
-            for entry in found
-            if entry["name"].strip("/") != path.strip("/")
-        }
+            return {
+                PurePosixPath(entry["name"]).name: entry["type"] == "directory"
+                for entry in found
+                if entry["name"].strip("/") != path.strip("/")
+            }
+        return {}
 
     def matching(self) -> list[str]:
         """Addresses that fit a pattern, in their order; the address is the pattern."""
@@ -113,33 +104,35 @@ class StoragePath:
         Raises:
             InputError: it is not there, or cannot be read.
         """
-        try:
-            with self._reached() as (system, path):
-                if system.isfile(path):
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    system.get_file(path, str(target))
-                    return
-                files = system.find(path)
-                if not files:
-                    raise InputError(f"{self.address} does not exist; give a source that does.")
-                for file in files:
-                    relative = PurePosixPath(file).relative_to(path.rstrip("/"))
-                    if ".." in relative.parts:
-                        raise InputError(f"{self.address} names files outside of itself.")
-                    inner = target / relative
-                    inner.parent.mkdir(parents=True, exist_ok=True)
-                    system.get_file(file, str(inner))
-        except OSError as error:
-            raise InputError(f"{self.address} cannot be read ({_reason(error)}).") from error
+        with self._failing(InputError, "read"), self._reached() as (system, path):
+            if system.isfile(path):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                system.get_file(path, str(target))
+                return
+            files = system.find(path)
+            if not files:
+                raise InputError(f"{self.address} does not exist; give a source that does.")
+            for file in files:
+                relative = PurePosixPath(file).relative_to(path.rstrip("/"))
+                if ".." in relative.parts:
+                    raise InputError(f"{self.address} names files outside of itself.")
+                inner = target / relative
+                inner.parent.mkdir(parents=True, exist_ok=True)
+                system.get_file(file, str(inner))
 
     def upload(self, file: Path) -> None:
         """Copy a file of this machine here. Raises OutputError if it cannot be written."""
+        with self._failing(OutputError, "written"), self._reached() as (system, path):
+            system.makedirs(str(PurePosixPath(path).parent), exist_ok=True)
+            system.put_file(str(file), path)
+
+    @contextmanager
+    def _failing(self, kind: type[GeogsError], done: str) -> Iterator[None]:
+        """Says of a failure inside that this cannot be read, written or deleted."""
         try:
-            with self._reached() as (system, path):
-                system.makedirs(str(PurePosixPath(path).parent), exist_ok=True)
-                system.put_file(str(file), path)
-        except OSError as error:
-            raise OutputError(f"{self.address} cannot be written ({_reason(error)}).") from error
+            yield
+        except (OSError, UnicodeDecodeError) as error:
+            raise kind(f"{self.address} cannot be {done} ({_reason(error)}).") from error
 
     @contextmanager
     def _reached(self) -> Iterator[tuple[Any, str]]:
@@ -164,7 +157,7 @@ class StoragePath:
 
 
 def _limits(address: str) -> dict[str, Any]:
-    """By which a file system waits no longer than ``PATIENCE`` for a server that is silent."""
+    """Options by which a file system waits no longer than ``PATIENCE`` for a silent server."""
     protocol = address.partition("://")[0]
     if protocol in ("http", "https"):
         from aiohttp import ClientTimeout

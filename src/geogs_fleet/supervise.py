@@ -16,7 +16,7 @@ _LOOK = 0.5
 
 @dataclass(frozen=True)
 class Limits:
-    """What a process may take; none lets it take what it needs."""
+    """Limits of a process; none lets it take what it needs."""
 
     seconds: float | None = None
     memory: int | None = None
@@ -40,7 +40,7 @@ def supervise(
     log: Path,
     limits: Limits,
     environment: Mapping[str, str],
-    meanwhile: Callable[[], None] = lambda: None,
+    meanwhile: Callable[[], None],
 ) -> ProcessEnd:
     """Run a command until it ends, or has to.
 

@@ -55,7 +55,7 @@ class RayWorkers:
         """
         begin, ray = time.monotonic(), self._ray
         task = as_task(ray, function, self._allocation, retries=self._attempts - 1)
-        references = [task.remote(*job) for job in jobs]
+        references = [task(*job) for job in jobs]
         try:
             results: list[R] = _results(ray, references)
         except ray.exceptions.RayTaskError as error:

@@ -27,7 +27,7 @@ def place_lost(
     seed: int,
     progress: StageProgress,
 ) -> FoundFrames:
-    """As asked of it in ``geogs.application.structure_from_motion.photos.place_lost``."""
+    """Implements ``geogs.application.structure_from_motion.photos.place_lost``."""
     features = frame_features(frames, progress)
     shown = [k for k, some in enumerate(features) if len(some) >= FEWEST_FEATURES]
     known = {place + 1: T for place, k in enumerate(shown) if (T := T_cw[k]) is not None}
@@ -49,8 +49,7 @@ def place_lost(
     if is_known.all():
         return FoundFrames.none()
     poses = np.stack([world_to_camera(image) for image in images])
-    error = float(model.compute_mean_reprojection_error())
-    deviations = pose_deviations(model, images, poses, error, True, beside)
+    deviations = pose_deviations(model, images, poses, True, beside)
     of = [frames[int(image.name)] for image in images]
     times = np.array([frame.timestamp for frame in of], np.float64)
     numbers = tuple(frame.index for frame in of)

@@ -1,4 +1,4 @@
-"""What of a reconstruction is left where matches between its pictures contradict their poses.
+"""The part of a reconstruction that is left where matches contradict the poses of its pictures.
 
 A wrong world need not lie off the epipolar lines: two parts that are joined with a wrong turn let
 all matches between them lie near a circle through both cameras (a horopter), where any turn does.
@@ -23,15 +23,15 @@ from geogs_photos.incremental_mapping import without_poses
 from geogs_photos.photo_pairs import FOLLOWING
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
-MOST = 0.5
-"""Part of a pair's matches that has to be explained, by the poses or by a turn alone."""
-TURN = 20.0
-"""Degrees by which poses may turn otherwise than a turn that explains a pair by itself: beyond what
-a step to the side does of which all that is seen is equally far."""
-OF_FOLLOWING = 200
+LEAST_EXPLAINED = 0.5
+"""Fraction of a pair's matches that has to be explained, by the poses or by a rotation alone."""
+MAX_ROTATION_DISAGREEMENT_DEG = 20.0
+"""Most between the rotation of two poses and one that explains their matches by itself: more than a
+step to the side makes of a scene that is equally far everywhere."""
+FOLLOWING_WEIGHT = 200
 """Times that matches of frames that follow one another count; those that speak for the poses twice
 that, as few false ones are among many true ones anywhere (docs/photographs.md)."""
-_FIRST = 1000
+_FOLLOWING_WEIGHT_IN_CUTS = 1000
 """Times that they do where a cut is looked for: it goes through others, however many, where it can,
 rather than around single frames that few hold."""
 _ROUNDS = 15
@@ -39,13 +39,13 @@ _ROUNDS = 15
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """What the matches of two pictures say of their poses."""
+    """Evidence of the matches of two pictures for or against their poses."""
 
     one: int
     other: int
     """Their places among the pictures."""
     matches: int
-    """That speak for the poses; negative where as many speak against them."""
+    """Number of matches that speak for the poses; negative where as many speak against them."""
     is_following: bool = False
     """Whether they follow one another in a video."""
 
@@ -54,7 +54,7 @@ class Vote:
         """How much it counts."""
         if not self.is_following:
             return self.matches
-        return OF_FOLLOWING * (2 * self.matches if self.matches > 0 else self.matches)
+        return FOLLOWING_WEIGHT * (2 * self.matches if self.matches > 0 else self.matches)
 
 
 def undisputed(model: Any, database: Path, known: Container[int] = ()) -> Any:
@@ -85,7 +85,7 @@ def _placed(model: Any) -> list[int]:
 
 
 def _votes(model: Any, database: Path, place: dict[int, int]) -> list[Vote]:
-    """Of all pairs of pictures with places of their own."""
+    """Votes of all pairs of pictures with places of their own."""
     return [
         Vote(place[p.one], place[p.other], speaks_for(p), abs(p.other - p.one) <= FOLLOWING)
         for p in verified_matches(model, database, place)
@@ -96,14 +96,17 @@ def _votes(model: Any, database: Path, place: dict[int, int]) -> list[Vote]:
 def speaks_for(pair: PairMatches) -> int:
     """Matches that speak for the poses of a pair; negative where as many speak against them."""
     by_poses = (pair.epipolar() <= MAX_ERROR) & pair.in_front()
-    R, off = turn_alone(*pair.rays)
-    by_turn = pair.focal * off <= MAX_ERROR
-    if by_turn.mean() >= MOST and rotation_angle(R[None], pair.T[None, :3, :3])[0] > TURN:
-        return -int(by_turn.sum())
-    return int(by_poses.sum()) if by_poses.mean() >= MOST else -int((~by_poses).sum())
+    R, off = best_rotation(*pair.rays)
+    by_rotation = pair.focal * off <= MAX_ERROR
+    if (
+        by_rotation.mean() >= LEAST_EXPLAINED
+        and rotation_angle(R[None], pair.T[None, :3, :3])[0] > MAX_ROTATION_DISAGREEMENT_DEG
+    ):
+        return -int(by_rotation.sum())
+    return int(by_poses.sum()) if by_poses.mean() >= LEAST_EXPLAINED else -int((~by_poses).sum())
 
 
-def turn_alone(
+def best_rotation(
     one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "n"]]:
     """The rotation that takes rays nearest to others, and how far each ends (about radians).
@@ -163,7 +166,7 @@ def _reached(joins: csr_array, source: int, sink: int) -> np.ndarray:
 
 def _graph(count: int, joins: Iterable[Vote]) -> csr_array:
     rows = [
-        (a, b, v.matches * (_FIRST if v.is_following else 1))
+        (a, b, v.matches * (_FOLLOWING_WEIGHT_IN_CUTS if v.is_following else 1))
         for v in joins
         for a, b in ((v.one, v.other), (v.other, v.one))
     ]

@@ -115,16 +115,14 @@ def _camera(colmap: Any, number: int, shared: SharedCamera) -> Any:
         )
         camera.has_prior_focal_length = not c.is_guess
         return camera
+    models, terms = colmap.CameraModelId, [*c.distortion, *[0.0] * 8]
     camera = colmap.Camera(camera_id=number, width=c.width, height=c.height)
     if c.lens == "fisheye":
-        camera.model = colmap.CameraModelId.OPENCV_FISHEYE
-        camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *(c.distortion or (0.0,) * 4)]
-        camera.has_prior_focal_length = True
-        return camera
-    distortion = [*c.distortion, *[0.0] * 8][:8]
-    is_short = not any(distortion[4:])
-    models = colmap.CameraModelId
-    camera.model = models.OPENCV if is_short else models.FULL_OPENCV
-    camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *distortion[: 4 if is_short else 8]]
+        camera.model, count = models.OPENCV_FISHEYE, 4
+    elif any(terms[4:8]):
+        camera.model, count = models.FULL_OPENCV, 8
+    else:
+        camera.model, count = models.OPENCV, 4
+    camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *terms[:count]]
     camera.has_prior_focal_length = True
     return camera

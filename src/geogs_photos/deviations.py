@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from geogs_photos.pycolmap_library import load_colmap
 
-ALIKE = 2.3
+COMMON_ERROR_FACTOR = 2.3
 """Times a deviation is larger than if all points erred by themselves: one that is seen a little
 beside its place is so in most views. Measured on videos with a truth (docs/photographs.md)."""
 
@@ -18,7 +18,6 @@ def pose_deviations(
     model: Any,
     images: Sequence[Any],
     T_cw: Float64[np.ndarray, "n 4 4"],
-    error: float,
     is_known: bool,
     beside: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
@@ -32,12 +31,12 @@ def pose_deviations(
         model: the reconstruction.
         images: those to tell of, with poses ``T_cw``, world to camera.
         T_cw: the same.
-        error: deviation of a measured point, pixels.
         is_known: whether the camera was given, or found along with the poses.
         beside: for each image the places of those that the alignment fits, which count as unsure
             as their matches leave them: what hangs on at an end sways with that. None fits all.
     """
     colmap = load_colmap()
+    error = float(model.compute_mean_reprojection_error())  # deviation of a measured point, pixels
     options = colmap.BundleAdjustmentOptions(
         print_summary=False, refine_principal_point=not is_known
     )
@@ -54,7 +53,7 @@ def pose_deviations(
         unknown = np.full(len(images), np.inf)
         return unknown, unknown.copy()
     centre, rotation = without_gauge(joint, T_cw, beside)
-    return ALIKE * error * centre, ALIKE * error * rotation
+    return COMMON_ERROR_FACTOR * error * centre, COMMON_ERROR_FACTOR * error * rotation
 
 
 def without_gauge(

@@ -7,7 +7,7 @@ from geogs.threads import worker_count
 from geogs_photos.photo_features import MAX_FEATURES
 
 FEATURES = (MAX_FEATURES, 2896, 2048, 1448, 1024)
-"""Of a photograph, at most: from one to the next matching takes half as long."""
+"""Most features of a photograph: from one to the next matching takes half as long."""
 POSES = 0.5
 """Fraction of the time that the poses may take; the map is made in the rest."""
 LEAST_MAP = 20.0
@@ -20,10 +20,10 @@ match all of its features, with their square."""
 _TO_START, _TO_PLACE = 0.06, 0.24
 """Seconds to place a photograph, on any number of cores: in any case, and with all features."""
 _PAIRS = 20.0
-"""That are matched for each photograph, where there are many."""
+"""Pairs that are matched for each photograph, where there are many."""
 
 
-def stages_of_poses(count: int, features: int = MAX_FEATURES) -> dict[str, float]:
+def stages_of_poses(count: int, features: int) -> dict[str, float]:
     """About how many seconds each stage takes that finds the poses of so many photographs."""
     part, cores = features / MAX_FEATURES, worker_count()
     pairs = min(0.5 * count * (count - 1), _PAIRS * count)
@@ -35,8 +35,8 @@ def stages_of_poses(count: int, features: int = MAX_FEATURES) -> dict[str, float
     }
 
 
-def seconds_to_find_poses(count: int, features: int = MAX_FEATURES) -> float:
-    """The same of all of them."""
+def seconds_to_find_poses(count: int, features: int) -> float:
+    """About how many seconds all stages take together."""
     return sum(stages_of_poses(count, features).values())
 
 
@@ -49,8 +49,8 @@ def features_for(count: int, seconds: float | None) -> int:
 
 
 def what_does_not_fit(count: int, seconds: float | None) -> str:
-    """What to say at once of a time that is too short for so many photographs, or that is only
-    enough with less effort; empty where it is enough."""
+    """Note or warning where the time is too short for so many photographs, or needs fewer features;
+    empty where it is enough."""
     if seconds is None or (features := features_for(count, seconds)) == MAX_FEATURES:
         return ""
     least = seconds_to_find_poses(count, features)

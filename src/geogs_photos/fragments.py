@@ -1,4 +1,4 @@
-"""What is tried where incremental mapping of a video falls into parts, or leaves frames out.
+"""Other ways where incremental mapping of a video falls into parts, or leaves frames out.
 
 Where matches contradict a world, those that joined it falsely, as sides of a building do that look
 alike, are left out, and the rest is mapped once more. Global mapping (rotation averaging, global
@@ -29,7 +29,7 @@ from geogs_photos.incremental_mapping import (
     put_together,
     without_poses,
 )
-from geogs_photos.known_places import of_known_places
+from geogs_photos.known_positions import with_known_positions
 from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_VIEWS = 3
@@ -80,7 +80,7 @@ def rejoined(
 
 
 def believed(model: Any, database: Path, known: Container[int] = ()) -> Any:
-    """What of a reconstruction hangs together, and contradicts no matches.
+    """The part of a reconstruction that hangs together and contradicts no matches.
 
     With pictures ``known`` from elsewhere it is what does with these.
     """
@@ -135,8 +135,8 @@ def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndar
 
 
 def _believed(parts: Sequence[Any], database: Path, is_known: bool) -> list[Any]:
-    """What is to be believed of each; the largest first."""
-    found = (of_known_places(believed(part, database), is_known) for part in parts)
+    """The believed part of each reconstruction; the largest first."""
+    found = (with_known_positions(believed(part, database), is_known) for part in parts)
     return sorted(found, key=lambda part: -_placed([part]))
 
 

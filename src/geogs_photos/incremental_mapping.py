@@ -98,7 +98,7 @@ def _options(known: Sequence[int], seed: int, **more: Any) -> Any:
 
 
 def _counting(placed: int, count: int, progress: Callable[[float], None]) -> Callable[[], None]:
-    """What is to be called after each picture, so many of ``count`` being placed before."""
+    """Callback for after each picture, ``placed`` of ``count`` being placed before."""
     numbers = itertools.count(placed + 1)
     return lambda: progress(min(next(numbers) / count, 1.0))
 
@@ -121,7 +121,7 @@ def of_poses(database: Path, known: Mapping[int, Float64[np.ndarray, "4 4"]]) ->
 
 
 def largest_first(models: Mapping[int, Any]) -> list[Any]:
-    """Those that have enough pictures to count as a part."""
+    """Reconstructions that have enough pictures to count as a part, the largest first."""
     parts = [model for model in models.values() if model.num_reg_images() >= LEAST_IMAGES]
     return sorted(parts, key=lambda model: -model.num_reg_images())
 

@@ -3,12 +3,12 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from geogs.application.structure_from_motion.photos import PlacedVideo
 from geogs.geometry.camera import Camera
 from geogs.types import Frame
-from geogs_photos.photo_features import find_features
+from geogs_photos.photo_features import find_features, squared_distances
 from geogs_photos.pycolmap_library import load_colmap
 
 NEIGHBOURS = 2
@@ -71,7 +71,7 @@ def matches_to_points(
 
     The second nearest has to be clearly farther, but for the same point as another frame sees it.
     """
-    distance = _squares(own.astype(np.float32), descriptors.astype(np.float32))
+    distance = squared_distances(own.astype(np.float32), descriptors.astype(np.float32)).clip(0)
     rows = np.arange(len(own))
     nearest = distance.argmin(1)
     best = distance[rows, nearest].copy()
@@ -80,10 +80,3 @@ def matches_to_points(
     second = np.where(other, distance, np.inf).min(1)
     kept = np.flatnonzero(is_mutual & (best < _RATIO**2 * second))
     return kept, nearest[kept]
-
-
-def _squares(
-    one: Float32[np.ndarray, "n d"], other: Float32[np.ndarray, "m d"]
-) -> Float32[np.ndarray, "n m"]:
-    distance = (one**2).sum(1)[:, None] + (other**2).sum(1) - 2 * one @ other.T
-    return distance.clip(0)

@@ -74,6 +74,13 @@ def find_features(
     return PhotoFeatures(keypoints, _root_sift(raw))
 
 
+def squared_distances(
+    one: Float32[np.ndarray, "n d"], other: Float32[np.ndarray, "m d"]
+) -> Float32[np.ndarray, "n m"]:
+    """Squared distances of descriptors; rounding may leave them a little below zero."""
+    return (one**2).sum(1)[:, None] + (other**2).sum(1) - 2 * one @ other.T
+
+
 def frame_features(frames: Sequence[Frame], progress: StageProgress) -> list[PhotoFeatures]:
     """Features of frames of a video, where their masks say that they show the scene."""
     return thread_map(

@@ -14,11 +14,11 @@ from jaxtyping import Float32, UInt8
 
 from geogs.stopwatch import StageProgress
 from geogs.threads import thread_map
-from geogs_photos.photo_features import PhotoFeatures
+from geogs_photos.photo_features import PhotoFeatures, squared_distances
 
 ALL_PAIRS = 20
 """Most pictures of which every pair is matched in full."""
-ALL_LOOKS = 200
+ALL_PREVIEWS = 200
 """Most pictures of which every pair is looked at."""
 PREVIEW = 400
 """Features of a picture that a first look compares."""
@@ -26,7 +26,7 @@ LEAST_ALIKE = 6
 """Matches in a first look from which on a pair is matched in full."""
 ALWAYS = 8
 """Pictures most alike to each that are matched in full in any case, if they share anything."""
-MOST = 40
+MAX_PARTNERS = 40
 """Most pictures that one brings along, those most alike to it."""
 NEIGHBOURS = 2
 """Next pictures by name that are matched in any case: photographs are taken one after another."""
@@ -49,7 +49,7 @@ def choose_pairs(
     everything = [(i, j) for i in range(count) for j in range(i + 1, count)]
     if count <= ALL_PAIRS:
         return everything
-    looked_at = everything if count <= ALL_LOOKS else _candidates(features, seed)
+    looked_at = everything if count <= ALL_PREVIEWS else _candidates(features, seed)
     previews = [f.largest(PREVIEW).astype(np.float32) for f in features]
     alike = thread_map(
         lambda pair: mutual_matches(previews[pair[0]], previews[pair[1]]), looked_at, progress
@@ -67,7 +67,7 @@ def mutual_matches(one: Float32[np.ndarray, "n 128"], other: Float32[np.ndarray,
     """Features that are each other's nearest, and clearly nearer than the second nearest."""
     if len(one) < 2 or len(other) < 2:
         return 0
-    distance = (one**2).sum(1)[:, None] + (other**2).sum(1) - 2 * one @ other.T
+    distance = squared_distances(one, other)
     forward, backward = distance.argmin(1), distance.argmin(0)
     two = np.partition(distance, 1, axis=1)[:, :2].clip(0)
     is_clear = two[:, 0] < _RATIO**2 * two[:, 1]
@@ -83,7 +83,7 @@ def _best(count: int, pairs: Pairs, alike: Sequence[int]) -> Pairs:
             of_picture[j].append((-matches, i))
     kept = _following(count, NEIGHBOURS)
     for i, others in enumerate(of_picture):
-        for rank, (matches, j) in enumerate(sorted(others)[:MOST]):
+        for rank, (matches, j) in enumerate(sorted(others)[:MAX_PARTNERS]):
             if rank < ALWAYS or -matches >= LEAST_ALIKE:
                 kept.add((min(i, j), max(i, j)))
     return sorted(kept)

@@ -27,7 +27,7 @@ from geogs_photos.photo_features import MAX_FEATURES, PhotoFeatures, find_featur
 from geogs_photos.photo_pairs import Pairs, choose_pairs
 from geogs_photos.photograph import Lens, PhotoFolder, Photograph
 from geogs_photos.pycolmap_library import load_colmap
-from geogs_photos.upright import upright_rotation
+from geogs_photos.upright import make_upright
 
 FEWEST_FEATURES = 50
 """Features of a picture that can be matched with others."""
@@ -37,7 +37,7 @@ FEWEST_MATCHES = 15
 
 @dataclass(frozen=True, slots=True)
 class FoundPoses:
-    """What structure from motion came to."""
+    """Outcome of structure from motion."""
 
     left_out: tuple[tuple[str, str], ...]
     """Names of photographs that have no pose, each with the reason as a clause."""
@@ -69,7 +69,7 @@ def find_poses(
         InputError: pycolmap is missing, the intrinsics do not fit, or fewer than three photographs
             hang together.
     """
-    colmap = load_colmap()
+    load_colmap()  # says at once if it is missing
     photographs = folder.photographs
     if len(photographs) < 3:
         raise InputError(
@@ -94,7 +94,9 @@ def find_poses(
     progress("adjusting", 0.0)
     best = refine(parts[0], cameras)
     progress("adjusting", 1.0)
-    _make_upright(colmap, best, {p.name: p.quarter_turns for p in photographs})
+    turns = {photograph.name: photograph.quarter_turns for photograph in photographs}
+    images = sorted((i for i in best.images.values() if i.has_pose), key=lambda i: i.image_id)
+    make_upright(best, images, [turns[image.name] for image in images])
     best.extract_colors_for_all_images(folder.root, worker_count())
     model.mkdir(parents=True, exist_ok=True)
     best.write(model)
@@ -173,13 +175,6 @@ def _features(photograph: Photograph, root: Path, most: int) -> PhotoFeatures:
 
 def _names(model: Any) -> set[str]:
     return {image.name for image in model.images.values() if image.has_pose}
-
-
-def _make_upright(colmap: Any, model: Any, turns: dict[str, int]) -> None:
-    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.image_id)
-    R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
-    rotation = upright_rotation(R_cw, [turns.get(image.name, 0) for image in images])
-    model.transform(colmap.Sim3d(1.0, colmap.Rotation3d(rotation), np.zeros(3)))
 
 
 def _nothing_found(root: Path, entries: Sequence[Entry], kept: np.ndarray) -> str:

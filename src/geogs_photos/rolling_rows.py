@@ -18,14 +18,14 @@ from geogs_photos.incremental_mapping import placed_images, world_to_camera
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.verified_matches import MAX_ERROR
 
-TRIED = 0.1
+TRIAL_READOUT = 0.1
 """Readout that is tried, of the time from one frame to the next: 20 ms of five a second."""
-MOST = 2.0
-"""Times that the readout may be."""
-LEFT = 0.33
+MAX_READOUT = 2.0
+"""Largest readout, over the one that is tried."""
+UNSURE_FRACTION = 0.33
 """Part of what a readout moves that stays unsure, as motion between frames is only roughly known.
 Measured on videos with a truth (docs/photographs.md)."""
-_APART = 2.5
+_MAX_GAP = 2.5
 """Times the usual step of time from which on motion between two frames is not known."""
 
 
@@ -44,12 +44,12 @@ def with_rows_at_once(
         ``placed_images``.
     """
     model.update_point_3d_errors()  # those that it comes with are older than its poses
-    step = TRIED * float(np.median(np.diff(times)))
+    step = TRIAL_READOUT * float(np.median(np.diff(times)))
     trials = [_adjusted(model, times, readout, adjust) for readout in (-step, step)]
     squares = [_square(m) for m in (trials[0], model, trials[1])]
     bend = squares[0] + squares[2] - 2 * squares[1]
     best = 0.5 * (squares[0] - squares[2]) / bend if bend > 0 else 0.0
-    found = _adjusted(model, times, float(np.clip(best, -MOST, MOST)) * step, adjust)
+    found = _adjusted(model, times, float(np.clip(best, -MAX_READOUT, MAX_READOUT)) * step, adjust)
     for number in [n for n, point in found.points3D.items() if not point.error <= MAX_ERROR]:
         found.delete_point3D(number)
     images = placed_images(found)
@@ -58,7 +58,7 @@ def with_rows_at_once(
         for m in (model, found)
     )
     scale, R, t = umeyama(before, now)
-    return found, LEFT * (scale * before @ R.T + t - now).norm(dim=1).numpy()
+    return found, UNSURE_FRACTION * (scale * before @ R.T + t - now).norm(dim=1).numpy()
 
 
 def _square(model: Any) -> float:
@@ -73,7 +73,7 @@ def _adjusted(
     """A copy whose rows are put where all would be seen at once."""
     copy, images = load_colmap().Reconstruction(model), placed_images(model)
     places = [int(image.name) for image in images]
-    T_cw, step = [world_to_camera(image) for image in images], _APART * np.median(np.diff(times))
+    T_cw, step = [world_to_camera(image) for image in images], _MAX_GAP * np.median(np.diff(times))
     for k, image in enumerate(images):
         around = range(max(0, k - 1), min(len(images), k + 2))
         near = [j for j in around if abs(times[places[j]] - times[places[k]]) <= step]

@@ -104,7 +104,7 @@ def _tell(
 
 
 def _read(note: Path) -> FoundPoses:
-    """What an earlier call found. Raises InputError if that cannot be read."""
+    """The outcome of an earlier call. Raises InputError if it cannot be read."""
     try:
         values = read_json(note)
         left_out = tuple((str(name), str(why)) for name, why in values["left_out"])

@@ -1,14 +1,27 @@
 """Which way is up in a world that photographs tell of."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float64
+
+from geogs_photos.pycolmap_library import load_colmap
 
 LEAST_SPREAD = 0.05
 """Second smallest eigenvalue of the cameras' x axes from which on they tell the vertical."""
 
 
+def make_upright(model: Any, images: Sequence[Any], quarter_turns: Sequence[int]) -> None:
+    """Rotate a reconstruction in place, so that y points down in its pictures."""
+    colmap = load_colmap()
+    R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
+    rotation = colmap.Rotation3d(upright_rotation(R_cw, quarter_turns))
+    model.transform(colmap.Sim3d(1.0, rotation, np.zeros(3)))
+
+
 def upright_rotation(
-    R_cw: Float64[np.ndarray, "n 3 3"], quarter_turns: list[int]
+    R_cw: Float64[np.ndarray, "n 3 3"], quarter_turns: Sequence[int]
 ) -> Float64[np.ndarray, "3 3"]:
     """The rotation of the world after which y points down, as in an upright image.
 

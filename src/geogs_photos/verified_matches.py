@@ -43,8 +43,8 @@ class PairMatches:
 def verified_matches(
     model: Any, database: Path, pictures: Collection[int]
 ) -> Iterator[PairMatches]:
-    """Those of all pairs of some pictures that have a pose, but of pixels that the lens which was
-    found does not see."""
+    """Verified matches of all pairs of some pictures that have a pose, without pixels that the lens
+    which was found does not see."""
     colmap = load_colmap()
     with closing(colmap.Database.open(database)) as opened:
         ids, _ = opened.read_two_view_geometry_num_inliers()
@@ -66,7 +66,7 @@ def verified_matches(
 
 
 def _rays(model: Any, opened: Any, number: int) -> Float64[np.ndarray, "n 3"]:
-    """Of all points of interest; not finite where a lens that bends too much shows nothing."""
+    """Rays of all features; not finite where a lens that bends too much shows nothing."""
     camera = model.cameras[model.images[number].camera_id]
     pixels = np.asarray(opened.read_keypoints(number), np.float64)[:, :2]
     return homogeneous(np.asarray(camera.cam_from_img(pixels), np.float64)[:, :2])

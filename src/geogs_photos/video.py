@@ -26,13 +26,13 @@ from geogs_photos.incremental_mapping import (
     refine,
     world_to_camera,
 )
-from geogs_photos.only_turns import only_turns
 from geogs_photos.photo_features import frame_features
 from geogs_photos.photo_pairs import frame_pairs
 from geogs_photos.poses import structure_of
+from geogs_photos.pure_rotation import only_rotates
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.rolling_rows import with_rows_at_once
-from geogs_photos.upright import upright_rotation
+from geogs_photos.upright import make_upright
 from geogs_photos.zoom import zooms
 
 MOST_CHANGE = 0.1
@@ -49,8 +49,8 @@ def place_frames(
     seed: int,
     progress: StageProgress,
 ) -> PlacedVideo:
-    """As asked of it in ``geogs.application.structure_from_motion.photos.place_frames``."""
-    colmap = load_colmap()
+    """Implements ``geogs.application.structure_from_motion.photos.place_frames``."""
+    load_colmap()  # says at once if it is missing
     begin = Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,
         is_guess=not (is_known or is_found),
@@ -63,7 +63,7 @@ def place_frames(
         database = Path(work) / "database.db"
         parts, _ = structure_of(database, shared, entries, pairs, seed, progress)
         parts = rejoined(parts, database, count, shared, seed, progress)
-        if parts and only_turns(parts[0], database):
+        if parts and only_rotates(parts[0], database):
             raise InputError(
                 "The camera only turns: a turn alone explains what nearly all pairs of frames "
                 "show; move it sideways, too."
@@ -75,9 +75,7 @@ def place_frames(
             f"Of {count} sharp frames no three tell where they were taken; the camera has to move, "
             "and the scene to show texture."
         )
-    R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
-    up = upright_rotation(R_cw, [0] * len(images))
-    best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
+    make_upright(best, images, [0] * len(images))
     # Before rows are told apart, which explain much of a zoom.
     has_zoomed, unsure = zooms(best, images), np.zeros(len(images))
     if is_rolling:
@@ -110,7 +108,7 @@ def _placed(
         camera.model.name, camera.width, camera.height, camera.params.tolist(), "the video itself"
     )
     error = float(model.compute_mean_reprojection_error())
-    deviation, rotation = pose_deviations(model, images, T_cw, error, is_known)
+    deviation, rotation = pose_deviations(model, images, T_cw, is_known)
     depth = np.array([_depth_deviation(model, image, error) for image in images])
     numbers = tuple(chosen.frames[int(image.name)].index for image in images)
     return PlacedVideo(

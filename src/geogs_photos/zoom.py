@@ -14,10 +14,10 @@ from geogs_photos.incremental_mapping import adjust_free
 from geogs_photos.pycolmap_library import load_colmap
 
 PARTS = 6
-"""Of a video, which have lenses of their own."""
-LESS, CHANGE = 0.93, 0.03
-"""Part of their distance from where points were seen that is left with these, at most, and the
-least relative difference of their focal lengths: 0.78 and 7 % where somebody zooms by four fifths,
+"""Parts of a video that have lenses of their own."""
+MAX_ERROR_RATIO, LEAST_CHANGE = 0.93, 0.03
+"""Reprojection error with these over that with one lens, at most, and the least relative difference
+of their focal lengths: 0.78 and 7 % where somebody zooms by four fifths,
 0.90 and 14 % where by a half in five images, 0.97 and more where nobody does (docs/uncertainty.md
 has what that leaves)."""
 
@@ -32,7 +32,7 @@ def zooms(model: Any, images: Sequence[Any]) -> bool:
     if len(images) < 2 * PARTS:
         return False
     focal, left = with_own_lenses(model, images)
-    return left < LESS and float(np.ptp(np.log(focal))) > CHANGE
+    return left < MAX_ERROR_RATIO and float(np.ptp(np.log(focal))) > LEAST_CHANGE
 
 
 def with_own_lenses(model: Any, images: Sequence[Any]) -> tuple[Float64[np.ndarray, "p"], float]:

@@ -46,7 +46,7 @@ def test_who_has_no_token_and_who_has_another_version_are_refused(tmp_path):
             )  # fmt: skip
             assert not other.stdout.startswith("in"), other.stdout
         task = as_task(ray, double, Allocation(1, 0.0))
-        assert ray.get(task.remote(21)) == 42
+        assert ray.get(task(21)) == 42
         other = ray.remote(in_version).remote("0.0.0", double, 21)
         with pytest.raises(ray.exceptions.RayTaskError) as caught:
             ray.get(other)

@@ -45,16 +45,21 @@ class Recording(OneProcess):
         return done
 
 
+def make_parts(folder: Path) -> None:
+    for n, places in enumerate(PLACES):
+        part = Part(str(n), make_part(folder / str(n), places, 0))
+        describe(part, CAMERA, folder / f"{n}.safetensors")
+
+
 @pytest.fixture
-def placed(tmp_path, monkeypatch):
+def placed(once, monkeypatch):
     """Three parts that were put together badly; the first and the last share nothing."""
     rng, config = np.random.default_rng(0), Config()
     monkeypatch.setattr(adjust, "ROUNDS", 1)
-    parts, files, placements = [], [], {}
-    for n, places in enumerate(PLACES):
-        parts.append(Part(str(n), make_part(tmp_path / str(n), places, 0)))
-        files.append(tmp_path / f"{n}.safetensors")
-        describe(parts[-1], CAMERA, files[-1])
+    folder, parts, files, placements = once("described-parts", make_parts), [], [], {}
+    for n in range(len(PLACES)):
+        parts.append(Part(str(n), folder / str(n)))
+        files.append(folder / f"{n}.safetensors")
         T = torch.from_numpy(read_record(PartViews, files[-1]).T_cw)
         T[:, :3, 3] += torch.from_numpy(rng.normal(0, 0.003, 3)) * (n > 0)
         placements[n] = Placement(T, torch.ones(len(T)))

@@ -1,6 +1,7 @@
 """What parts match, and what the rows of their keyframes were off by."""
 
 import numpy as np
+import pytest
 import torch
 
 from geogs.application.results.saved_result import load_result
@@ -23,7 +24,7 @@ READOUT = 0.03
 
 
 def rows() -> SeenRows:
-    """Of an image whose rows were taken for those of a camera that stands still."""
+    """Times of rows that were taken for those of a camera that stands still."""
     height, width = -(-CAMERA.height // CELL) + 2, -(-CAMERA.width // CELL) + 2
     line = (torch.arange(height) - 1) * CELL + (CELL - 1) / 2
     seconds = READOUT * (line / (CAMERA.height - 1) - 0.5)
@@ -50,9 +51,14 @@ def matched(folder, number: int, with_rows: bool) -> tuple[Member, Matches]:
     return member, found
 
 
-def test_rows_are_corrected_as_within_a_run(tmp_path):
-    member, found = matched(tmp_path / "a", 0, with_rows=True)
-    result = load_result(tmp_path / "a")
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory) -> tuple[Member, Matches]:
+    return matched(tmp_path_factory.mktemp("corrected") / "a", 0, with_rows=True)
+
+
+def test_rows_are_corrected_as_within_a_run(corrected):
+    member, found = corrected
+    result = load_result(member.part.folder)
     frames = range(len(result.trajectory.timestamps))
     middle = [FRAMES * n + 1 for n in range(len(PLACES))]
     errors = RowErrors(GRID, dict.fromkeys(middle, rows()), frames, result.trajectory)
@@ -68,14 +74,14 @@ def test_rows_are_corrected_as_within_a_run(tmp_path):
     step = position_step(CAMERA)
     assert float(shift.norm(dim=-1).median()) > 0.05  # pixels
     assert np.array_equal(found.shift, (shift / step).round().short().numpy())
-    corrected = torch.stack(
+    moved = torch.stack(
         [unpacked_positions(GRID, edge.position) for edge in found.edges().values()]
     )
-    assert float((corrected - torch.stack(plain) - shift).abs().max()) < 0.51 * step
+    assert float((moved - torch.stack(plain) - shift).abs().max()) < 0.51 * step
 
 
-def test_rows_are_corrected_in_any_world_and_unit(tmp_path):
-    _, found = matched(tmp_path / "a", 0, with_rows=True)
+def test_rows_are_corrected_in_any_world_and_unit(corrected, tmp_path):
+    _, found = corrected
     _, other = matched(tmp_path / "b", 3, with_rows=True)
     assert np.array_equal(found.ends[:, [1, 3]], other.ends[:, [1, 3]])
     size = np.median(np.abs(found.shift[..., 0]))

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.mesh.denoise import _MOVES, _TURNS, ALIKE, denoised, faces_beyond
+from geogs.mesh.denoise import (
+    _NORMAL_ROUNDS,
+    _VERTEX_ROUNDS,
+    NORMAL_DEVIATION,
+    denoised,
+    faces_beyond,
+)
 
 
 def _roof(noise: float, side: int = 21) -> tuple[torch.Tensor, torch.Tensor]:
@@ -47,7 +53,7 @@ def _angles(vertices: torch.Tensor, faces: torch.Tensor) -> np.ndarray:
 
 
 def _slow(vertices: np.ndarray, faces: list[list[int]], reach: float) -> np.ndarray:
-    """The same facet by facet."""
+    """The oracle: facet by facet."""
 
     def cross(face: list[int]) -> np.ndarray:
         a, b, c = vertices[face]
@@ -57,7 +63,7 @@ def _slow(vertices: np.ndarray, faces: list[list[int]], reach: float) -> np.ndar
     normal = [cross(face) / size for face, size in zip(faces, area, strict=True)]
     edges = [[frozenset((f[k], f[(k + 1) % 3])) for k in range(3)] for f in faces]
     sides = {e: [m for m, other in enumerate(edges) if e in other] for own in edges for e in own}
-    for _ in range(_TURNS):
+    for _ in range(_NORMAL_ROUNDS):
         turned = []
         for m, own in enumerate(edges):
             total = normal[m] * area[m]
@@ -65,11 +71,11 @@ def _slow(vertices: np.ndarray, faces: list[list[int]], reach: float) -> np.ndar
                 other = [n for n in sides[edge] if n != m]
                 n = other[0] if len(other) == 1 else m
                 apart = ((normal[m] - normal[n]) ** 2).sum()
-                total = total + normal[n] * area[n] * np.exp(-apart / (2 * ALIKE**2))
+                total = total + normal[n] * area[n] * np.exp(-apart / (2 * NORMAL_DEVIATION**2))
             turned.append(total / np.linalg.norm(total))
         normal = turned
     moved = vertices.copy()
-    for _ in range(_MOVES):
+    for _ in range(_VERTEX_ROUNDS):
         step = np.zeros_like(moved)
         for v in range(len(moved)):
             of = [m for m, face in enumerate(faces) if v in face]

@@ -8,12 +8,14 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.mesh.clean import border_edges, cleaned, components_on_host, vertex_components
-from geogs.mesh.decimation.deviation import deviations
+from geogs.mesh.decimation.deviation import (
+    device_deviations,
+    host_deviations,
+    triangle_distances,
+)
 from geogs.mesh.decimation.deviation_kernels import triangle_distance
-from geogs.mesh.decimation.device_deviation import surface_distances, triangle_distances
-from geogs.mesh.device import surface
-from geogs.mesh.device.surface import device_surface
 from geogs.mesh.tensor_mesh import TensorMesh
+from geogs.mesh.volume.device_marching import device_surface
 from geogs.mesh.volume.free_space import SeenFree
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import SparseTsdf
@@ -72,7 +74,7 @@ def assert_same_surface(made: TensorMesh, expected: TensorMesh) -> None:
 @DEVICES
 @pytest.mark.parametrize("batch", [5, 100_000])
 def test_the_surface_is_that_of_the_host(device, batch, monkeypatch):
-    monkeypatch.setattr(surface, "_BATCH", batch)
+    monkeypatch.setattr("geogs.mesh.volume.device_marching._BATCH", batch)
     tsdf = volume(device)
     assert len(tsdf) > 50
     assert_same_surface(device_surface(tsdf, 1.5), extract_surface(host(tsdf), 1.5))
@@ -110,8 +112,9 @@ def test_borders_and_components_of_any_faces(count):
     expected = {(a, b) for a, b in edges if (b, a) not in edges}
     found = [tuple(edge) for edge in border_edges(mesh).tolist()]
     assert sorted(found) == sorted(expected)
-    label = np.arange(400)
-    for _ in range(400):
+    label, before = np.arange(400), None
+    while not np.array_equal(label, before):
+        before = label.copy()
         for face in faces:
             label[face] = label[face].min()
     assert vertex_components(mesh).tolist() == label.tolist()
@@ -124,9 +127,10 @@ def test_deviations_are_those_of_the_host(device):
     mesh = hills(30)
     random = np.random.default_rng(0)
     points = (mesh.vertices + 0.03 * random.normal(size=mesh.vertices.shape)).astype(np.float32)
-    arrays = [torch.from_numpy(x).to(device) for x in (points, mesh.vertices, mesh.faces)]
-    expected = deviations(points, mesh.vertices, mesh.faces)
-    np.testing.assert_allclose(surface_distances(*arrays).cpu(), expected, atol=1e-6)
+    given = points, mesh.vertices, mesh.faces, random.permutation(len(points))
+    arrays = [torch.from_numpy(x).to(device) for x in given]
+    expected = host_deviations(*given)
+    np.testing.assert_allclose(device_deviations(*arrays).cpu(), expected, atol=1e-6)
 
 
 def test_distances_to_triangles_are_those_of_the_host():

@@ -64,7 +64,7 @@ class ReferenceRasteriser:
         background: Float[Tensor, "3"] | None,
         with_normals: bool,
     ) -> Rendering:
-        """As :class:`geogs_bench.appearance.rasteriser.Rasteriser` says."""
+        """See :class:`geogs_bench.appearance.rasteriser.Rasteriser`."""
         blend = self._blend(disks, camera, T_cw)
         shape = (camera.height, camera.width)
         offset = disks.means - _centre(T_cw)
@@ -89,7 +89,7 @@ class ReferenceRasteriser:
     def median_disks(
         self, disks: AppearanceDisks, camera: Camera, T_cw: Float[Tensor, "4 4"]
     ) -> MedianDisks:
-        """As :class:`geogs_bench.appearance.rasteriser.Rasteriser` says."""
+        """See :class:`geogs_bench.appearance.rasteriser.Rasteriser`."""
         blend = self._blend(disks, camera, T_cw)
         counts = (blend.before > 0.5) & (blend.weight > 0)
         order = torch.arange(1, len(blend.rows) + 1, device=counts.device)

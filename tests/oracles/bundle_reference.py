@@ -41,7 +41,7 @@ def residuals(
 
 
 def motion_residuals(problem: BundleProblem, xi: Tensor) -> Float[Tensor, "m 6"]:
-    """What is between the motions after the steps xi of poses and the measured ones."""
+    """Residuals of the motions after the steps xi of poses against the measured ones."""
     (m,), T = problem.pose_terms, retract(xi, problem.T_cw)
     return torch.stack([
         se3_log(T[j] @ se3_inverse(T[i]) @ se3_inverse(measured))

@@ -26,7 +26,7 @@ def residuals(
     depth: Float[Tensor, "p"],
     scale: Float[Tensor, "r c"],
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "p"]]:
-    """Of the matches of a frame's edges in pixels, and of its prior in inverse depth."""
+    """Residuals of the matches of a frame's edges in pixels, and of its prior in inverse depth."""
     rows = []
     for e in torch.nonzero(problem.source == frame)[:, 0].tolist():
         T = problem.T_cw[int(problem.target[e])] @ se3_inverse(problem.T_cw[frame])

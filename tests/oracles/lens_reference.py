@@ -19,7 +19,7 @@ from geogs.geometry.robust import huber_cost
 
 
 class Equations(NamedTuple):
-    """Of each edge: of its motion, of the lens and of what else is shared, and of the depths."""
+    """Normal equations of each edge: motion, lens and other shared parameters, depths."""
 
     hessian: Tensor  # (e, c, c)
     gradient: Tensor  # (e, c)
@@ -62,7 +62,7 @@ def linearised(
 def equations(
     problem: BundleProblem, block: LensBlock, huber: float, further: Tensor | None = None
 ) -> Equations:
-    """All edges of a problem, summed in float64."""
+    """Normal equations of all edges of a problem, summed in float64."""
     i, j, T = problem.source, problem.target, problem.T_cw
     block = LensBlock(block.lens, block.pixels.double())
     p, J, Jd = linearised(block, T, i, j, problem.inverse_depth[i].double())
@@ -79,7 +79,7 @@ def equations(
 
 
 def cost(problem: BundleProblem, block: LensBlock, huber: float) -> float:
-    """Of all matches of a problem."""
+    """Cost of all matches of a problem."""
     depth = problem.inverse_depth[problem.source]
     p = block.project(problem.T_cw, problem.source, problem.target, depth)
     return matched_cost(p, problem.pixels, problem.weight, huber)

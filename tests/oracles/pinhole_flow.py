@@ -31,7 +31,7 @@ class PinholeFlow:
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
     ) -> Iterator[SourceFlow]:
-        """As in the protocol."""
+        """See the protocol."""
         i, j = problem.source, problem.target
         T_ji = relative_motion(state.T_cw, i, j)
         p = linearise(self.camera, self.rays, T_ji, state.inverse_depth[i])
@@ -56,7 +56,7 @@ class PinholeFlow:
             yield SourceFlow(frame, edges)
 
     def cost(self, problem: BundleProblem, state: BundleState, huber: float) -> float:
-        """As in the protocol."""
+        """See the protocol."""
         i = problem.source
         T_ji = relative_motion(state.T_cw, i, problem.target)
         p = project(self.camera, self.rays, T_ji, state.inverse_depth[i])

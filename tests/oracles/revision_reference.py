@@ -27,7 +27,7 @@ def photo_costs(
     camera: Camera,
     mask: Bool[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, "2 h w"]:
-    """As :func:`geogs.depth.revision.photo_vote.photo_costs`, pixel by pixel of all."""
+    """:func:`geogs.depth.revision.photo_vote.photo_costs` of all pixels."""
     if mask is not None:
         depths = torch.stack([depths[0], torch.where(mask, depths[1], depths[0])])
     device, size = depths.device, (camera.width, camera.height)

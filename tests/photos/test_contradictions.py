@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from geogs_photos import contradictions
 from geogs_photos.contradictions import (
     Vote,
+    best_rotation,
     false_pairs,
     speaks_for,
-    turn_alone,
     undisputed,
     undivided,
 )
@@ -40,7 +40,7 @@ def pair(turn: float, claimed: float) -> PairMatches:
 def test_a_turn_is_found_beside_false_matches():
     one, two = horizon(12.0)
     two[::4, 1] += 0.3
-    R, off = turn_alone(one, two)
+    R, off = best_rotation(one, two)
     assert Rotation.from_matrix(R).magnitude() == pytest.approx(np.radians(12), abs=0.01)
     assert (off < 0.01).sum() == 30
 

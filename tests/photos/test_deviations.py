@@ -124,5 +124,6 @@ def test_a_covariance_that_overflows_tells_nothing(monkeypatch):
     monkeypatch.setattr(deviations, "_covariance", lambda *given: overflown)
     images = [SimpleNamespace(image_id=n) for n in range(4)]
     T_cw = np.tile(np.eye(4), (4, 1, 1))
-    for known in pose_deviations(SimpleNamespace(), images, T_cw, 0.5, False):
+    model = SimpleNamespace(compute_mean_reprojection_error=lambda: 0.5)
+    for known in pose_deviations(model, images, T_cw, False):
         np.testing.assert_array_equal(known, np.inf)

@@ -68,7 +68,7 @@ def test_of_all_ways_the_one_that_puts_most_into_one(
 
     by_rest = by_way("without", without)
     monkeypatch.setattr(fragments, "believed", lambda part, _: part)
-    monkeypatch.setattr(fragments, "of_known_places", lambda part, _: part)
+    monkeypatch.setattr(fragments, "with_known_positions", lambda part, _: part)
     monkeypatch.setattr(fragments, "false_pairs", lambda *_: false)
     monkeypatch.setattr(fragments, "_without", lambda *given: (by_rest(*given), Path("pruned")))
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
@@ -135,7 +135,7 @@ def test_a_reconstruction_of_nothing_stays_nothing():
 def test_each_way_places_a_room(monkeypatch):
     """Incremental mapping is taken to have failed; the others place all by themselves."""
     pytest.importorskip("pycolmap")
-    room = render_room(9, 3, 320, 240)
+    room = render_room(9, 3, 240, 180)
     frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(room.images))
     chosen = ChosenFrames(frames, np.arange(9) / 10)
     truth = room.T_wc[:, :3, 3]
@@ -171,14 +171,7 @@ def test_a_reconstruction_of_too_few_points_is_none(monkeypatch):
     pytest.importorskip("pycolmap")
     room = render_room(4, 3, 160, 120)
     frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(room.images))
+    chosen = ChosenFrames(frames, np.arange(4) / 10)
     monkeypatch.setattr(incremental_mapping, "LEAST_POINTS", 10**6)
     with pytest.raises(InputError, match="no three tell where they were taken"):
-        video.place_frames(
-            ChosenFrames(frames, np.arange(4) / 10),
-            room.camera,
-            True,
-            False,
-            False,
-            0,
-            lambda *_: None,
-        )
+        video.place_frames(chosen, room.camera, True, False, False, 0, lambda *_: None)

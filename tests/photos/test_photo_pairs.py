@@ -52,7 +52,7 @@ def test_of_more_those_that_share_something_and_neighbours():
 
 
 def test_of_many_a_place_seen_again_is_still_found(monkeypatch):
-    monkeypatch.setattr(pairs_module, "ALL_LOOKS", 30)
+    monkeypatch.setattr(pairs_module, "ALL_PREVIEWS", 30)
     monkeypatch.setattr(pairs_module, "_CANDIDATES", 10)
     random = np.random.default_rng(3)
     there = walk(random, 40)

@@ -29,7 +29,7 @@ def test_a_point_seen_twice_does_not_compete_with_itself():
 
 
 @pytest.mark.system
-def test_a_frame_is_placed_against_points(tmp_path):
+def test_a_frame_is_placed_against_points():
     """Points of the truth with the looks that two frames give them; a third frame is placed."""
     pytest.importorskip("pycolmap")
     room = render_room(3, 2, 320, 240)
@@ -60,9 +60,9 @@ def test_a_frame_is_placed_against_points(tmp_path):
 
 
 @pytest.mark.system
-def test_deviations_hold_what_the_truth_is_off(tmp_path):
+def test_deviations_hold_what_the_truth_is_off():
     pytest.importorskip("pycolmap")
-    room = render_room(9, 3, 320, 240)
+    room = render_room(9, 3, 240, 180)
     frames = [Frame(k, k / 10, image) for k, image in enumerate(room.images)]
     chosen = ChosenFrames(tuple(frames), np.arange(9) / 10)
     placed = place_frames(chosen, room.camera, True, False, False, 0, lambda *_: None)

@@ -21,11 +21,11 @@ def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
 @pytest.mark.parametrize(("last", "is_known"), [(1.0, True), (1.5, False)])
 def test_frames_of_a_zoom_have_no_place_that_counts(last, is_known):
     pytest.importorskip("pycolmap")
-    room = render_room(18, 3, 320, 240)
-    factors = np.where(np.arange(18) < 9, 1.0, last)
+    room = render_room(14, 3, 240, 180)
+    factors = np.where(np.arange(14) < 7, 1.0, last)
     images = [zoomed(image, f) for image, f in zip(room.images, factors, strict=True)]
     frames = tuple(Frame(k, k / 10, image) for k, image in enumerate(images))
-    chosen = ChosenFrames(frames, np.arange(18) / 10)
+    chosen = ChosenFrames(frames, np.arange(14) / 10)
     placed = place_frames(chosen, room.camera, False, False, False, 0, lambda *_: None)
     assert len(placed.numbers) >= 12
     assert np.isfinite(placed.deviation).all() == is_known

@@ -28,7 +28,7 @@ from geogs.threads import on_one_torch_thread
 
 @dataclass(frozen=True)
 class MeshBlock:
-    """What the work on one box of space comes to."""
+    """Surface and free space of one box of space."""
 
     parts: tuple[SurfacePart, ...]
     free: FreeSpace

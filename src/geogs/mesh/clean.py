@@ -1,4 +1,4 @@
-"""What is removed from an extracted mesh, and which of its holes are closed, on its device."""
+"""Cleaning of an extracted mesh on its device: specks removed, small holes closed."""
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def cleaned(
 
 
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:
-    """As :func:`without_degenerate_faces`, with normals and colours."""
+    """:func:`without_degenerate_faces` of a mesh with normals and colours."""
     if not len(mesh.faces):
         return mesh
     return keep_faces(mesh, _have_areas(TensorMesh.of(mesh.vertices, mesh.faces)).numpy())
@@ -155,6 +155,6 @@ def with_closed_holes(
 
     border = border_edges(mesh).cpu().numpy()
     fans = closing_fans(border, len(vertices), look, most_edges, is_free)
-    new = [torch.from_numpy(part).to(device) for part in (fans.vertices, fans.normals, fans.faces)]
-    mesh = TensorMesh(torch.cat([vertices, new[0]]), torch.cat([mesh.faces, new[2]]))
-    return mesh, torch.cat([normals, new[1]])
+    middle, up, faces = (torch.from_numpy(part).to(device) for part in fans)
+    mesh = TensorMesh(torch.cat([vertices, middle]), torch.cat([mesh.faces, faces]))
+    return mesh, torch.cat([normals, up])

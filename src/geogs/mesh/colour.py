@@ -28,7 +28,6 @@ def colour_mesh(
     mesh: Mesh,
     views: Sequence[DepthMapView],
     tolerance: float,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Mesh:
     """Give each vertex the mean colour of the images that see it, as :func:`seen_colours` says.
 
@@ -38,7 +37,7 @@ def colour_mesh(
     device = views[0].depth.device if len(views) else torch.device("cpu")
     vertices = torch.from_numpy(mesh.vertices).to(device)
     normals = torch.from_numpy(mesh.normals).to(device)
-    mean, seen = seen_colours(vertices, normals, views, tolerance, progress)
+    mean, seen = seen_colours(vertices, normals, views, tolerance)
     return replace(mesh, colours=filled(vertices, mean, seen).cpu().numpy())
 
 
@@ -87,7 +86,7 @@ def add_compiled(
     total: Float[Tensor, "n 3"],
     weight: Float[Tensor, "n"],
 ) -> None:
-    """As :func:`add_reference`, by compiled loops, for float32 tensors on the CPU."""
+    """:func:`add_reference` by compiled loops, for float32 tensors on the CPU."""
     from geogs.mesh.colour_kernels import add_colours
 
     f, camera, n = np.float32, seen.camera, len(vertices)

@@ -43,15 +43,15 @@ def add_colours(
         cosine = -towards / np.sqrt(x * x + y * y + z * z)
         if not cosine > least:
             continue
-        share = (cosine / z) ** 2
+        gain = (cosine / z) ** 2
         s = min(max((u + HALF) * zoom_x - HALF, ZERO), last_x)
         t = min(max((v + HALF) * zoom_y - HALF, ZERO), last_y)
         left, top = np.int64(s), np.int64(t)
         right, bottom = min(left + 1, image_width - 1), min(top + 1, image_height - 1)
         s, t = s - np.float32(left), t - np.float32(top)
-        weight[i] += share
+        weight[i] += gain
         for k in range(3):
             p, q = np.float32(image[top, left, k]), np.float32(image[top, right, k])
             upper = p + s * (q - p)
             p, q = np.float32(image[bottom, left, k]), np.float32(image[bottom, right, k])
-            total[i, k] += share * (upper + t * (p + s * (q - p) - upper))
+            total[i, k] += gain * (upper + t * (p + s * (q - p) - upper))

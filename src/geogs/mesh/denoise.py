@@ -7,11 +7,11 @@ from torch.nn.functional import normalize
 
 from geogs.mesh.tensor_mesh import vertex_sums
 
-ALIKE = 0.2
+NORMAL_DEVIATION = 0.2
 """Standard deviation of the length between unit normals (11 degrees) that are of one surface."""
-_TURNS = 10
+_NORMAL_ROUNDS = 10
 """Means over neighbours: what is waved over some ten facets is smoothed."""
-_MOVES = 5
+_VERTEX_ROUNDS = 5
 """Steps by which vertices follow the normals."""
 
 
@@ -35,12 +35,12 @@ def denoised(
     faces, count = faces.long(), len(start)
     before, area = _facets(start, faces)
     normal, beyond = before, faces_beyond(faces)
-    for _ in range(_TURNS):
+    for _ in range(_NORMAL_ROUNDS):
         normal = _mean_of_neighbours(normal, area, beyond)
     weight = vertex_sums(area, faces, count).clamp(min=1e-300)
     moved = start
-    for _ in range(_MOVES):
-        moved = moved + _missing(moved, faces, normal, area) / weight
+    for _ in range(_VERTEX_ROUNDS):
+        moved = moved + _plane_offsets(moved, faces, normal, area) / weight
     away = moved - start
     away = away - vertex_sums(away[faces].mean(1) * area, faces, count) / weight
     away = away * (reach / away.norm(dim=1, keepdim=True).clamp(min=reach))
@@ -94,11 +94,11 @@ def _mean_of_neighbours(
     total = normal * area
     for other in beyond.unbind(1):
         apart = (normal - normal[other]).square().sum(1, keepdim=True)
-        total = total + normal[other] * area[other] * torch.exp(apart / (-2 * ALIKE**2))
+        total = total + normal[other] * area[other] * torch.exp(apart / (-2 * NORMAL_DEVIATION**2))
     return normalize(total, dim=1, eps=1e-300)
 
 
-def _missing(
+def _plane_offsets(
     vertices: Float[Tensor, "n 3"],
     faces: Int[Tensor, "m 3"],
     normal: Float[Tensor, "m 3"],

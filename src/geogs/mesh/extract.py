@@ -15,11 +15,11 @@ from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import filled, seen_colours
 from geogs.mesh.decimation.decimate import merged
 from geogs.mesh.denoise import denoised
-from geogs.mesh.device.surface import device_surface
 from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.block_count import fitting, fitting_voxel
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
+from geogs.mesh.volume.device_marching import device_surface
 from geogs.mesh.volume.free_space import SeenFree
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
@@ -31,22 +31,22 @@ _SAMPLED_POINTS = 400_000
 _MOST_OUT_OF_REACH = 0.05
 """Part of the surface that may lie beyond the volume, as stray points do."""
 _CROWDED = 0.1
-"""Part of the memory limit from which on, by a sample of the pixels, all of them are asked how many
-blocks they have: of what is scattered, as outdoors, there are several times as many."""
+"""Part of the memory limit from which on, by a sample of the pixels, the blocks of all pixels are
+counted: of scattered surface, as outdoors, there are several times as many."""
 _NEAR = 0.1
 """Part of the pixels that show what is nearest."""
 _COARSEST = 4.0
-"""Times the footprints of those pixels that voxels are at most, where there is room for smaller
-ones: of what is near, a background fills most of the image."""
+"""Largest voxel over the footprint of those pixels, where there is room for smaller ones: behind
+what is near, a background fills most of the image."""
 _AROUND = 0.95
-"""Part of the cameras and of the surface that distances from the middle are told of."""
+"""Quantile of the distances of cameras and of surface from the middle."""
 _FAR = 4.0
-"""Times the radius of the scene around the cameras that its surface reaches where there is a
-background, which is contracted."""
-OVERRUN = 1.5
+"""Distance of the surface, over the radius of the scene around the cameras, from which on there is
+a background, which is contracted."""
+_OVERRUN = 1.5
 """Times the memory limit that a volume may take, where the plan is a sample's."""
-COARSER = 1.5
-"""Times larger are the voxels that are tried next."""
+_COARSER = 1.5
+"""Growth of the voxels from one trial to the next."""
 _FACES_PER_SQUARE = 2.4
 """Marching cubes makes about so many triangles per voxel face of surface."""
 
@@ -66,7 +66,7 @@ class VolumePlan:
     triangles: int
     """Estimated number, before those that the surface does not need are merged."""
     contraction: Contraction = UNCONTRACTED
-    """Of the space in which the voxels are a grid."""
+    """Contraction of the space in which the voxels are a grid."""
 
     @property
     def bytes(self) -> int:
@@ -98,30 +98,38 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     points = points[depths <= max_depth]
     contraction = _contraction([view.T_cw for view in sampled], points, near)
     points = contraction.contracted(points)
-    limit = config.memory_limit * 2**30
     if config.voxel is not None:
-        reach = LIMIT * config.voxel
-        if float((points.abs() > reach).any(1).double().mean()) > _MOST_OUT_OF_REACH:
-            raise InputError(
-                f"A voxel of {config.voxel:g} is too small: the volume would end at {reach:.3g} "
-                f"map units, within the scene; use a larger voxel or leave it to be chosen."
-            )
-        blocks = len(band_blocks(points, config.voxel, config.truncation))
-        if blocks * BYTES_PER_BLOCK > limit:
-            raise InputError(
-                f"A voxel of {config.voxel:g} needs about {blocks * BYTES_PER_BLOCK / 2**30:.1f} "
-                f"GiB for the volume, more than the limit of {config.memory_limit:g}; use a "
-                f"larger voxel or leave it to be chosen."
-            )
-        triangles = round(_FACES_PER_SQUARE * _area(points, config.voxel) / config.voxel**2)
-        return VolumePlan(
-            config.voxel, config.truncation, max_depth, blocks, triangles, contraction
-        )
-    faces = _FACES_PER_SQUARE * _area(points, voxel)
-    voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
-    voxel, blocks = fitting(points, voxel, config.truncation, int(limit / BYTES_PER_BLOCK))
+        voxel, blocks = config.voxel, _blocks_of_given_voxel(points, config.voxel, config)
+        faces = _FACES_PER_SQUARE * _area(points, voxel)
+    else:
+        faces = _FACES_PER_SQUARE * _area(points, voxel)
+        voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
+        voxel, blocks = fitting(points, voxel, config.truncation, _most_blocks(config))
     triangles = round(faces / voxel**2)
     return VolumePlan(voxel, config.truncation, max_depth, blocks, triangles, contraction)
+
+
+def _blocks_of_given_voxel(points: Float[Tensor, "n 3"], voxel: float, config: MeshConfig) -> int:
+    """Blocks around a surface; InputError where they are too many or do not reach far enough."""
+    reach = LIMIT * voxel
+    if float((points.abs() > reach).any(1).double().mean()) > _MOST_OUT_OF_REACH:
+        raise InputError(
+            f"A voxel of {voxel:g} is too small: the volume would end at {reach:.3g} map units, "
+            "within the scene; use a larger voxel or leave it to be chosen."
+        )
+    blocks = len(band_blocks(points, voxel, config.truncation))
+    if blocks * BYTES_PER_BLOCK > config.memory_limit * 2**30:
+        raise InputError(
+            f"A voxel of {voxel:g} needs about {blocks * BYTES_PER_BLOCK / 2**30:.1f} GiB for the "
+            f"volume, more than the limit of {config.memory_limit:g}; use a larger voxel or leave "
+            "it to be chosen."
+        )
+    return blocks
+
+
+def _most_blocks(config: MeshConfig) -> int:
+    """Blocks that fit into the memory limit."""
+    return int(config.memory_limit * 2**30 / BYTES_PER_BLOCK)
 
 
 @on_one_torch_thread
@@ -148,14 +156,14 @@ def extract_mesh(
     if config.voxel is None and plan.bytes > _CROWDED * config.memory_limit * 2**30:
         plan = _counted(plan, views, config)
     _log.info("voxel %.4g, about %.0f MiB", plan.voxel, plan.bytes / 2**20)
-    most = OVERRUN * config.memory_limit * 2**30
+    most = _OVERRUN * config.memory_limit * 2**30
     while (tsdf := fuse(views, plan, progress, most)) is None:
         if config.voxel is not None:
             raise InputError(
                 f"A voxel of {config.voxel:g} needs more than {most / 2**30:.1f} GiB for the "
                 "volume; use a larger voxel or leave it to be chosen."
             )
-        plan = replace(plan, voxel=COARSER * plan.voxel)
+        plan = replace(plan, voxel=_COARSER * plan.voxel)
         _log.info("too large: voxel %.4g", plan.voxel)
     surface = _clean_surface(tsdf, config)
     del tsdf
@@ -175,9 +183,8 @@ def extract_mesh(
 
 def _counted(plan: VolumePlan, views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
     """The plan with all pixels of all views counted."""
-    most = int(config.memory_limit * 2**30 / BYTES_PER_BLOCK)
     voxel, blocks = fitting_voxel(
-        views, plan.voxel, plan.truncation, plan.max_depth, most, plan.contraction
+        views, plan.voxel, plan.truncation, plan.max_depth, _most_blocks(config), plan.contraction
     )
     triangles = round(plan.triangles * (plan.voxel / voxel) ** 2)
     return replace(plan, voxel=voxel, blocks=blocks, triangles=triangles)
@@ -244,8 +251,8 @@ def fuse(
     progress: Callable[[str, int, int], None] | None = None,
     most: float = math.inf,
 ) -> SparseTsdf | None:
-    """All views in one volume, on the device of the first depth map; None as soon as that takes
-    more than ``most`` bytes."""
+    """Fuse all views in one volume, on the device of the first depth map; None as soon as that
+    takes more than ``most`` bytes."""
     device = views[0].depth.device
     tsdf = SparseTsdf(
         plan.voxel, plan.truncation, device, plan.blocks, contraction=plan.contraction
@@ -288,7 +295,7 @@ def _sample_points(
 def _contraction(
     poses: Sequence[Float[Tensor, "4 4"]], points: Float[Tensor, "n 3"], near: float
 ) -> Contraction:
-    """What contracts the background of a scene; nothing where it has none.
+    """The contraction of a scene's background; none where there is no background.
 
     Around the cameras, up to the depth ``near``, space stays as it is.
     """

@@ -1,7 +1,6 @@
 """Small holes of a mesh, closed where nobody looked through them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,22 +11,13 @@ Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Positions and normals of vertices."""
 
 
-@dataclass(frozen=True)
-class Fans:
-    """Vertices and faces that close holes."""
-
-    vertices: Float[np.ndarray, "k 3"]
-    """float32."""
-    normals: Float[np.ndarray, "k 3"]
-    faces: Int[np.ndarray, "m 3"]
-
-
 def closing_fans(
     border: Int[np.ndarray, "e 2"], count: int, look: Look, most_edges: int, is_free: IsFree
-) -> Fans:
-    """Fans around the middles of holes with ``most_edges`` or fewer edges.
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], Int[np.ndarray, "m 3"]]:
+    """Vertices, normals and faces of fans around the middles of holes with ``most_edges`` or fewer
+    edges.
 
-    Their vertices are numbered from ``count`` on; ``border`` are the edges (start, end) that one
+    The vertices are numbered from ``count`` on; ``border`` are the edges (start, end) that one
     face has.
     """
     vertices, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
@@ -44,7 +34,7 @@ def closing_fans(
         length = np.linalg.norm(up[closed], axis=1, keepdims=True)
         normals.append((up[closed] / length).astype(np.float32))
         count += len(closed)
-    return Fans(np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
+    return np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces)
 
 
 def border_loops(

@@ -39,7 +39,7 @@ from geogs_fleet.join.records import read_record, write_record
 from geogs_fleet.workers import Workers
 
 _NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
-"""Of a keyframe whose matches are known."""
+"""Image of a keyframe whose matches are known."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class StepJob:
 
     own: Member
     others: tuple[Member, ...]
-    """All that are linked to it."""
+    """All parts that are linked to it."""
     first: Mapping[int, int]
     """Number of the first keyframe of each of them in the whole."""
     matches: tuple[Path, ...]
@@ -58,9 +58,9 @@ class StepJob:
     after: Path
     """File of the depths, to be written."""
     T_before: Float[Tensor, "m 4 4"] | None
-    """Of all keyframes of the whole; none where there was no step yet."""
+    """Poses of all keyframes of the whole before the step; none where there was no step yet."""
     step: Float[Tensor, "m 6"] | None
-    """Of their poses."""
+    """Step of their poses."""
     is_last: bool = False
     """Nothing is said of the next; cells without matches are filled, and what moves is found."""
 
@@ -103,7 +103,7 @@ class _Poses:
 
 
 class _Adjustment:
-    """What is known between two steps."""
+    """State between two steps."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class _Adjustment:
         """Edges that leave the keyframes of the second part, matched by the first."""
         self.ends = np.zeros((0, 4), np.int64)
         self.steps = 0
-        """Of all poses, so far."""
+        """Number of steps of all poses so far."""
         self.written = 0
         """Files so far, so that each gets a name of its own."""
 
@@ -222,7 +222,7 @@ class _AllPoses:
     def step(
         self, state: _Poses, linear: SparseCameraSystem, damping: float
     ) -> Step[_Poses] | None:
-        """As the loop asks for it; the parts' keyframes move at once."""
+        """One step of the least-squares loop; the parts' keyframes move at once."""
         found = linear.solve(damping, FLOOR)
         if found is None:
             return None

@@ -4,7 +4,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,19 +46,13 @@ _RUNS_PER_WORKER = 4
 
 @dataclass(frozen=True)
 class Joint:
-    """What became of the parts."""
+    """Outcome of a join."""
 
     output: Path
-    joined: tuple[str, ...]
     unjoined: tuple[str, ...]
     """Parts in which nothing of the others was recognised: their own results are all there is."""
-    links: int
-    summary: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def sentence(self) -> str:
-        """For the terminal."""
-        return str(self.summary["verdict"]["sentence"])
+    sentence: str
+    """For the terminal."""
 
 
 class _Join:
@@ -93,12 +87,8 @@ class _Join:
         self.workers.map("moving maps", move_disks, moves)
         merges = [(files[n], [files[m] for m in gauge.linked[n] if m < n]) for n in numbers]
         keep = self.workers.map("merging maps", merge_disks, merges)
-        return joined_disks(
-            [
-                kept(load_map_file(files[n], "cpu").disks, k)
-                for n, k in zip(numbers, keep, strict=True)
-            ]
-        )
+        pairs = zip(numbers, keep, strict=True)
+        return joined_disks([kept(load_map_file(files[n], "cpu").disks, k) for n, k in pairs])
 
     def surface(self, count: int, disks: MapSnapshot) -> Mesh | None:
         """The mesh of the result that has been written, and colours of its disks."""
@@ -152,8 +142,6 @@ def join_parts(
         InputError: a part cannot be used, or no two of them show one place.
         OutputError: a file cannot be written.
     """
-    if len(parts) < 2:
-        raise InputError("There is one part only, which is whole already; give two or more.")
     begin = time.perf_counter()
     output = prepare_output_folder(output)
     with replaced(output, "result") as new:
@@ -163,13 +151,14 @@ def join_parts(
     return replace(joint, output=output)
 
 
-def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float) -> Joint:
+def _placed_parts(
+    join: _Join, adjust: bool, say: Callable[[str], None]
+) -> tuple[Gauge, dict[int, JoinedPart]]:
+    """The parts that hang together with their places in the joint world, by their numbers."""
     parts, config = join.parts, join.config
     with join.stopwatch("describing"):
-        described = [
-            (part, join.camera, file, join.device)
-            for part, file in zip(parts, join.files, strict=True)
-        ]
+        files = zip(parts, join.files, strict=True)
+        described = [(part, join.camera, file, join.device) for part, file in files]
         keyframes = sum(join.workers.map("describing", describe, described))
     say(f"{len(parts)} parts, {keyframes} keyframes.")
     views = [read_record(PartViews, file).outline() for file in join.files]
@@ -181,7 +170,6 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
             f"No place of one part was recognised in another ({len(links)} single views alike); "
             "parts have to overlap, seen from similar sides."
         )
-    unjoined = [parts[n].name for n in range(len(parts)) if n not in gauge.world]
     say(f"{len(gauge.links)} links join {len(gauge.world)} of {len(parts)} parts.")
     with join.stopwatch("pose graph"):
         placements = placed(views, gauge)
@@ -196,21 +184,27 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         [parts[n].name for n in gauge.parts],
         [results[n].trajectory.timestamps for n in gauge.parts],
     )
-    placed_parts = [
-        JoinedPart(results[n], views[n], placements[n], span)
+    return gauge, {
+        n: JoinedPart(results[n], views[n], placements[n], span)
         for n, span in zip(gauge.parts, spans, strict=True)
-    ]
+    }
+
+
+def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float) -> Joint:
+    gauge, placed_parts = _placed_parts(join, adjust, say)
+    unjoined = [part.name for n, part in enumerate(join.parts) if n not in gauge.world]
+    parts = list(placed_parts.values())
     with join.stopwatch("moving and merging maps"):
-        disks = join.disks(gauge, placements)
+        disks = join.disks(gauge, {n: part.placement for n, part in placed_parts.items()})
     say(f"{len(disks)} disks.")
-    trajectory = write_poses(join.output, placed_parts)
-    write_map(join.output, placed_parts, disks, join.camera, config)
+    trajectory = write_poses(join.output, parts)
+    write_map(join.output, parts, disks, join.camera, join.config)
     with join.stopwatch("mesh"):
-        mesh = join.surface(sum(len(p.views.T_cw) for p in placed_parts), disks)
+        mesh = join.surface(sum(len(part.views.T_cw) for part in parts), disks)
     seconds = join.stopwatch.seconds
-    summary = {
-        **_statistics(list(results.values()), gauge, unjoined, adjust),
-        "videos": [asdict(span) for span in spans],
+    summary: dict[str, Any] = {
+        **_statistics([part.result for part in parts], gauge, unjoined, adjust),
+        "videos": [asdict(part.span) for part in parts],
         "frames": len(trajectory.timestamps),
         "lost_spans": state_spans(trajectory, "lost"),
         "disks": len(disks),
@@ -227,14 +221,13 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     report, renders = join.output / "report", written.keyframes
     write_pictures(report, trajectory, renders)
     write_page(report, trajectory, renders, mesh, summary, written.disks)
-    names = tuple(parts[n].name for n in gauge.parts)
-    return Joint(join.output, names, tuple(unjoined), len(gauge.links), summary)
+    return Joint(join.output, tuple(unjoined), summary["verdict"]["sentence"])
 
 
 def _statistics(
     results: Sequence[SavedResult], gauge: Gauge, unjoined: Sequence[str], adjusted: bool
 ) -> dict[str, Any]:
-    """What a summary says of the parts."""
+    """Part of the summary about the parts."""
     verdicts = [result.summary.get("verdict") for result in results]
     unreliable = [
         result.name for result, verdict in zip(results, verdicts, strict=True)

@@ -1,6 +1,7 @@
 """The disks of a part, moved to the joint world; and those that another part has already."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import torch
@@ -19,6 +20,7 @@ from geogs_fleet.join.part import Part, PartViews, opened
 from geogs_fleet.join.part_graph import Placement
 from geogs_fleet.join.records import read_record
 
+_COLUMNS = [field.name for field in fields(MapSnapshot)]
 _NEAREST = 8
 _WITHIN = 2.0
 """Standard deviations of a disk within which it stands for another in its plane."""
@@ -31,12 +33,10 @@ _ALIKE = 0.8
 @on_one_torch_thread
 def move_disks(
     part: Part, views_file: Path, placement: Placement, after: Path, device: str = "cpu"
-) -> int:
-    """Move every disk of a part with the keyframes that see it in place; their number.
+) -> None:
+    """Move every disk of a part with the keyframes that see it in place, into the file ``after``.
 
-    The moved disks go to the file ``after``.
-
-    The update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
+    This is the update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
     """
     result, views = opened(part, device), read_record(PartViews, views_file)
     similarities = placement.similarities(views.T_cw)
@@ -53,7 +53,6 @@ def move_disks(
     if len(x) > 1:
         S = blended_similarities(x, S, whole, similarities, covisible())
     save_map(after, transformed(result.disks, S), {})
-    return len(x)
 
 
 def overall(views: PartViews, similarities: Float[Tensor, "n 4 4"]) -> Float[Tensor, "4 4"]:
@@ -117,12 +116,10 @@ def _axes(disks: MapSnapshot) -> Float[Tensor, "n 3 3"]:
 
 
 def joined_disks(disks: Sequence[MapSnapshot]) -> MapSnapshot:
-    """All of them."""
-    columns = ("position", "quaternion", "scale", "opacity")
-    return MapSnapshot(*(torch.cat([getattr(d, c) for d in disks]) for c in columns))
+    """The disks of all parts in one map."""
+    return MapSnapshot(*(torch.cat([getattr(d, c) for d in disks]) for c in _COLUMNS))
 
 
 def kept(disks: MapSnapshot, keep: Bool[Tensor, "n"]) -> MapSnapshot:
     """The disks that are marked."""
-    columns = ("position", "quaternion", "scale", "opacity")
-    return MapSnapshot(*(getattr(disks, c)[keep] for c in columns))
+    return MapSnapshot(*(getattr(disks, c)[keep] for c in _COLUMNS))

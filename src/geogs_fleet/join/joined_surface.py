@@ -64,7 +64,7 @@ class SpacePlan:
     volume: VolumePlan
     boxes: tuple[BlockBox, ...]
     views: tuple[tuple[StoredView, ...], ...]
-    """That see each box."""
+    """Views that see each box."""
 
 
 def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers) -> SpacePlan:

@@ -49,7 +49,7 @@ def _moved(S: Float[Tensor, "n 4 4"], T_wc: Float[Tensor, "n 4 4"]) -> Float[Ten
 
 
 def joined_trajectory(parts: list[Trajectory], spans: list[RecordingSpan]) -> Trajectory:
-    """All of them, in the joint time."""
+    """The trajectories one after the other, in the joint time."""
     times = [t.timestamps + span.shift for t, span in zip(parts, spans, strict=True)]
     return Trajectory(
         np.concatenate(times),

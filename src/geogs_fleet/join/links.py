@@ -27,7 +27,7 @@ from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
 from geogs_fleet.join.records import read_record
 
 Candidates = dict[tuple[int, int], list[tuple[int, int]]]
-"""By the numbers of two parts, the earlier first: places of keyframes in the one and the other."""
+"""Places of keyframes in two parts, by the numbers of these, the earlier first."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Link:
     matched: float
     """Fraction of the cells whose flow agrees."""
     relative: RelativePoses
-    """The same with information, between 0 (the first) and 1, in both directions."""
+    """The poses with information, between 0 (the first) and 1, in both directions."""
 
 
 def candidates(parts: Iterable[PartViews], config: LoopConfig) -> Candidates:

@@ -1,4 +1,4 @@
-"""What the keyframes of a part match, among each other and in linked parts, kept in files."""
+"""Matches of a part's keyframes, among each other and with linked parts, kept in files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -62,7 +62,7 @@ class Member:
     T_cw: Float[Tensor, "n 4 4"]
     """Joint world to camera."""
     scale: Float[Tensor, "n"]
-    """By which the part's lengths around each keyframe were divided."""
+    """Divisor of the part's lengths around each keyframe."""
     adjusted: Path | None = None
     """File of its depths; those that its map shows where there is none."""
 
@@ -72,7 +72,7 @@ class Member:
         return [(self.number, place) for place in range(len(self.T_cw))]
 
     def depths(self) -> Depths:
-        """As they are now."""
+        """The depths as they are now."""
         if self.adjusted is not None:
             return read_record(Depths, self.adjusted)
         views, scale = read_record(PartViews, self.views), self.scale.float()[:, None]
@@ -122,7 +122,7 @@ class Matches:
         )
 
     def edges(self, as_found: bool = False) -> dict[Directed, PackedEdge]:
-        """As a graph has them; without the shifts ``as_found``."""
+        """Edges of a graph; without the shifts ``as_found``."""
         found = {}
         for n, (a, i, b, j) in enumerate(self.ends.tolist()):
             position, weight, poses, depth = (
@@ -138,7 +138,7 @@ class Matches:
 
 @dataclass(frozen=True)
 class Matched:
-    """What came of it."""
+    """Result of matching a part."""
 
     ends: Int[np.ndarray, "e 4"]
     """All directed edges."""
@@ -193,10 +193,11 @@ def match(
     errors = _row_errors(grid, members, results, ids)
     shift: dict[Directed, Tensor] = {}
     if errors is not None:
-        measured = {(ids[a], ids[b]): edge for (a, b), edge in found.items()}
-        for part, (off, _) in edge_shifts(errors, segment, measured, lambda id: id):
-            steps = in_steps(grid.camera, off)
-            shift |= {(node[i], node[j]): s for (i, j), s in zip(part, steps, strict=True)}
+        shift = {
+            (node[i], node[j]): steps
+            for pairs, (off, _) in edge_shifts(errors, segment, graph.packed, lambda id: id)
+            for (i, j), steps in zip(pairs, in_steps(grid.camera, off), strict=True)
+        }
     ends = []
     for member, path in zip(members, after, strict=True):
         its = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
@@ -212,7 +213,7 @@ def _row_errors(
     results: Mapping[int, SavedResult],
     ids: Mapping[Node, int],
 ) -> RowErrors | None:
-    """What rectified rows of the keyframes are off by, as the trajectories of their parts tell.
+    """Errors of the rectified rows of the keyframes, by the trajectories of their parts.
 
     None where nothing was rectified. Rows of another camera than the grid's stay as they are.
     """

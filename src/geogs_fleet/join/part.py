@@ -36,7 +36,7 @@ class Part:
 
 @dataclass(frozen=True)
 class PartViews:
-    """What is known of the keyframes of a part, in its own world, on the grid of one camera."""
+    """The keyframes of a part, in its own world, on the grid of one camera."""
 
     T_cw: Float64[np.ndarray, "n 4 4"]
     """World of the part to camera."""
@@ -54,8 +54,7 @@ class PartViews:
         return 1 / np.median(self.inverse_depth, axis=1).astype(np.float64)
 
     def outline(self) -> "PartViews":
-        """The same with one depth a keyframe and no features: so little that all parts fit into one
-        memory."""
+        """One depth a keyframe and no features: so little that all parts fit into one memory."""
         middle = np.median(self.inverse_depth, axis=1, keepdims=True)
         return PartViews(self.T_cw, self.timestamp, middle, 0 * middle, ())
 

@@ -16,7 +16,7 @@ from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.part import PartViews
 
 STEP = 1e-3
-"""What a part's own adjustment leaves open between two keyframes near each other: radians, parts of
+"""Deviation between two keyframes near each other after a part's own adjustment: radians, parts of
 the depth, and of the scale."""
 STEPS = (1, 2, 4)
 """Keyframes so far apart in time are tied to each other."""
@@ -31,7 +31,7 @@ class Placement:
     T_cw: Float[Tensor, "n 4 4"]
     """Joint world to camera, float64."""
     scale: Float[Tensor, "n"]
-    """By which lengths around each keyframe have been divided, from the part's to the joint."""
+    """Divisor of the lengths around each keyframe, from the part's to the joint."""
 
     def similarities(self, T_before: Float[np.ndarray, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
         """From the part's world to the joint one, as each keyframe has it."""
@@ -72,7 +72,7 @@ def _linked(gauge: Gauge, first: Mapping[int, int]) -> list[RelativePoses]:
 
 
 def _stiff(part: PartViews, offset: int) -> RelativePoses:
-    """What a part says of its own keyframes."""
+    """Relative poses of a part's own keyframes."""
     pairs = _pairs(part)
     T = torch.from_numpy(part.T_cw)
     source, target = pairs.unbind(1)

@@ -1,4 +1,4 @@
-"""What jobs of a join leave for each other in files: records of arrays, as in checkpoints."""
+"""Records of arrays in files that jobs of a join leave for each other, as in checkpoints."""
 
 import json
 from pathlib import Path

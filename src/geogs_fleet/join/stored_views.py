@@ -28,7 +28,7 @@ class StoredView:
     T_cw: Float64[np.ndarray, "4 4"]
 
     def load(self, with_image: bool = False) -> DepthMapView:
-        """What is in the file; with the image only where it is wanted."""
+        """The depth map in the file; with the image only where it is wanted."""
         with open_file(self.file) as stored, np.load(stored, allow_pickle=False) as file:
             depth, weight = torch.from_numpy(file["depth"]), torch.from_numpy(file["weight"])
         image = read_image(self.image) if with_image else None

@@ -9,8 +9,8 @@ import torch
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mesh.extract import extract_mesh, plan_volume
-from geogs.mesh.triangle_mesh import DepthMapView
+from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
 from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
@@ -125,12 +125,18 @@ def ball_before_a_hall(count: int = 12) -> list[DepthMapView]:
     return views
 
 
-def test_what_is_near_keeps_its_shape_before_a_far_background():
+@pytest.fixture(scope="module")
+def whole() -> tuple[VolumePlan, Mesh]:
+    """The ball before the hall, with all of its triangles."""
     views, config = ball_before_a_hall(), MeshConfig(triangle_budget=300_000, detail=0)
-    plan = plan_volume(views, config)
+    return plan_volume(views, config), extract_mesh(views, config)
+
+
+def test_what_is_near_keeps_its_shape_before_a_far_background(whole):
+    plan, mesh = whole
     assert plan.contraction.centre == pytest.approx((0, 0, 0), abs=1e-9)
     assert plan.voxel < BALL / 10
-    distance = np.linalg.norm(extract_mesh(views, config).vertices.astype(np.float64), axis=1)
+    distance = np.linalg.norm(mesh.vertices.astype(np.float64), axis=1)
     near, far = distance[distance < 1], distance[distance > 0.8 * HALL]
     assert len(near) + len(far) == len(distance)
     assert len(near) > 1000
@@ -140,11 +146,10 @@ def test_what_is_near_keeps_its_shape_before_a_far_background():
     assert np.abs(far / HALL - 1).mean() < 0.01  # a voxel there is 17
 
 
-def test_merged_triangles_stay_where_the_surface_is():
-    views, config = ball_before_a_hall(), MeshConfig(triangle_budget=300_000)
-    whole, plan = MeshConfig(triangle_budget=300_000, detail=0), plan_volume(views, config)
-    mesh = extract_mesh(views, config)
-    assert len(mesh.faces) < 0.7 * len(extract_mesh(views, whole).faces)
+def test_merged_triangles_stay_where_the_surface_is(whole):
+    plan, all_triangles = whole
+    mesh = extract_mesh(ball_before_a_hall(), MeshConfig(triangle_budget=300_000))
+    assert len(mesh.faces) < 0.7 * len(all_triangles.faces)
     distance = np.linalg.norm(mesh.vertices.astype(np.float64), axis=1)
     assert np.abs(distance[distance < 1] - BALL).max() < 2 * plan.voxel
     outwards = (mesh.normals * mesh.vertices).sum(1) / distance

@@ -14,7 +14,7 @@ _SOURCE = Path(__file__).parent / "cuda" / "collapse.cu"
 _THREADS = 128
 _SPAN = 16384
 """Vertices or faces that a thread of the CPU takes at a time."""
-_SHARE = 0.8
+_CHEAPEST = 0.8
 """Part of the edges that may be collapsed next, the cheapest."""
 _SAMPLES = 20_000
 _MOST_ROUNDS = 300
@@ -102,7 +102,7 @@ class CollapsingMesh:
         """The cost of the dearest edge that may be collapsed now."""
         some = self._cost[:: 1 + len(self._cost) // _SAMPLES].sort().values
         finite = torch.isfinite(some).sum()
-        place = (finite * _SHARE).long().clamp(max=len(some) - 1)
+        place = (finite * _CHEAPEST).long().clamp(max=len(some) - 1)
         return some.index_select(0, place[None]).clamp(max=torch.finfo(torch.float32).max)
 
     def _squeeze(self) -> None:

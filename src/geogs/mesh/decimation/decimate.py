@@ -9,10 +9,9 @@ from torch import Tensor
 
 from geogs.mesh.clean import remove_degenerate_faces
 from geogs.mesh.decimation.collapse import CollapsingMesh
-from geogs.mesh.decimation.deviation import deviations
-from geogs.mesh.decimation.device_deviation import surface_distances
+from geogs.mesh.decimation.deviation import device_deviations, host_deviations
 from geogs.mesh.denoise import denoised
-from geogs.mesh.triangle_mesh import Mesh, vertex_normals
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import worker_count
 
 QUANTILE = 0.99
@@ -76,14 +75,14 @@ def merged(
 
 
 def _deviation(mesh: CollapsingMesh, before: Float[Tensor, "n 3"]) -> Float[np.ndarray, "2"]:
-    """How far vertices before are off a mesh: nearly all of them, and on average."""
+    """Distance to a mesh of the vertices before: that of nearly all of them, and the mean."""
     step = 1 + len(before) // _SAMPLES
     samples, became = before[::step], mesh.became[::step].clamp(min=0)
     arrays = samples, mesh.position.float(), mesh.faces, became
     if samples.device.type == "cpu":
-        away = deviations(*(array.numpy() for array in arrays))
+        away = host_deviations(*(array.numpy() for array in arrays))
     else:
-        away = surface_distances(*arrays).cpu().numpy()
+        away = device_deviations(*arrays).cpu().numpy()
     return np.array([np.quantile(away, QUANTILE), away.mean()])
 
 
@@ -95,7 +94,7 @@ def with_at_most(mesh: Mesh, faces: int) -> Mesh:
     fewer = _simplified(mesh.vertices, mesh.faces, faces / len(mesh.faces))
     if len(fewer[1]) > faces:  # of a mesh in scraps most is border
         fewer = _simplified(*fewer, faces / len(fewer[1]), keep_borders=False)
-    return remove_degenerate_faces(_dressed(mesh, *fewer))
+    return remove_degenerate_faces(_with_colours_of(mesh, *fewer))
 
 
 def _simplified(
@@ -114,7 +113,9 @@ def _simplified(
     return vertices.astype(np.float32), faces.astype(np.int32)
 
 
-def _dressed(mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Mesh:
+def _with_colours_of(
+    mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+) -> Mesh:
     """The vertices and faces with the colours of the mesh that they were made from.
 
     Normals are their own: those of the mesh before, averaged, are noisier (of two rendered rooms
@@ -122,17 +123,13 @@ def _dressed(mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarr
     """
     from scipy.spatial import cKDTree
 
+    made = Mesh.from_triangles(vertices, faces)
+    if mesh.colours is None:
+        return made
     _, nearest = cKDTree(vertices).query(mesh.vertices, workers=worker_count())
     count = np.bincount(nearest, minlength=len(vertices))
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        total = [np.bincount(nearest, column, len(vertices)) for column in values.T]
-        return np.stack(total, -1) / np.maximum(count, 1)[:, None]
-
-    colours = None
-    if mesh.colours is not None:
-        colours = mean(mesh.colours.astype(np.float64))
-        _, closest = cKDTree(mesh.vertices).query(vertices[count == 0])
-        colours[count == 0] = mesh.colours[closest]
-        colours = (colours + 0.5).astype(np.uint8)
-    return Mesh(vertices, faces, vertex_normals(vertices, faces), colours)
+    total = [np.bincount(nearest, channel, len(vertices)) for channel in mesh.colours.T]
+    colours = np.stack(total, -1) / np.maximum(count, 1)[:, None]
+    _, closest = cKDTree(mesh.vertices).query(vertices[count == 0])
+    colours[count == 0] = mesh.colours[closest]
+    return replace(made, colours=(colours + 0.5).astype(np.uint8))

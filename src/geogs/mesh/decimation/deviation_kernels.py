@@ -7,24 +7,6 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def faces_around(count, faces):
-    """Where the faces of each of ``count`` vertices begin in the list of them, and that list."""
-    first = np.zeros(count + 2, np.int64)
-    for face in range(len(faces)):
-        for corner in range(3):
-            first[faces[face, corner] + 2] += 1
-    first = np.cumsum(first)
-    around = np.empty(3 * len(faces), np.int64)
-    # While the list is written a vertex's next place stands where its end will be.
-    for face in range(len(faces)):
-        for corner in range(3):
-            vertex = faces[face, corner] + 1
-            around[first[vertex]] = face
-            first[vertex] += 1
-    return first[:-1], around
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def triangle_distance(point, triangle):
     """Distance of a point to a triangle (its corners in rows).
 

@@ -48,7 +48,7 @@ def draw_atlas(
     Raises:
         InputError: the atlas has no room for them.
     """
-    across = int(np.ceil(np.sqrt(len(swatches))))
+    across = max(1, int(np.ceil(np.sqrt(len(swatches)))))
     sizes = patches.box[:, 2:] - patches.box[:, :2] + 1
     plain = np.array([[SWATCH * across, SWATCH * across]], np.int64)[: len(swatches)]
     together = np.concatenate([sizes, plain])
@@ -62,16 +62,11 @@ def draw_atlas(
         w, h = scaled[number]
         drawn = _patch(patches, number, views, gains, corrections, local, (int(w), int(h)))
         image[y : y + h, x : x + w] = drawn
-    corner = places[: len(sizes)][own] + local if len(own) else np.zeros((0, 2))
-    index = np.arange(len(swatches))
-    middle = np.zeros((0, 2))
-    if len(swatches):
-        row, column = np.divmod(index, across)
-        at = places[-1] + SWATCH * np.stack([column, row], -1)
-        for (x, y), colour in zip(at.tolist(), swatches, strict=True):
-            image[y : y + SWATCH, x : x + SWATCH] = colour
-        middle = at + (SWATCH - 1) / 2
-    return Atlas(image, corner, middle)
+    row, column = np.divmod(np.arange(len(swatches)), across)
+    at = places[-1] + SWATCH * np.stack([column, row], -1)
+    for (x, y), colour in zip(at.tolist(), swatches, strict=True):
+        image[y : y + SWATCH, x : x + SWATCH] = colour
+    return Atlas(image, places[own] + local, at + (SWATCH - 1) / 2)
 
 
 def _patch(

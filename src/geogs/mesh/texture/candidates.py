@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
-from geogs.mesh.triangle_mesh import DepthMapView, Mesh, cross
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
-MOST = 8
+MAX_VIEWS = 8
 """Views of a face that are kept, those that show it best."""
 LEAST_COSINE = 0.1
 """Cosine between a face's normal and the ray to a view that shows it, at least."""
@@ -17,14 +17,14 @@ DEPTH_SLACK = 0.02
 """Part of the depth by which a face may lie off a depth map that shows it."""
 MARGIN = 1.5
 """Pixels from the border of an image within which nothing is taken."""
-PARTLY = 0.05
-"""What a face counts of which one corner is hidden, beside one that is seen."""
+HIDDEN_CORNER_WEIGHT = 0.05
+"""Weight of a face of which one corner is hidden."""
 _SHARP_POWER = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Up to ``MOST`` views of each face, the best ones in no order; -1 where there are no more."""
+    """The best views of each face, up to ``MAX_VIEWS``, in no order; -1 where there are no more."""
 
     view: Int32[np.ndarray, "m k"]
     score: Float32[np.ndarray, "m k"]
@@ -33,11 +33,7 @@ class Candidates:
     """Mean of the image over about the face, 0 to 255."""
 
 
-def find_candidates(
-    mesh: Mesh,
-    views: Sequence[DepthMapView],
-    tolerance: float,
-) -> Candidates:
+def find_candidates(mesh: Mesh, views: Sequence[DepthMapView], tolerance: float) -> Candidates:
     """Views that show each face: near ones from the front first, sharp ones before blurred ones.
 
     A view shows a face whose corners project into its image, whose middle lies on its depth map
@@ -46,9 +42,9 @@ def find_candidates(
     """
     count = len(mesh.faces)
     best = Candidates(
-        np.full((count, MOST), -1, np.int32),
-        np.zeros((count, MOST), np.float32),
-        np.zeros((count, MOST, 3), np.float32),
+        np.full((count, MAX_VIEWS), -1, np.int32),
+        np.zeros((count, MAX_VIEWS), np.float32),
+        np.zeros((count, MAX_VIEWS, 3), np.float32),
     )
     sharpness = _sharpness(views)
     for number, view in enumerate(views):
@@ -85,7 +81,7 @@ def _seen_faces(
     faces = np.flatnonzero(inside[mesh.faces].all(1))
     corners = mesh.vertices[mesh.faces[faces]].astype(np.float64)
     middle = corners.mean(1)
-    normal = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     T_cw = view.T_cw.cpu().numpy()
     ray = middle - (-T_cw[:3, :3].T @ T_cw[:3, 3])
     length = np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1)
@@ -101,8 +97,15 @@ def _seen_faces(
     p = pixels[mesh.faces[faces]]
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    area = np.where(corners_seen == 3, area, PARTLY * area)
+    area = np.where(corners_seen == 3, area, HIDDEN_CORNER_WEIGHT * area)
     return faces, area, _sampled(cv2.GaussianBlur(image, (0, 0), 1.5), at)
+
+
+def _cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Cross products of the rows, several times faster than NumPy's for long arrays."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
 
 
 def _on_depth(

@@ -68,7 +68,7 @@ def seam_corrections(
     edges: Int64[np.ndarray, "e 2"],
     colour: Float32[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """What to add at each corner of a patch so that patches agree at the vertices they fraction.
+    """What to add at each corner of a patch so that patches agree at the vertices they share.
 
     Smooth within each patch (Lempitsky & Ivanov 2007): minimises the squared differences between
     corrected colours of corners at the same vertex, and those of corrections along edges.

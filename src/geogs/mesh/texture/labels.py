@@ -10,8 +10,8 @@ from jaxtyping import Float32, Int, Int32, Int64
 from geogs.mesh.texture.candidates import Candidates
 
 SMOOTHNESS = 0.35
-"""What a neighbour with another view costs, beside 1 - score / best score."""
-ODD_COLOUR = 40.0
+"""Cost of a neighbour with another view, beside 1 - score / best score."""
+MAX_COLOUR_DISTANCE = 40.0
 """Distance of a view's colour from the median of a face's views that makes it an odd one out."""
 _ROUNDS = 12
 
@@ -25,7 +25,7 @@ def face_neighbours(faces: Int[np.ndarray, "m 3"]) -> Int64[np.ndarray, "k 2"]:
     return np.stack([owner[order[:-1]][same], owner[order[1:]][same]], -1).astype(np.int64)
 
 
-def without_odd_colours(
+def without_colour_outliers(
     candidates: Candidates, gains: Float32[np.ndarray, "v 3"]
 ) -> Float32[np.ndarray, "m k"]:
     """Scores, zero for views that show another colour than most do: something stands before them.
@@ -40,7 +40,7 @@ def without_odd_colours(
     median[enough] = np.nanmedian(masked[enough], axis=1)
     distance = np.linalg.norm(colour - median[:, None], axis=-1)
     kept = candidates.score.copy()
-    kept[enough] *= distance[enough] <= ODD_COLOUR
+    kept[enough] *= distance[enough] <= MAX_COLOUR_DISTANCE
     any_left = np.any(kept > 0, axis=1, keepdims=True)
     return np.where(any_left, kept, candidates.score).astype(np.float32)
 

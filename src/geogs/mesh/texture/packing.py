@@ -40,7 +40,7 @@ def pack(
 
 
 def scale_that_fits(
-    sizes: Int64[np.ndarray, "n 2"], limit: int, fixed: int = 0
+    sizes: Int64[np.ndarray, "n 2"], limit: int, fixed: int
 ) -> tuple[Int64[np.ndarray, "n 2"], Int64[np.ndarray, "n 2"], tuple[int, int]]:
     """Sizes scaled alike, at most by 1, so that they fit; their places; the size of the atlas.
 

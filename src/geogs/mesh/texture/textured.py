@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from geogs.errors import InputError
-from geogs.mesh.texture.atlas import draw_atlas
+from geogs.mesh.texture.atlas import Atlas, draw_atlas
 from geogs.mesh.texture.candidates import find_candidates
 from geogs.mesh.texture.exposure import seam_corrections, view_gains
-from geogs.mesh.texture.labels import choose_views, face_neighbours, without_odd_colours
+from geogs.mesh.texture.labels import choose_views, face_neighbours, without_colour_outliers
 from geogs.mesh.texture.patches import Patches, cut_patches
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
@@ -37,10 +37,7 @@ class TexturedMesh:
 
 
 def texture_mesh(
-    mesh: Mesh,
-    views: Sequence[DepthMapView],
-    tolerance: float,
-    limit: int = 4096,
+    mesh: Mesh, views: Sequence[DepthMapView], tolerance: float, limit: int = 4096
 ) -> TexturedMesh:
     """Give a mesh an image, put together from those of the views.
 
@@ -64,7 +61,7 @@ def texture_mesh(
         raise InputError("No image shows any of the mesh, so there is no texture for it.")
     gains = view_gains(candidates, len(views))
     neighbours = face_neighbours(mesh.faces)
-    score = without_odd_colours(candidates, gains)
+    score = without_colour_outliers(candidates, gains)
     label = choose_views(candidates, score, neighbours)
     images = {int(v): views[int(v)] for v in np.unique(label[label >= 0])}
     patches = cut_patches(mesh, images, label, neighbours)
@@ -72,7 +69,7 @@ def texture_mesh(
     corrections = seam_corrections(patches.corner_vertex, patches.edges(), colour)
     plain, swatches, swatch_of = _plain_colours(mesh, label)
     atlas = draw_atlas(patches, images, gains, corrections, swatches, limit)
-    return _assembled(mesh, patches, plain, swatch_of, atlas.corner, atlas.swatch, atlas.image)
+    return _assembled(mesh, patches, plain, swatch_of, atlas)
 
 
 def _corner_colours(
@@ -108,13 +105,7 @@ def _plain_colours(
 
 
 def _assembled(
-    mesh: Mesh,
-    patches: Patches,
-    plain: np.ndarray,
-    swatch_of: np.ndarray,
-    corner: np.ndarray,
-    swatch: np.ndarray,
-    image: np.ndarray,
+    mesh: Mesh, patches: Patches, plain: np.ndarray, swatch_of: np.ndarray, atlas: Atlas
 ) -> TexturedMesh:
     """Corners of the patches, then those of the plain faces, which share none."""
     count = len(patches.corner_vertex)
@@ -122,8 +113,8 @@ def _assembled(
     faces[patches.faces] = patches.corners
     faces[plain] = count + np.arange(3 * len(plain)).reshape(-1, 3)
     vertex = np.concatenate([patches.corner_vertex, mesh.faces[plain].ravel()])
-    place = np.concatenate([corner, np.repeat(swatch[swatch_of], 3, axis=0).reshape(-1, 2)])
+    uv = np.concatenate([atlas.corner, np.repeat(atlas.swatch[swatch_of], 3, axis=0)])
     seen = len(patches.faces) / len(mesh.faces)
     return TexturedMesh(
-        mesh.vertices[vertex], faces, mesh.normals[vertex], place.astype(np.float32), image, seen
+        mesh.vertices[vertex], faces, mesh.normals[vertex], uv.astype(np.float32), atlas.image, seen
     )

@@ -11,12 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.mesh.triangle_mesh import DepthMapView
-from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
+from geogs.mesh.volume.contraction import Contraction
 from geogs.mesh.volume.pixel_planes import PixelPlanes
-from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, followed, pack, unpack
+from geogs.mesh.volume.tsdf import HALF, LIMIT, band_blocks, footprint_points, pack, unpack
 
 COARSER = 1.1
-"""Times larger are the voxels that are tried next."""
+"""Growth of the voxels from one trial to the next."""
 _CELLS_PER_BLOCK = 3
 """Half blocks with surface for each block that fits, from which on larger voxels are certain."""
 
@@ -27,7 +27,7 @@ def fitting_voxel(
     truncation: float,
     max_depth: float,
     most: int,
-    contraction: Contraction = UNCONTRACTED,
+    contraction: Contraction,
 ) -> tuple[float, int]:
     """The voxel, or the least one larger by steps of ``COARSER``, of which ``most`` blocks hold
     the surface of all views with its band, and how many do.
@@ -48,7 +48,7 @@ def fitting_voxel(
 def fitting(
     points: Float[Tensor, "n 3"], voxel: float, truncation: float, most: int
 ) -> tuple[float, int]:
-    """As :func:`fitting_voxel`, of a surface that some points of contracted space tell of."""
+    """:func:`fitting_voxel` of a surface that some points of contracted space sample."""
     while (blocks := len(band_blocks(points, voxel, truncation))) > most:
         voxel *= COARSER
     return voxel, blocks
@@ -61,7 +61,7 @@ def _surface(
     valid = view.valid() & (view.depth <= max_depth)
     T_cw = view.T_cw.to(view.depth.device, torch.float64)
     planes = PixelPlanes.of(view.depth.float(), valid, view.camera).grown(T_cw, contraction)
-    return followed(planes, T_cw, voxel, contraction)
+    return footprint_points(planes, T_cw, voxel, contraction)
 
 
 def _cells(points: Float[Tensor, "n 3"], voxel: float) -> Int[Tensor, "n"]:

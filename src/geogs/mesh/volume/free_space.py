@@ -79,8 +79,8 @@ class FreeSpace:
 def _nearest(
     points: Float[np.ndarray, "n 3"], size: float
 ) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """Of the voxel nearest to each point: its block, held to what can be packed, its place in its
-    own block, and whether a volume reaches so far."""
+    """Block of the voxel nearest to each point, clipped to what can be packed, the voxel's place in
+    the block, and whether a volume reaches so far."""
     voxel, limit = np.rint(points / size).astype(np.int64), LIMIT // BLOCK
     block = np.floor_divide(voxel, BLOCK)
     is_within = np.asarray((np.abs(voxel) < LIMIT).all(axis=1))

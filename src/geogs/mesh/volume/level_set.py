@@ -31,7 +31,7 @@ class SurfacePart:
     faces: Int[np.ndarray, "m 3"]
 
 
-def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> TensorMesh:
+def extract_surface(tsdf: SparseTsdf, min_weight: float) -> TensorMesh:
     """Triangles of the zero level, in the world frame of ``tsdf``.
 
     Only cells whose eight voxels have at least ``min_weight`` give triangles: the far side of the
@@ -44,21 +44,19 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> TensorMesh:
     return stitched(surface_parts(tsdf, min_weight), tsdf.voxel)
 
 
-def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
+def surface_parts(tsdf: SparseTsdf, min_weight: float) -> Iterator[SurfacePart]:
     """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
 
     def part(place: tuple[Tensor, Tensor]) -> SurfacePart | None:
         chunk = _voxel_chunk(tsdf, min_weight, *place)
-        return None if chunk is None else _part(chunk)
+        if chunk is None:
+            return None
+        vertices, axis, triangles = march(chunk.distance, chunk.cell)
+        keys = _edge_keys(np.floor(vertices).astype(np.int64) + chunk.origin, axis)
+        return SurfacePart(chunk.chunk, keys, vertices + chunk.origin, triangles)
 
     parts = ordered_map(part, _chunks(tsdf), worker_count())
     return (part for part in parts if part is not None and len(part.faces))
-
-
-def _part(chunk: "_VoxelChunk") -> SurfacePart:
-    vertices, axis, triangles = march(chunk.distance, chunk.cell)
-    keys = _edge_keys(np.floor(vertices).astype(np.int64) + chunk.origin, axis)
-    return SurfacePart(chunk.chunk, keys, vertices + chunk.origin, triangles)
 
 
 def stitched(parts: Iterable[SurfacePart], voxel: float) -> TensorMesh:

@@ -1,4 +1,4 @@
-"""What each pixel of a depth map says of the surface there: a small plane, its footprint.
+"""The small plane that each pixel of a depth map shows, and its footprint.
 
 On a surface seen at a slant a footprint is longer than a voxel, and a distance along the ray is
 many times that from the surface. Both follow from how inverse depth goes on around a pixel.
@@ -33,12 +33,12 @@ class PixelPlanes:
     inverse: Float[Tensor, "h w"]
     """Inverse depth; 1 where there is none."""
     right: Float[Tensor, "h w"]
-    """Its slope along u, per pixel; it reaches across no jump."""
+    """Slope of inverse depth along u, per pixel; it reaches across no jump."""
     down: Float[Tensor, "h w"]
-    """The same along v."""
+    """Slope along v."""
     slant: tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]
-    """Of both slopes the middle one of three pixels in a row: a single pixel between two surfaces
-    has a slope, but none that its neighbours have."""
+    """Median of three pixels in a row of both slopes: a single pixel between two surfaces has a
+    slope, but none that its neighbours have."""
     valid: Bool[Tensor, "h w"]
     """Where there is a depth."""
     camera: Camera
@@ -49,7 +49,7 @@ class PixelPlanes:
     def of(
         depth: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"], camera: Camera
     ) -> "PixelPlanes":
-        """Of depths in map units."""
+        """Planes of depths in map units."""
         inverse = torch.where(valid, 1.0 / torch.where(valid, depth, 1.0), 1.0)
         right, down = minmod_slopes(inverse, valid)
         slant = _middle_of_three(right), _middle_of_three(down.mT).mT
@@ -61,7 +61,7 @@ class PixelPlanes:
         return torch.stack([self.inverse, self.right, self.down, weight], -1).flatten(0, 1)
 
     def grown(self, T_cw: Float[Tensor, "4 4"], contraction: Contraction) -> "PixelPlanes":
-        """In a world whose voxels grow, seen from a pose."""
+        """The planes seen from a pose, in a world whose voxels grow with the contraction."""
         if not contraction:
             return self
         rays = self.camera.rays(torch.float64, self.inverse.device)

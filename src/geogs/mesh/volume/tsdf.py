@@ -84,10 +84,10 @@ def blocks_seen(
     contraction: Contraction,
 ) -> Int[Tensor, "k 3"]:
     """Coordinates of the blocks in which the surface of a depth map lies, with its band."""
-    return band_blocks(followed(planes, T_cw, voxel, contraction), voxel, truncation)
+    return band_blocks(footprint_points(planes, T_cw, voxel, contraction), voxel, truncation)
 
 
-def followed(
+def footprint_points(
     planes: PixelPlanes, T_cw: Float[Tensor, "4 4"], voxel: float, contraction: Contraction
 ) -> Float[Tensor, "n 3"]:
     """Points of contracted space along the footprints of the pixels of a depth map, half a block
@@ -171,12 +171,12 @@ class SparseTsdf:
         """Sums of observation weights."""
         return self._weight[: len(self)].unflatten(1, (BLOCK, BLOCK, BLOCK))
 
-    def owns(self, block: Int[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Whether blocks lie in the box; all do where there is none."""
+    def owns(self, block: Int[Tensor, "*b 3"], layers: int = 0) -> Bool[Tensor, "*b"]:
+        """Whether blocks lie in the box or so many layers above it; all do where there is none."""
         if self.box is None:
             return torch.ones(block.shape[:-1], dtype=torch.bool, device=block.device)
         low, high = (block.new_tensor(side) for side in (self.box.low, self.box.high))
-        return ((block >= low) & (block < high)).all(-1)
+        return ((block >= low) & (block < high + layers)).all(-1)
 
     def slots_of(self, blocks: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
         """Places of blocks in :attr:`coordinates`, -1 where the volume has none."""
@@ -211,7 +211,7 @@ class SparseTsdf:
         T_cw = T_cw.to(self.device, torch.float64)
         planes = PixelPlanes.of(depth, valid, camera).grown(T_cw, self.contraction)
         seen = blocks_seen(planes, T_cw, self.voxel, self.truncation, self.contraction)
-        self._allocate(self._kept(seen))
+        self._allocate(seen[self.owns(seen, layers=1)])
         if not len(self):
             return
         table, truncation = planes.table(weight), planes.truncation(self.truncation * self.voxel)
@@ -230,7 +230,7 @@ class SparseTsdf:
         T_cw: Float[Tensor, "4 4"],
         far: Float[Tensor, ""],
     ) -> None:
-        """What a GPU does in place of :meth:`_update`: all blocks in view at once.
+        """:meth:`_update` on a GPU, of all blocks in view at once.
 
         Nothing changes beyond the depth ``far``, which stays on the device.
         """
@@ -240,13 +240,6 @@ class SparseTsdf:
             truncation, T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
             self.voxel, *self.contraction.centre, self.contraction.radius,
         )  # fmt: skip
-
-    def _kept(self, blocks: Int[Tensor, "k 3"]) -> Int[Tensor, "l 3"]:
-        """Those in the box and in the layer above it."""
-        if self.box is None:
-            return blocks
-        low, high = (blocks.new_tensor(side) for side in (self.box.low, self.box.high))
-        return blocks[((blocks >= low) & (blocks <= high)).all(-1)]
 
     def _allocate(self, blocks: Int[Tensor, "k 3"]) -> None:
         keys = pack(blocks)

@@ -14,11 +14,11 @@ from geogs_photos.incremental_mapping import (
     world_to_camera,
 )
 
-OUTLYING = 3.0
-"""Times the median deviation: where all are unsure, that is for the verdict to say."""
+OUTLIER_RATIO = 3.0
+"""Deviation over the median one: where all are unsure, that is for the verdict to say."""
 
 
-def of_known_places(model: Any, is_known: bool) -> Any:
+def with_known_positions(model: Any, is_known: bool) -> Any:
     """A reconstruction whose frames' places its matches tell; the others lose their poses.
 
     What sees little but far things, or the rest of the world along one direction alone, lies
@@ -32,10 +32,9 @@ def of_known_places(model: Any, is_known: bool) -> Any:
     """
     while len(images := placed_images(model)) > LEAST_IMAGES:
         T_cw = np.stack([world_to_camera(image) for image in images])
-        error = float(model.compute_mean_reprojection_error())
-        deviation, _ = pose_deviations(model, images, T_cw, error, is_known)
+        deviation, _ = pose_deviations(model, images, T_cw, is_known)
         allowed = MAX_POSITION_DEVIATION * extent_of(np.linalg.inv(T_cw))
-        unknown = deviation > max(allowed, OUTLYING * float(np.median(deviation)))
+        unknown = deviation > max(allowed, OUTLIER_RATIO * float(np.median(deviation)))
         if not unknown.any():
             break
         model = without_poses(model, [images[k].image_id for k in np.flatnonzero(unknown)])

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from geogs_photos import known_places
-from geogs_photos.known_places import of_known_places
+from geogs_photos import known_positions
+from geogs_photos.known_positions import with_known_positions
 
 
 def model_of(places: np.ndarray) -> Any:
@@ -27,8 +27,7 @@ def model_of(places: np.ndarray) -> Any:
 
     images |= {n: frame(n, place) for n, place in enumerate(places)}
     return SimpleNamespace(
-        images=images, deregister_frame=deregister_frame, tear_down=lambda: None,
-        compute_mean_reprojection_error=lambda: 0.4,
+        images=images, deregister_frame=deregister_frame, tear_down=lambda: None
     )  # fmt: skip
 
 
@@ -36,13 +35,13 @@ def kept(monkeypatch: pytest.MonkeyPatch, places: np.ndarray, own: Sequence[floa
     """Frames that keep their place, each being known to what is its own and to a hundredth of the
     extent of all that are there, as one that lies far off takes part in what is aligned."""
 
-    def deviations(model, images, T_cw, error, is_known):
-        extent = known_places.extent_of(np.linalg.inv(T_cw))
+    def deviations(model, images, T_cw, is_known):
+        extent = known_positions.extent_of(np.linalg.inv(T_cw))
         known = np.hypot(np.array(own)[[image.image_id for image in images]], 0.01 * extent)
         return known, np.zeros(len(images))
 
-    monkeypatch.setattr(known_places, "pose_deviations", deviations)
-    model = of_known_places(model_of(places), is_known=False)
+    monkeypatch.setattr(known_positions, "pose_deviations", deviations)
+    model = with_known_positions(model_of(places), is_known=False)
     return [n for n, image in model.images.items() if image.has_pose]
 
 

@@ -40,7 +40,7 @@ def device_surface(tsdf: SparseTsdf, min_weight: float) -> TensorMesh:
 
 
 def _blocks_above(tsdf: SparseTsdf) -> Int[Tensor, "k 8"]:
-    """Of each block, where those are whose lowest corner is one of its own; -1 where none is."""
+    """Slots of the blocks that begin at the eight corners of each block; -1 where there is none."""
     steps = torch.from_numpy(CORNERS).to(tsdf.device)
     return tsdf.slots_of(tsdf.coordinates[:, None] + steps)
 

@@ -12,7 +12,7 @@ from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.types import Frame
-from geogs_photos import only_turns
+from geogs_photos import pure_rotation
 from geogs_photos.verified_matches import PairMatches
 from geogs_photos.video import place_frames
 
@@ -54,9 +54,9 @@ def test_a_turn_alone_is_told_from_one_at_arms_length(arm, times, seed, monkeypa
         monkeypatch.setattr(
             PairMatches, "epipolar", lambda p: np.abs(lines.normal(0, 0.2, len(p.rays[0])))
         )
-    monkeypatch.setattr(only_turns, "verified_matches", lambda *_: iter(pairs))
+    monkeypatch.setattr(pure_rotation, "verified_matches", lambda *_: iter(pairs))
     model = SimpleNamespace(images={}, compute_mean_reprojection_error=lambda: 0.3)
-    assert only_turns.only_turns(model, Path("database")) is (arm == 0.0)
+    assert pure_rotation.only_rotates(model, Path("database")) is (arm == 0.0)
 
 
 @pytest.mark.system

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from scipy.optimize import minimize_scalar
 
 from geogs.tracking.matching.two_view_rotation import gric
-from geogs_photos.contradictions import turn_alone
+from geogs_photos.contradictions import best_rotation
 from geogs_photos.incremental_mapping import placed_images
 from geogs_photos.verified_matches import MAX_ERROR, PairMatches, verified_matches
 
@@ -28,7 +28,7 @@ _FOCAL, _STEP = 0.3, 0.01
 """Logarithms: most by which the focal length may be wrong, and how finely it is looked for."""
 
 
-def only_turns(model: Any, database: Path) -> bool:
+def only_rotates(model: Any, database: Path) -> bool:
     """Whether a turn alone explains the matches of nearly all pairs of a reconstruction's pictures.
 
     One focal length serves all pairs: that at which turns leave matches least far off. Which model
@@ -57,4 +57,4 @@ def _off(pair: PairMatches, longer: float) -> Float64[np.ndarray, "n"]:
     so much longer."""
     times = float(np.exp(longer))
     one, two = (rays / [times, times, 1.0] for rays in pair.rays)
-    return times * pair.focal * turn_alone(one, two)[1]
+    return times * pair.focal * best_rotation(one, two)[1]
