@@ -177,6 +177,8 @@ def test_what_no_camera_explained_is_known_when_all_matches_found_a_lens():
         after = before.with_lens(FoundLens(-0.1, 0.02, 0.01, 0.01, 0.9, 0.05))
         assert after.refinement.failure is None
         assert before.refinement.is_explained == after.refinement.is_explained == is_explained
+        moving = before.with_lens(FoundLens(0.0, 0.0, 0.01, 0.01, 0.9, 0.05, varies_centre=0.01))
+        assert moving.refinement.is_explained
 
 
 def test_a_focal_length_is_as_unsure_as_who_said_it():

@@ -118,7 +118,7 @@ def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 4)
 
 
-@pytest.mark.parametrize(("focal", "centre"), [(0.02, 0.0), (0.0, 0.012)])
+@pytest.mark.parametrize(("focal", "centre"), [(0.02, 0.0), (0.0, 0.012), (0.02, 0.012)])
 def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypatch, focal, centre):
     sizes = sizes_of(focal, centre)
     tracker, truth = tracker_of(sizes)
@@ -137,8 +137,8 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     want = sizes[:, list(OWN)]
     found, want = found - found.mean(0), want - want.mean(0)
     assert float((found - want).square().mean().sqrt()) < 0.45 * float(want.square().mean().sqrt())
-    assert lens.varies_focal == pytest.approx(focal / 2**0.5, rel=0.3, abs=2e-3)
-    assert lens.varies_centre == pytest.approx(centre, rel=0.3, abs=2e-3)
+    assert lens.varies_focal == pytest.approx(focal / 2**0.5, rel=0.3)
+    assert lens.varies_centre == pytest.approx(centre, rel=0.3)  # what stays has nothing of its own
     view = StraightView(CAMERA, lens).of_frame(own[7])
     assert np.array_equal(tracker.keyframes[7].image, view.image(image_of(7)))
     shown = SceneMask().of(tracker.keyframes[7])

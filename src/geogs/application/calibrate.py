@@ -151,12 +151,11 @@ def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> 
     if found.is_off_centre:
         deviation = found.deviation_centre * after.fx
         focal += f"principal point {after.cx:.1f}, {after.cy:.1f} +- {deviation:.1f}, "
-    if found.varies:
-        focal += (
-            f"from image to image the focal length varies by {found.varies_focal:.2%} and the "
-            f"principal point by {found.varies_centre * after.fx:.1f} pixels (focusing, "
-            "stabilisation, or a zoom), "
-        )
+    if found.varies_focal > 0:
+        focal += f"fx varies from image to image by {found.varies_focal:.2%} (focusing or a zoom), "
+    if found.varies_centre > 0:
+        pixels = found.varies_centre * after.fx
+        focal += f"the principal point from image to image by {pixels:.1f} pixels (stabilisation), "
     return (
         f"Lens, by all matches, beside what was said of its distortion ({was}): {focal}"
         f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "

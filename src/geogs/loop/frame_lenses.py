@@ -3,7 +3,9 @@
 Focusing anew magnifies otherwise, stabilisation moves the lens or the crop, a zoom does the first
 on purpose. Matches tell it of each keyframe; they are corrected for it, and everything is adjusted
 again. Flow is not measured anew until images are straight. What a lens has of its own counts as
-a random number of a deviation that the video tells, too (expectation maximisation).
+a random number of a deviation that the video tells, too (expectation maximisation). The focal
+length and the principal point are let go one after the other, and only where that takes off much of
+what the matches have left (forward selection): a depth that is wrong as yet asks for either.
 """
 
 import math
@@ -19,8 +21,9 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import SHAPES, lens_prior, shifts_of_edges
 from geogs.bundle.uncertainty.varying_intrinsics import (
     EXPLAINED,
-    FIRST,
     OWN,
+    LensChange,
+    VaryingEvidence,
     VaryingPrior,
 )
 from geogs.geometry.camera import Camera
@@ -34,14 +37,21 @@ from geogs.types import FoundLens, FrameLens
 from geogs.world.edges import PackedEdge, Pair
 from geogs.world.straight_view import StraightView
 
-ROUNDS = 8
+ROUNDS = 12
 """At most."""
 SETTLED = 2e-4
 """Largest change of a size, root mean square over the keyframes, by which the rounds end."""
 UNSETTLED = 2e-3
 """From which on they have not settled after the last round."""
+AMBIGUOUS = 0.02
+"""Part of the cost that nothing else may take off in the end: 0.037 where the map was wrong from the
+start, which lenses that change hid, up to 0.009 where they were found rightly (docs/lens.md)."""
 TOLD = 1e-6
 """Deviation of what is shared of a lens that somebody told of."""
+
+
+Said = Sequence[tuple[list[int], VaryingEvidence]]
+"""What matches say of the lenses of some keyframes, and of others."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,8 @@ def correct_frame_lenses(
 ) -> VaryingLens | None:
     """Correct all matches for what the lens of each keyframe has of its own, and adjust again.
 
-    None where matches do not ask for it, or it does not settle: then everything is as it was.
+    None where matches do not ask for it, it does not settle, or what does not change would do
+    nearly as well: then everything is as it was.
     ``before`` was found already, images are straight by it, and what is left is asked for. What was
     found of the frames between the keyframes stays (:meth:`VaryingLens.shift`). Not in the world of
     a saved map. Of a lens that somebody told of, what all frames share stays.
@@ -103,17 +114,19 @@ def correct_frame_lenses(
         return None
     kept = [(k, k.T_cw.clone(), k.inverse_depth.clone(), k.information.clone()) for k in keyframes]
     measured = graph.packed
-    sizes = _Sizes(tracker, before.prior if before is not None and before.prior else FIRST)
-    last = math.inf
-    for n in range(ROUNDS):
-        explained, last = sizes.step()
-        if n == 0 and before is None and explained < EXPLAINED:
-            return None
+    prior = None if before is None else before.prior
+    sizes = _Sizes(tracker, prior or VaryingPrior())
+    said = said_of_frame_lenses(tracker, tracker.segment.ids)
+    if prior is None and not sizes.grow(said):
+        return None
+    for _ in range(ROUNDS):
+        last = sizes.step(said)
         _shift(graph, measured, sizes)
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
-        if last < SETTLED:
+        said = said_of_frame_lenses(tracker, tracker.segment.ids)
+        if last < SETTLED and not sizes.grow(said):
             break
-    if last > UNSETTLED:
+    if last > UNSETTLED or sizes.left > AMBIGUOUS:
         graph.edges.update(measured)
         for keyframe, T_cw, depth, information in kept:
             keyframe.T_cw, keyframe.inverse_depth = T_cw, depth
@@ -121,7 +134,11 @@ def correct_frame_lenses(
         return None
     known = {k.frame_index: sizes.of(k.id) for k in keyframes}
     found = sizes_of_frames(log, keyframes, known, sizes.prior)
-    own = {n: FrameLens(*(s - sizes.common)[list(OWN)].tolist()) for n, s in found.items()}
+    varies = torch.tensor(sizes.prior.jitter) > 0
+    own = {
+        n: FrameLens(*torch.where(varies, (s - sizes.common)[list(OWN)], 0.0).tolist())
+        for n, s in found.items()
+    }
     focal, k1, k2, right, down = sizes.common.tolist()
     lens = FoundLens(k1, k2, 0.0, 0.0, math.exp(focal), right=right, down=down)
     return VaryingLens(lens, own, sizes.prior)
@@ -132,6 +149,8 @@ class _Sizes:
 
     def __init__(self, tracker: Tracker, prior: VaryingPrior) -> None:
         self.prior, self.common = prior, torch.zeros(SHAPES, dtype=torch.float64)
+        self.left = 0.0
+        """Part of the cost that what does not change would take off, when that was asked last."""
         self._tracker, self._own = tracker, dict[int, Tensor]()
         deviation = tracker.keyframes.table.focal_deviation
         self._is_open = deviation > 0
@@ -142,25 +161,45 @@ class _Sizes:
         """Of a keyframe, with what all share."""
         return self.common.index_add(0, torch.tensor(OWN), self._of(id))
 
-    def step(self) -> tuple[float, float]:
-        """Go on to what matches ask for now. Returns which part of their cost it takes off, and
-        the largest of the sizes' steps, root mean square over the keyframes; none where nothing
-        tells."""
-        keyframes, explained = self._tracker.keyframes, 0.0
-        said = said_of_frame_lenses(self._tracker, self._tracker.segment.ids)
-        steps: dict[int, Tensor] = {}
+    def grow(self, said: Said) -> bool:
+        """Let that change, too, which takes most off the cost; false where nothing takes enough."""
+        fixed = [change for change in LensChange if not self.prior.varies(change)]
+        now = 0.0 if len(fixed) == len(LensChange) else max(0.0, self._told(said, self.prior)[2])
+        most, best, self.left = now + EXPLAINED, self.prior, 0.0
+        for prior in map(self.prior.also, fixed):
+            explained = self._told(said, prior)[2]
+            if explained >= most:
+                most, best = explained, prior
+            self.left = max(self.left, explained - now)
+        has_grown, self.prior = best is not self.prior, best
+        return has_grown
+
+    def step(self, said: Said) -> float:
+        """Go on to what matches say now. Returns the largest of the sizes' steps, root mean square
+        over the keyframes."""
+        steps, self.prior, _ = self._told(said, self.prior)
+        own = {
+            k: size
+            for (frames, _), step in zip(said, steps, strict=True)
+            for k, size in zip(frames, step[:-SHAPES].reshape(-1, len(OWN)), strict=True)
+        }
+        self._own.update({k: self._of(k) + size for k, size in own.items()})
+        if self._is_open:
+            self.common = self.common + torch.stack([step[-SHAPES:] for step in steps]).mean(0)
+        return float(torch.stack([*own.values()]).square().mean(0).max().sqrt())
+
+    def _told(self, said: Said, prior: VaryingPrior) -> tuple[list[Tensor], VaryingPrior, float]:
+        """Steps of all parts, the prior that suits them, and what they take off the cost of that
+        which they do most to."""
+        steps, explained = [], 0.0
         for frames, evidence in said:
-            times = torch.tensor([keyframes[k].timestamp for k in frames]).double()
+            times = [self._tracker.keyframes[k].timestamp for k in frames]
             taken = torch.cat([*(self._of(k) for k in frames), self.common])
-            step, self.prior = evidence.told(times, taken, self.prior, self._shared)
+            at = torch.tensor(times, dtype=torch.float64)
+            step, prior = evidence.told(at, taken, prior, self._shared)
+            steps.append(step)
             explained = max(explained, evidence.explained(step))
-            steps.update(zip(frames, step[:-SHAPES].reshape(-1, len(OWN)), strict=True))
-            if self._is_open:
-                self.common = self.common + step[-SHAPES:] / len(said)
-        for k, own in steps.items():
-            self._own[k] = self._of(k) + own
-        moved = torch.stack([*steps.values()]) if steps else torch.zeros(1, len(OWN))
-        return explained, float(moved.square().mean(0).max().sqrt())
+        return steps, prior, explained
 
     def _of(self, id: int) -> Float[Tensor, "3"]:
         return self._own.get(id, torch.zeros(len(OWN), dtype=torch.float64))

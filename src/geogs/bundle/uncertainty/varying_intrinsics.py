@@ -11,6 +11,7 @@ adjustment.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 import torch
@@ -38,10 +39,10 @@ OWN = 0, RADIAL, RADIAL + 1
 """Of the shapes of a lens' error, those that each frame has of its own: the logarithm of the focal
 length, and the principal point along either side."""
 EXPLAINED = 0.1
-"""Part of the matches' cost that lenses which change have to take off: 0.29 where the focal length
-changes by 1 %, below 0.06 where nothing does (docs/lens.md)."""
+"""Part of the matches' cost that has to go where something of a lens changes: 0.33 where the focal
+length does by 1 %, below 0.06 where nothing does (docs/lens.md)."""
 LEAST = 2e-4
-"""Deviation of a size that is told to be zero."""
+"""Smallest deviation of a size, that of one which does not vary, too."""
 FIRST_DEVIATION = 0.02
 """Of what frames have of their own before any match is asked."""
 EXPECTATIONS = 10
@@ -50,15 +51,34 @@ COUNTS = 0.1
 """Fraction of what matches say that counts, as those of an edge err together."""
 
 
+class LensChange(Enum):
+    """What of a lens may change from frame to frame."""
+
+    FOCAL = "focal length"
+    CENTRE = "principal point"
+
+
 @dataclass(frozen=True)
 class VaryingPrior:
     """What frames have of their own before any match is asked: independent of each other, and of
-    the focal length a random walk beside. Deviations, which the video itself tells."""
+    the focal length a random walk beside. Deviations, which the video itself tells; zero of what
+    does not change."""
 
-    jitter: tuple[float, float, float]
+    jitter: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the sizes of each frame."""
-    drift: float
+    drift: float = 0.0
     """Of the logarithm of the last frame's focal length from the first one's."""
+
+    def varies(self, change: LensChange) -> bool:
+        """Whether something changes."""
+        return self.jitter[0 if change is LensChange.FOCAL else 1] > 0
+
+    def also(self, change: LensChange) -> "VaryingPrior":
+        """With something more that changes, by as much as may be expected of any lens."""
+        focal, *centre = self.jitter
+        if change is LensChange.FOCAL:
+            return VaryingPrior((FIRST_DEVIATION, centre[0], centre[1]), FIRST_DEVIATION)
+        return VaryingPrior((focal, FIRST_DEVIATION, FIRST_DEVIATION), self.drift)
 
     def information(self, times: Float[Tensor, "n"]) -> Float[Tensor, "3 n n"]:
         """Inverse covariance of each size of frames at some times; they are independent."""
@@ -91,7 +111,7 @@ class VaryingPrior:
         covariance: Float[Tensor, "n 3 n 3"],
     ) -> "VaryingPrior":
         """That which suits sizes that are known to a covariance better: a step of expectation
-        maximisation of components of a variance."""
+        maximisation of components of a variance. What does not change stays so."""
         prior, squares = self.information(times), self._squares
         found = []
         for n, (part, square) in enumerate(zip(_parts(times), squares, strict=True)):
@@ -99,7 +119,9 @@ class VaryingPrior:
             second = sizes[:, k, None] * sizes[:, k] + covariance[:, k, :, k]
             both = prior[k] @ part
             less = ((both @ prior[k]) * second.mT).sum() - both.diagonal().sum()
-            found.append(math.sqrt(max(0.0, square + square**2 / len(times) * float(less))))
+            found.append(math.sqrt(max(LEAST**2, square + square**2 / len(times) * float(less))))
+        varying = [size > 0 for size in (*self.jitter, self.drift)]
+        found = [size if varies else 0.0 for size, varies in zip(found, varying, strict=True)]
         return VaryingPrior((found[0], found[1], found[2]), found[3])
 
 
@@ -111,7 +133,7 @@ def _parts(times: Float[Tensor, "n"]) -> list[Float[Tensor, "n n"]]:
     return [alone, alone, alone, torch.minimum(past[:, None], past)]
 
 
-FIRST = VaryingPrior(3 * (FIRST_DEVIATION,), FIRST_DEVIATION)
+FIRST = VaryingPrior().also(LensChange.FOCAL).also(LensChange.CENTRE)
 
 
 @dataclass(frozen=True)

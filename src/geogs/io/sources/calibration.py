@@ -146,7 +146,9 @@ class Calibration:
         if found.focal == 1:
             return bent
         own = found.deviation_k1, found.deviation_k2
-        said = replace(self.refinement or FocalRefinement(), deviations=own, failure=None)
+        said = self.refinement or FocalRefinement()
+        is_explained = said.is_explained or found.varies  # no camera that stays does
+        said = replace(said, deviations=own, failure=None, is_explained=is_explained)
         return replace(
             bent, fx=camera.fx, fy=camera.fy, is_guess=False, is_nominal=False,
             origin=f"{origin}, fx times {found.focal:.4f}",
