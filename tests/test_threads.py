@@ -12,7 +12,7 @@ from geogs.config import MeshConfig
 from geogs.evaluation import trajectory_errors
 from geogs.evaluation.surfaces import reconstruction_errors, toolbox
 from geogs.geometry.camera import Camera
-from geogs.mesh.colour import colour_mesh
+from geogs.mesh import colour as colours
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread, thread_map
@@ -55,7 +55,8 @@ def extract(note: Note, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def colour(note: Note, monkeypatch: pytest.MonkeyPatch) -> None:
     corner = np.array([[0.0, 0.0, 2.0]], np.float32)
-    colour_mesh(Mesh(corner, np.zeros((0, 3), np.int32), -corner / 2), [wall()], 0.1, note)
+    monkeypatch.setattr(colours, "seen_colours", noting(note, colours.seen_colours))
+    colours.colour_mesh(Mesh(corner, np.zeros((0, 3), np.int32), -corner / 2), [wall()], 0.1)
 
 
 def noting(note: Note, function: Callable) -> Callable:
@@ -82,7 +83,7 @@ def compare_trajectories(note: Note, monkeypatch: pytest.MonkeyPatch) -> None:
     T_wc = np.tile(np.eye(4), (9, 1, 1))
     T_wc[:, :3, 3] = np.random.default_rng(0).normal(size=(9, 3))
     path = Trajectory(np.arange(9.0), T_wc, np.ones(9, bool))
-    monkeypatch.setattr(trajectory_errors, "align", noting(note, trajectory_errors.align))
+    monkeypatch.setattr(trajectory_errors, "umeyama", noting(note, trajectory_errors.umeyama))
     assert trajectory_errors.evaluate_trajectory(path, path).ate_rmse_cm < 1e-9
 
 

@@ -20,7 +20,7 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-KERNELS_OF_SEARCH, KERNELS_OF_MAP, KERNELS = 18, 39, 53
+KERNELS_OF_SEARCH, KERNELS_OF_MAP, KERNELS = 18, 39, 52
 """How many kernels that are called from Python a rehearsal compiles: up to what searches depths,
 up to what makes a map, up to a mesh."""
 PARTS = {"map": KERNELS_OF_MAP, "mesh": KERNELS - KERNELS_OF_MAP}
