@@ -281,6 +281,8 @@ class Uncertainty(ShortRepr):
     """Relative difference of the focal lengths that parts of the video fit best."""
     lens_change: AtLeast0 = 0.0
     """Part of the cost of the matches that is left because the lens changes from frame to frame."""
+    joined: Annotated[float, Range(0, 1)] = 1.0
+    """Fraction of the keyframes in the largest group that their images join."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""

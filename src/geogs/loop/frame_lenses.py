@@ -44,8 +44,8 @@ SETTLED = 2e-4
 UNSETTLED = 2e-3
 """From which on they have not settled after the last round."""
 AMBIGUOUS = 0.02
-"""Part of the cost that nothing else may take off in the end: 0.037 where the map was wrong from the
-start, which lenses that change hid, up to 0.009 where they were found rightly (docs/lens.md)."""
+"""Part of the cost that nothing else may take off in the end: 0.037 where the map was wrong from
+its start, which lenses that change hid, up to 0.009 where they were found (docs/lens.md)."""
 TOLD = 1e-6
 """Deviation of what is shared of a lens that somebody told of."""
 

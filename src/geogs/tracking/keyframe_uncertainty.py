@@ -25,6 +25,7 @@ from geogs.bundle.uncertainty.varying_intrinsics import (
 from geogs.tracking.frames.pose_filling import rows_in_doubt
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import HUBER
+from geogs.tracking.graph.photometric_groups import largest_group
 from geogs.tracking.tracker import Tracker
 from geogs.types import FrameLens, Uncertainty
 from geogs.world.grid import SampleGrid
@@ -85,7 +86,10 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     # it agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
     focal = max(open_, math.sqrt(focal))
-    return Uncertainty(times, position, rotation, depth, focal, misfit(residual), change, lenses)
+    joined = largest_group(tracker.map.graph, tracker.segment.ids)
+    return Uncertainty(
+        times, position, rotation, depth, focal, misfit(residual), change, lenses, joined
+    )
 
 
 def misfit(residuals: Float[np.ndarray, "n"]) -> float:

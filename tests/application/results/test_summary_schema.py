@@ -15,7 +15,7 @@ RUN = {
     "shutter": {"readout": 0.0276, "origin": "as given"},
     "verdict": {"is_reliable": True, "sentence": "Well.", "lost": 0.0, "orientation_only": 0.1,
                 "position": 0.01, "rotation_deg": None, "depth": 0.02, "focal": 0.01,
-                "focal_change": 0.0, "lens_change": 0.0},
+                "focal_change": 0.0, "lens_change": 0.0, "joined": 1.0},
     "metric_scale": {"origin": "a known distance", "factor": 1.2, "deviation": 0.01},
     "keyframes": 20, "lost_spans": [[0.5, 1.25]], "orientation_only_spans": [], "moving": 0.0,
     "segments": [{"first_time": 0.0, "last_time": 4.0, "keyframes": 20, "fate": "world"}],

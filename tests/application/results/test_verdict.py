@@ -70,6 +70,7 @@ def test_what_no_camera_explains_is_not_relied_on():
     [
         ({"misfit": 1.25}, {"misfit": 1.75}, "a tenth of its keyframes fit 1.8 times less well"),
         ({"focal_change": 0.04}, {"focal_change": 0.14}, "more than 14%, as where somebody zooms"),
+        ({"joined": 0.97}, {"joined": 0.6}, "the longest of which has 60% of the keyframes"),
         ({"lens_change": 0.06}, {"lens_change": 0.3}, "the lens changes from image to image"),
     ],
 )

@@ -27,6 +27,8 @@ MAX_FOCAL_CHANGE = 0.05
 MAX_LENS_CHANGE = 0.1
 """Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
 has one (docs/lens.md)."""
+MIN_JOINED = 0.95
+"""Fraction of the keyframes that their images join; of the others a few may be out of place."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -55,6 +57,8 @@ class Verdict:
     """Relative difference of the focal lengths that parts of the video want."""
     lens_change: float = 0.0
     """Part of the matches' cost that is left because the lens changes from frame to frame."""
+    joined: float = 1.0
+    """Fraction of the keyframes in the largest group that their images join."""
 
     @property
     def has_shape(self) -> bool:
@@ -123,6 +127,11 @@ def verdict(
             f"the matches of a tenth of its keyframes fit {known.misfit:.1f} times less well than "
             "the others', as where tracking fails"
         )
+    if known.joined < MIN_JOINED:
+        reasons.append(
+            "the images do not agree with how parts of its path stand to each other, the longest "
+            f"of which has {known.joined:.0%} of the keyframes, as where something fills the view"
+        )
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."
     else:
@@ -132,7 +141,7 @@ def verdict(
         )
     return Verdict(
         not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal,
-        known.focal_change, known.lens_change,
+        known.focal_change, known.lens_change, known.joined,
     )  # fmt: skip
 
 

@@ -22,9 +22,10 @@ from geogs.geometry.jumps import widened
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
+from geogs.tracking.graph.photometric_groups import photometric_checks
 from geogs.tracking.graph.proximity import RADIUS
 from geogs.tracking.locate.frame_locator import MIN_KNOWN
-from geogs.tracking.matching.photometric_check import MIN_NCC, PhotometricCheck, correlation_at
+from geogs.tracking.matching.photometric_check import MIN_NCC
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.tracking.matching.two_view import TwoView, best_two_view
@@ -192,19 +193,7 @@ def _depth_deviation(graph: FrameGraph) -> float:
 
 def _passes_photometric_check(graph: FrameGraph) -> bool:
     """Whether the images of all neighbours in time agree at their poses."""
-    grey, found = graph.operator.grey, []
-    for a, b in pairwise(graph.keyframes):
-        found.append(
-            correlation_at(
-                graph.keyframes.grid,
-                grey(a.encoded),
-                grey(b.encoded),
-                b.T_cw @ se3_inverse(a.T_cw),
-                a.inverse_depth,
-                a.information,
-            )
-        )
-    checks = map(PhotometricCheck.of, torch.stack(found).cpu())
+    checks = photometric_checks(graph, list(pairwise(graph.keyframes.ids)))
     return all(check.passes(MIN_NCC, is_expected=False) for check in checks)
 
 
