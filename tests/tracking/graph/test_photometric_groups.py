@@ -50,15 +50,15 @@ def test_other_edges_join_what_is_before_and_after_a_keyframe_out_of_place(edges
 
 
 def test_what_moves_joins_nothing_and_what_is_covered_is_seen_the_other_way():
-    graph = walked()
-    noise = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
-    image = graph.keyframes[4].image.copy()
-    image[:, : CAMERA.width * 6 // 10] = noise[:, : CAMERA.width * 6 // 10]
+    images = [keyframe.image.copy() for keyframe in walked().keyframes]
+    noise = np.random.default_rng(0).integers(0, 255, images[4].shape, np.uint8)
+    covered = CAMERA.width * 6 // 10
+    images[4][:, :covered] = noise[:, :covered]
+    graph = walked(images)
     keyframe = graph.keyframes[4]
-    keyframe.image, keyframe.encoded = image, graph.operator.encode(image)
     assert largest_group(graph, range(COUNT)) < 1.0  # it knows depths of what covers it
     keyframe.moving = torch.zeros(graph.keyframes.grid.size, dtype=torch.bool)
-    keyframe.moving[graph.keyframes.grid.pixels[:, 0] < 0.6 * CAMERA.width] = True
+    keyframe.moving[graph.keyframes.grid.pixels[:, 0] < covered + 4] = True
     assert largest_group(graph, range(COUNT)) == 1.0
 
 
