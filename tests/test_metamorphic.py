@@ -17,6 +17,7 @@ CONFIG = parse([
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_a_mirrored_video_gives_the_mirrored_map(small_room):
     source = open_source(small_room, InputConfig(stop=22))
     frames = list(source)

@@ -87,6 +87,7 @@ def test_files_that_once_led_to_something_else(name, example, reads):
             (folder / file).write_bytes(good[file])
 
 
+@pytest.mark.long
 def test_what_a_parser_may_not_do_is_found_and_the_next_one_is_read():
     found = {
         "crashes": "crashes ended the process with -6", "floods": "floods took",

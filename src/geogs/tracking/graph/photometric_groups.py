@@ -10,8 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.matching.photometric_check import MIN_NCC, PhotometricCheck, correlation_at
@@ -48,6 +46,9 @@ def largest_group(graph: FrameGraph, ids: Sequence[int]) -> float:
     the other, for something may cover one of them, or where there is too little texture for it;
     else by other edges across the gap that pass.
     """
+    from scipy.sparse import coo_array  # a start has no need of it
+    from scipy.sparse.csgraph import connected_components
+
     pairs = list(pairwise(ids))
     joined = _agreeing(graph, pairs, is_expected=True)
     order = {k: n for n, k in enumerate(ids)}
@@ -58,8 +59,8 @@ def largest_group(graph: FrameGraph, ids: Sequence[int]) -> float:
         joined |= _agreeing(graph, across[:ASKED], is_expected=False)
     edges = np.array([(order[i], order[j]) for i, j in joined]).reshape(-1, 2)
     size = len(ids)
-    graph_of = coo_array((np.ones(len(edges)), edges.T), shape=(size, size))
-    _, group = connected_components(graph_of, directed=False)
+    links = coo_array((np.ones(len(edges)), edges.T), shape=(size, size))
+    _, group = connected_components(links, directed=False)
     return float(np.bincount(group).max(initial=0)) / max(size, 1)
 
 
