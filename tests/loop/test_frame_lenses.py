@@ -11,14 +11,14 @@ from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop import frame_lenses, lens_correction
-from geogs.loop.frame_lenses import correct_frame_lenses
+from geogs.loop.frame_lenses import VaryingLens, correct_frame_lenses
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
 from geogs.scene_mask import SceneMask
 from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import solved_poses
 from geogs.tracking.tracker import Tracker
-from geogs.types import FlowMatch
+from geogs.types import FlowMatch, FoundLens
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameRecord, Observation
 from geogs.world.grid import SampleGrid
@@ -187,6 +187,17 @@ def test_what_does_not_settle_leaves_everything_as_it_was(monkeypatch):
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
     assert graph.edges.keys() == edges.keys()
     assert all(torch.equal(graph.edges[e].position, edges[e].position) for e in edges)
+
+
+def test_where_matches_tell_nothing_of_straight_images_nothing_is_found(monkeypatch):
+    tracker, _ = tracker_of(torch.zeros(COUNT, SHAPES))
+    ids = list(range(COUNT))
+    tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
+    before = VaryingLens(FoundLens(0.0, 0.0, 0.0, 0.0), {}, VaryingPrior((0.0, 0.01, 0.01)))
+    monkeypatch.setattr(frame_lenses, "said_of_frame_lenses", lambda *a: [])
+    found = correct_frame_lenses(tracker, ids[1:], ids, GLOBAL_OPTIONS, before)
+    assert found is not None
+    assert all(max(map(abs, own.sizes)) < 1e-6 for own in found.own.values())
 
 
 def test_a_frame_between_keyframes_tells_its_own_lens():

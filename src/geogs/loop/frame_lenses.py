@@ -176,7 +176,9 @@ class _Sizes:
 
     def step(self, said: Said) -> float:
         """Go on to what matches say now. Returns the largest of the sizes' steps, root mean square
-        over the keyframes."""
+        over the keyframes; none where they say nothing."""
+        if not said:
+            return 0.0
         steps, self.prior, _ = self._told(said, self.prior)
         own = {
             k: size

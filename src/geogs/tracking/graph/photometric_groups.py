@@ -52,9 +52,9 @@ def largest_group(graph: FrameGraph, ids: Sequence[int]) -> float:
     pairs = list(pairwise(ids))
     joined = _agreeing(graph, pairs, is_expected=True)
     order = {k: n for n, k in enumerate(ids)}
+    known = [(i, j) for i, j in graph.pairs if i in order and j in order]
     for a, b in [pair for pair in pairs if pair not in joined]:
-        across = [(i, j) for i, j in graph.pairs if i in order and j in order]
-        across = [(i, j) for i, j in across if order[i] <= order[a] and order[b] <= order[j]]
+        across = [(i, j) for i, j in known if order[i] <= order[a] and order[b] <= order[j]]
         across.sort(key=lambda pair: order[pair[1]] - order[pair[0]])
         joined |= _agreeing(graph, across[:ASKED], is_expected=False)
     edges = np.array([(order[i], order[j]) for i, j in joined]).reshape(-1, 2)
