@@ -25,7 +25,7 @@ from geogs.bundle.uncertainty.varying_intrinsics import (
 from geogs.tracking.frames.pose_filling import rows_in_doubt
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.graph.frame_graph import HUBER
-from geogs.tracking.graph.photometric_groups import largest_group
+from geogs.tracking.graph.rigid_parts import largest_part
 from geogs.tracking.tracker import Tracker
 from geogs.types import FrameLens, Uncertainty
 from geogs.world.grid import SampleGrid
@@ -43,6 +43,10 @@ USUAL_RESIDUAL = 0.23
 videos (docs/uncertainty.md has the table)."""
 FLAWLESS_RESIDUAL = 0.26
 """The same where nothing is wrong, at most: 0.21 to 0.26."""
+MIN_SHARED = 0.2
+"""Least shared part of the cells for one structure to hold two edges (:func:`largest_part`): views
+of a place seen again, which may be all that joins two stretches, have less in common than those of
+a start."""
 LEAST_FITTING = 0.9
 """Quantile of the keyframes' residuals that stands for those whose matches fit least."""
 
@@ -86,7 +90,8 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     # it agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
     focal = max(open_, math.sqrt(focal))
-    joined = largest_group(tracker.map.graph, tracker.segment.ids)
+    held = largest_part(tracker.keyframes, tracker.map.graph.edges, MIN_SHARED)
+    joined = len(held) / len(tracker.segment.ids)
     return Uncertainty(
         times, position, rotation, depth, focal, misfit(residual), change, lenses, joined
     )

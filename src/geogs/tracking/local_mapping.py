@@ -70,12 +70,15 @@ class LocalMapping:
             self.map.sensor.join(keyframe, frame.depth)
         return keyframe
 
-    def extend_back(self, record: FrameRecord, id: int, motion: FrameMotion) -> None:
+    def extend(self, record: FrameRecord, id: int, motion: FrameMotion) -> None:
         """Make a located frame, which was the keyframe ``id`` before the map was started, the
-        earliest keyframe, linked to those after it and adjusted with them."""
+        earliest keyframe or the latest, linked to those beside it and adjusted with them."""
         keyframe = self.map.restore(record, id, motion.T_cw)
         self._propagate_depths(self.keyframes[motion.keyframe], keyframe)
         ids, fixed = self.keyframes.ids, {*self.segment.fixed}
+        if id == ids[-1]:
+            self._link(keyframe, motion.keyframe)
+            return
         self._connect(ids[1:PROXIMITY_WINDOW], ids[:1], (keyframe.id, motion.keyframe))
         self._propagate_dynamic(motion.keyframe, keyframe)
         self._adjust(
@@ -95,12 +98,16 @@ class LocalMapping:
         ``anchor`` is the keyframe at which it was located; without ``culls`` none goes.
         """
         self.map.complete(keyframe, rotations)
+        self._link(keyframe, anchor)
+        self.map.odometry.update_scale()
+        return self._cull() if culls else ()
+
+    def _link(self, keyframe: Keyframe, anchor: int) -> None:
+        """Link the latest keyframe to its neighbours and adjust them."""
         ids = self.keyframes.ids
         self._connect(ids[-1:], ids[-PROXIMITY_WINDOW:-1], (anchor, keyframe.id))
         self._propagate_dynamic(anchor, keyframe)
         self._adjust(self.active, self.deep)
-        self.map.odometry.update_scale()
-        return self._cull() if culls else ()
 
     def _propagate_depths(self, anchor: Keyframe, keyframe: Keyframe) -> None:
         T = keyframe.T_cw @ se3_inverse(anchor.T_cw)

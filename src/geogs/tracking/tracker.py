@@ -26,7 +26,7 @@ from geogs.tracking.locate.orientation_follower import OrientationFollower
 from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
 from geogs.tracking.matching.flow_chain import MIN_TEXTURE
 from geogs.tracking.start.start_up import StartUp
-from geogs.tracking.track_back import track_back
+from geogs.tracking.track_from_start import track_from_start
 from geogs.types import Frame, Trajectory
 from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -255,14 +255,20 @@ class Tracker:
         self._begin()
         self._orientation.located(status.orientation, frame, encoded)
         fresh = self.map.finalise(keyframes.ids[:-1])
+        given_up = tuple(k for k in given_up if k not in keyframes)
         return TrackResult(status.state, fresh, self.local.active, given_up)
 
     def _begin(self) -> None:
         """The map has just been started."""
         self.map.odometry.update_scale()
         keyframes = self.keyframes
-        track_back(self.local, self._localiser.locator)
-        self.segment.status.last = LastFrame.at(keyframes[keyframes.ids[-1]])
+        track_from_start(self.local, self._localiser.locator)
+        status, last = self.segment.status, keyframes[keyframes.ids[-1]]
+        status.last = LastFrame.at(last)
+        after = [r for r in self.map.recorder.unplaced() if r.index > last.frame_index]
+        if after:
+            status.lose()
+            status.misses = status.frames_lost = len(after)
 
     def _lose(self, frame: Frame, rotations: Sequence[RelativeRotation] = ()) -> TrackResult:
         """The frame has no pose; no orientation, either, unless rotations say one."""

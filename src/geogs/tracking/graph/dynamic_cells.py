@@ -89,8 +89,8 @@ def update_dynamic(
         return
     source = torch.tensor([i for i, _ in directed])
     for chunk in source_chunks(source, EDGES_TOGETHER):
-        residual, parallax, static = _residuals(keyframes, edges, directed[chunk])
-        ratio = (residual / _usual(residual, static)[:, None]).clamp(max=MAX_RATIO)
+        ratio, parallax, static = relative_residuals(keyframes, edges, directed[chunk])
+        ratio = ratio.clamp(max=MAX_RATIO)
         ids, row = source[chunk].unique(return_inverse=True)
         row = row.to(ratio.device)
         total = ratio.new_zeros(len(ids), ratio.shape[1])
@@ -155,11 +155,14 @@ def _static(
     return ~(source | (target & inside))
 
 
-def _residuals(
+def relative_residuals(
     keyframes: KeyframeSet, edges: Mapping[Pair, Edge], directed: Sequence[Pair]
 ) -> tuple[Float[Tensor, "e p"], Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
-    """Best residuals of some edges, and pixels that no rotation explains, neither a number without
-    a match; and what is static."""
+    """Best residuals of some edges as multiples of the usual one of each, and pixels that no
+    rotation explains, neither a number without a match; and what is static.
+
+    A cell's depth is that which suits these edges best, so they should be all of their sources.
+    """
     grid = keyframes.grid
     ids = sorted({k for e in directed for k in e})
     slot = {k: n for n, k in enumerate(ids)}
@@ -174,7 +177,8 @@ def _residuals(
     is_matched = weight[..., 0] > 0
     residual = torch.where(is_matched, residual, torch.nan)
     parallax = torch.where(is_matched, (pixels - far).norm(dim=-1), torch.nan)
-    return residual, parallax, _static(keyframes, directed, pixels)
+    static = _static(keyframes, directed, pixels)
+    return residual / _usual(residual, static)[:, None], parallax, static
 
 
 def _usual(residual: Float[Tensor, "e p"], static: Bool[Tensor, "e p"]) -> Float[Tensor, "e"]:

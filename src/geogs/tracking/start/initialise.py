@@ -22,10 +22,14 @@ from geogs.geometry.jumps import widened
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
-from geogs.tracking.graph.photometric_groups import photometric_checks
 from geogs.tracking.graph.proximity import RADIUS
+from geogs.tracking.graph.rigid_parts import largest_part
 from geogs.tracking.locate.frame_locator import MIN_KNOWN
-from geogs.tracking.matching.photometric_check import MIN_NCC
+from geogs.tracking.matching.photometric_check import (
+    MIN_NCC,
+    PhotometricCheck,
+    correlation_at,
+)
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.sparse_features import guided_flows
 from geogs.tracking.matching.two_view import TwoView, best_two_view
@@ -65,6 +69,8 @@ class Attempt(Enum):
     FAILED = "failed"
     FAR_OFF = "far off"
     """Depths are so open that only many more keyframes may help."""
+    APART = "apart"
+    """No one structure holds the keyframes together."""
 
 
 def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> Attempt:
@@ -72,9 +78,9 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
 
     It fails if they show no parallax, or none that a rotation of the camera would not explain as
     well (:mod:`geogs.tracking.matching.two_view_rotation`), if matches and poses leave their depths
-    open (``MAX_DEVIATION``), if most of what is seen moves by them (``MOST_MOVING``), or if the
-    images of two that follow each other do not correlate where poses and depths put them
-    (``MIN_NCC``).
+    open (``MAX_DEVIATION``), if most of what is seen moves by them (``MOST_MOVING``), if no one
+    structure holds all keyframes (:mod:`geogs.tracking.graph.rigid_parts`), or if the images of two
+    that follow each other do not correlate where poses and depths put them (``MIN_NCC``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
@@ -86,17 +92,25 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     if best is None or not has_moved_surely(SampleGrid(camera), flows[best[0]], best[1].T_ji):
         return Attempt.FAILED
     _place_all(graph, flows, best)
-    for rounds in (range(FORGIVING), range(FORGIVING, ROUNDS)):
-        if not _polish(graph, config.moving, rounds):
-            return Attempt.FAILED
-        deviation = _depth_deviation(graph)
-        if deviation > FAR * MAX_DEVIATION:
-            return Attempt.FAR_OFF
+    if not _polish(graph, config.moving, range(FORGIVING)):
+        return Attempt.FAILED
+    if _depth_deviation(graph) > FAR * MAX_DEVIATION:
+        return Attempt.FAR_OFF
+    return polished(graph, config)
+
+
+def polished(graph: FrameGraph, config: TrackingConfig) -> Attempt:
+    """Adjust keyframes whose poses and depths are known roughly, and say whether to start so."""
+    if not _polish(graph, config.moving, range(FORGIVING, ROUNDS)):
+        return Attempt.FAILED
+    segment, deviation = graph.keyframes, _depth_deviation(graph)
+    if deviation > FAR * MAX_DEVIATION:
+        return Attempt.FAR_OFF
+    if not largest_part(segment, graph.edges).issuperset(segment.ids):
+        return Attempt.APART
     if deviation > MAX_DEVIATION or dynamic_fraction(segment) > MOST_MOVING:
         return Attempt.FAILED
-    if not _passes_photometric_check(graph):
-        return Attempt.FAILED
-    return Attempt.STARTED
+    return Attempt.STARTED if _passes_photometric_check(graph) else Attempt.FAILED
 
 
 def has_moved_surely(grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]) -> bool:
@@ -193,7 +207,14 @@ def _depth_deviation(graph: FrameGraph) -> float:
 
 def _passes_photometric_check(graph: FrameGraph) -> bool:
     """Whether the images of all neighbours in time agree at their poses."""
-    checks = photometric_checks(graph, list(pairwise(graph.keyframes.ids)))
+    keyframes, grey, found = graph.keyframes, graph.operator.grey, []
+    pairs = list(pairwise(keyframes.ids))
+    for (i, j), T_ji in zip(pairs, keyframes.relative_poses(pairs), strict=True):
+        first, second = keyframes[i], keyframes[j]
+        images = grey(first.encoded), grey(second.encoded)
+        depth = first.inverse_depth, first.information
+        found.append(correlation_at(keyframes.grid, *images, T_ji, *depth))
+    checks = [PhotometricCheck.of(numbers) for numbers in torch.stack(found).cpu()]
     return all(check.passes(MIN_NCC, is_expected=False) for check in checks)
 
 

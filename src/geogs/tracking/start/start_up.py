@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from geogs.config import TrackingConfig
+from geogs.tracking.graph.rigid_parts import largest_part
 from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.locate.frame_locator import MIN_KNOWN
@@ -15,7 +16,7 @@ from geogs.tracking.matching.flow_chain import MIN_MATCHED, follow_flow
 from geogs.tracking.matching.two_view_rotation import two_view_rotation
 from geogs.tracking.start.chained_flows import ChainedFlows
 from geogs.tracking.start.early_frames import place_between_keyframes
-from geogs.tracking.start.initialise import Attempt, initialise
+from geogs.tracking.start.initialise import Attempt, initialise, polished
 from geogs.types import FlowMatch, Frame
 from geogs.world.frames import RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -76,6 +77,8 @@ class StartUp:
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
         attempt = initialise(self.map.graph, self.config, self._flows.measure())
+        if attempt is Attempt.APART:
+            attempt = self._start_with_part()
         if attempt is Attempt.FAR_OFF:
             self._progress.min_keyframes = math.ceil((1 + MORE) * len(self.keyframes))
         if attempt is not Attempt.STARTED:
@@ -99,6 +102,17 @@ class StartUp:
             "The images show no parallax (the camera only turns, or the scene is too far away); "
             "move the camera sideways while recording."
         )
+
+    def _start_with_part(self) -> Attempt:
+        """Start with those keyframes that one structure holds, which gives up the others."""
+        graph, keyframes = self.map.graph, self.keyframes
+        part = largest_part(keyframes, graph.edges)
+        if len(part) < MIN_KEYFRAMES:
+            return Attempt.FAILED
+        self.map.forget([k for k in keyframes.ids if k not in part])
+        for keyframe in keyframes:
+            keyframe.moving = None  # it was held for moving by poses of the others
+        return polished(graph, self.config)
 
     def _start_metric(
         self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
@@ -131,11 +145,15 @@ class StartUp:
         self.map.complete(keyframe, rotations)
         if measure is not None:
             self.map.recorder.measure_rotation(measure)
-        count, wanted = len(self.keyframes), self.config.init_keyframes
+        ids, wanted = self.keyframes.ids, self.config.init_keyframes
+        count = len(ids)
         if count < max(wanted, MIN_KEYFRAMES):
             return ()
-        if count >= self._progress.min_keyframes and self.finish():
-            return ()
+        if count >= self._progress.min_keyframes:
+            self.finish()
+            given_up = tuple(k for k in ids if k not in self.keyframes)
+            if self.map.segment.status.has_map or given_up:
+                return given_up
         # More keyframes may bring parallax. With twice as many every other one is left out; where
         # the last no longer sees what the first saw, the first half is given up.
         if count < 2 * wanted:

@@ -1,4 +1,4 @@
-"""Frames from before a map was started, tracked backwards from its keyframes."""
+"""Frames from before a map was started, tracked from its keyframes backwards, then forwards."""
 
 from typing import Any
 
@@ -7,21 +7,28 @@ from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.rotation_averaging import orientations
+from geogs.tracking.graph.rigid_parts import largest_part
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion, with_depth
 from geogs.tracking.locate.localiser import visible_keyframes
 from geogs.world.keyframes import KeyframeSet
 
+MIN_SHARED = 0.5
+"""Least shared part of the cells for one structure to hold two edges (:func:`largest_part`): more
+than of a start, as its frames can do without."""
 
-def track_back(local: LocalMapping, locator: FrameLocator) -> None:
-    """Locate the frames that have no pose between the keyframes of a start, the latest first.
+
+def track_from_start(local: LocalMapping, locator: FrameLocator) -> None:
+    """Locate the frames that have no pose from the keyframes of a start: those before its last,
+    the latest first, then those after it.
 
     Each is searched for where the camera was at the nearest time that is known, with the
     orientation that relative rotations to it say; they err alike while the camera turns, and along
     a whole turn that adds up to more than flow can bridge. Those that were keyframes of attempts
     which failed become keyframes again by the rule by which frames do: else all would hang on a
-    keyframe that sees them at its border, and what they show would have no depth.
+    keyframe that sees them at its border, and what they show would have no depth. Such as the
+    structure of the others does not hold are given up again.
     """
     recorder, keyframes = local.map.recorder, local.keyframes
     waiting = recorder.unplaced()
@@ -31,7 +38,9 @@ def track_back(local: LocalMapping, locator: FrameLocator) -> None:
     placed = {k.frame_index: k.T_cw for k in keyframes}
     # Of the frames on a keyframe that was given up the earliest was that keyframe.
     given_up = {r.anchor: r for r in reversed(waiting) if r.anchor is not None}
-    for record in reversed(waiting):
+    last, extended = max(placed), list[int]()
+    before = [r for r in reversed(waiting) if r.index < last]
+    for record in [*before, *(r for r in waiting if r.index > last)]:
         guess = placed[min(placed, key=lambda index: abs(index - record.index))]
         R = orientations(rotations, {n: T[:3, :3] for n, T in placed.items()}).get(record.index)
         guess = guess if R is None else _turned(guess, R)
@@ -40,12 +49,17 @@ def track_back(local: LocalMapping, locator: FrameLocator) -> None:
         if motion is None:
             continue
         placed[record.index] = motion.T_cw
-        is_earliest = record.index < next(iter(keyframes)).frame_index
-        if was is not None and given_up[was] is record and is_earliest and _is_far(local, motion):
-            local.extend_back(record, was, motion)
+        first, *_, latest = (k.frame_index for k in keyframes)
+        is_outside = not first <= record.index <= latest
+        if was is not None and given_up[was] is record and is_outside and _is_far(local, motion):
+            local.extend(record, was, motion)
+            extended.append(was)
         else:
             T_rel = motion.T_cw @ se3_inverse(keyframes[motion.keyframe].T_cw)
             recorder.place(record, motion.keyframe, T_rel, motion.match)
+    if extended:
+        held = largest_part(keyframes, local.graph.edges, MIN_SHARED)
+        local.map.forget([k for k in extended if k not in held])
 
 
 def _is_far(local: LocalMapping, motion: FrameMotion) -> bool:
