@@ -282,7 +282,7 @@ class Uncertainty(ShortRepr):
     lens_change: AtLeast0 = 0.0
     """Part of the cost of the matches that is left because the lens changes from frame to frame."""
     joined: Annotated[float, Range(0, 1)] = 1.0
-    """Fraction of the keyframes in the largest group that their images join."""
+    """Fraction of the keyframes in the largest part that one rigid structure holds together."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""

@@ -90,8 +90,9 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     # it agree with it.
     open_ = lens.deviation_focal if lens is not None else 0.0
     focal = max(open_, math.sqrt(focal))
-    held = largest_part(tracker.keyframes, tracker.map.graph.edges, MIN_SHARED)
-    joined = len(held) / len(tracker.segment.ids)
+    fixed, edges = set(tracker.segment.fixed), tracker.map.graph.edges
+    held = largest_part(tracker.keyframes, edges, MIN_SHARED, fixed).intersection(ids)
+    joined = max(len(held), 1) / max(len(ids), 1)
     return Uncertainty(
         times, position, rotation, depth, focal, misfit(residual), change, lenses, joined
     )

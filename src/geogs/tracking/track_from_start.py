@@ -49,8 +49,8 @@ def track_from_start(local: LocalMapping, locator: FrameLocator) -> None:
         if motion is None:
             continue
         placed[record.index] = motion.T_cw
-        first, *_, latest = (k.frame_index for k in keyframes)
-        is_outside = not first <= record.index <= latest
+        known = [k.frame_index for k in keyframes]
+        is_outside = not known[0] <= record.index <= known[-1]
         if was is not None and given_up[was] is record and is_outside and _is_far(local, motion):
             local.extend(record, was, motion)
             extended.append(was)

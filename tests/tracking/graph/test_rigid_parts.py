@@ -62,6 +62,18 @@ def test_a_structure_is_handed_on_by_enough_of_the_cells(fraction, members):
     assert len(largest_part(graph.keyframes, graph.edges, 0.2)) == COUNT
 
 
+def test_keyframes_that_are_fixed_are_of_one_piece():
+    """There are no edges between those of a saved map."""
+    graph = walked()
+    edges = {e: v for e, v in graph.edges.items() if not {0, 1, 2}.issuperset(e)}
+    edges = {e: v for e, v in edges.items() if set(e) not in ({3, 4}, {2, 4}, {3, 5})}
+    edges |= {e: graph.edges[e] for e in ((2, 3), (3, 2))}
+    graph.measure([(0, 5)])
+    edges |= {e: graph.edges[e] for e in ((0, 5), (5, 0))}
+    assert largest_part(graph.keyframes, edges) == {0, 4, 5, 6}
+    assert largest_part(graph.keyframes, edges, fixed={0, 1, 2}) == set(range(COUNT))
+
+
 def test_without_edges_nothing_is_held():
     graph = walked()
     assert largest_part(graph.keyframes, {}) == frozenset()

@@ -28,7 +28,7 @@ MAX_LENS_CHANGE = 0.1
 """Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
 has one (docs/lens.md)."""
 MIN_JOINED = 0.95
-"""Fraction of the keyframes that their images join; of the others a few may be out of place."""
+"""Fraction of the keyframes that one structure holds; of the others a few may be out of place."""
 NO_SHAPE = 0.5
 """Relative deviation of the best known depths from which on they are no evidence of a surface."""
 
@@ -58,7 +58,7 @@ class Verdict:
     lens_change: float = 0.0
     """Part of the matches' cost that is left because the lens changes from frame to frame."""
     joined: float = 1.0
-    """Fraction of the keyframes in the largest group that their images join."""
+    """Fraction of the keyframes in the largest part that one rigid structure holds together."""
 
     @property
     def has_shape(self) -> bool:
@@ -129,8 +129,8 @@ def verdict(
         )
     if known.joined < MIN_JOINED:
         reasons.append(
-            "the images do not agree with how parts of its path stand to each other, the longest "
-            f"of which has {known.joined:.0%} of the keyframes, as where something fills the view"
+            "nothing says how parts of its path stand to each other, the longest of which has "
+            f"{known.joined:.0%} of the keyframes, as where something fills the view"
         )
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."

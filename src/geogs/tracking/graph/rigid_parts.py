@@ -8,6 +8,7 @@ so no structure hands anything on.
 """
 
 from collections.abc import Collection, Mapping
+from itertools import pairwise
 
 import torch
 
@@ -27,12 +28,16 @@ least was 0.45; of nine that people in between held together 0.35 the most."""
 
 
 def largest_part(
-    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], shared: float = MIN_SHARED
+    keyframes: KeyframeSet,
+    edges: Mapping[Pair, Edge],
+    shared: float = MIN_SHARED,
+    fixed: Collection[int] = (),
 ) -> frozenset[int]:
     """The most keyframes that one structure holds together, of several such parts the earliest.
 
     ``edges`` lead both ways between the keyframes of each pair; two of one keyframe are held by one
-    structure where so large a part of the cells that agree with either is ``shared``.
+    structure where so large a part of the cells that agree with either is ``shared``, and all of
+    keyframes that are ``fixed``.
     """
     support: dict[Pair, float] = {}
     joints: list[tuple[Pair, Pair]] = []
@@ -50,8 +55,9 @@ def largest_part(
         support.update(zip(some, count.tolist(), strict=True))
     least = MIN_SUPPORT * keyframes.grid.size
     holding = {p for p in support if p[0] < p[1] and min(support[p], support[p[::-1]]) >= least}
-    pairs = [(min(e, e[::-1]), min(f, f[::-1])) for e, f in joints]
-    parts = _connected(holding, [(p, q) for p, q in pairs if p in holding and q in holding])
+    links = [(min(e, e[::-1]), min(f, f[::-1])) for e, f in joints]
+    links += pairwise(p for p in sorted(holding) if p[0] in fixed or p[1] in fixed)
+    parts = _connected(holding, [(p, q) for p, q in links if p in holding and q in holding])
     members = (frozenset(k for pair in part for k in pair) for part in parts)
     return max(members, key=lambda part: (len(part), -min(part)), default=frozenset())
 
