@@ -39,8 +39,7 @@ def track_from_start(local: LocalMapping, locator: FrameLocator) -> None:
     # Of the frames on a keyframe that was given up the earliest was that keyframe.
     given_up = {r.anchor: r for r in reversed(waiting) if r.anchor is not None}
     last, extended = max(placed), list[int]()
-    before = [r for r in reversed(waiting) if r.index < last]
-    for record in [*before, *(r for r in waiting if r.index > last)]:
+    for record in sorted(waiting, key=lambda r: (r.index > last, abs(r.index - last))):
         guess = placed[min(placed, key=lambda index: abs(index - record.index))]
         R = orientations(rotations, {n: T[:3, :3] for n, T in placed.items()}).get(record.index)
         guess = guess if R is None else _turned(guess, R)

@@ -7,9 +7,10 @@ between two parts tells: its cells that agree with the one are not those that ag
 so no structure hands anything on.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
 
 from geogs.bundle.problem import source_chunks
@@ -54,27 +55,25 @@ def largest_part(
         joints += [(some[a], some[b]) for a, b in is_joint.triu(1).nonzero().tolist()]
         support.update(zip(some, count.tolist(), strict=True))
     least = MIN_SUPPORT * keyframes.grid.size
-    holding = {p for p in support if p[0] < p[1] and min(support[p], support[p[::-1]]) >= least}
+    holding = [p for p in support if p[0] < p[1] and min(support[p], support[p[::-1]]) >= least]
     links = [(min(e, e[::-1]), min(f, f[::-1])) for e, f in joints]
-    links += pairwise(p for p in sorted(holding) if p[0] in fixed or p[1] in fixed)
-    parts = _connected(holding, [(p, q) for p, q in links if p in holding and q in holding])
-    members = (frozenset(k for pair in part for k in pair) for part in parts)
-    return max(members, key=lambda part: (len(part), -min(part)), default=frozenset())
+    links += pairwise(p for p in holding if p[0] in fixed or p[1] in fixed)
+    members: dict[int, set[int]] = {}
+    for pair, part in zip(holding, _components(holding, links), strict=True):
+        members.setdefault(part, set()).update(pair)
+    largest = max(members.values(), key=lambda part: (len(part), -min(part)), default=set[int]())
+    return frozenset(largest)
 
 
-def _connected(nodes: Collection[Pair], links: Collection[tuple[Pair, Pair]]) -> list[list[Pair]]:
-    """Connected components; SciPy's would be imported before the map has started."""
-    parent = {node: node for node in sorted(nodes)}
+def _components(nodes: Sequence[Pair], links: Sequence[tuple[Pair, Pair]]) -> list[int]:
+    """The number of the connected part of each node; links of what is no node join nothing."""
+    from scipy.sparse import coo_array  # no frame before a start has need of it
+    from scipy.sparse.csgraph import connected_components
 
-    def root(node: Pair) -> Pair:
-        while parent[node] != node:
-            parent[node] = parent[parent[node]]
-            node = parent[node]
-        return node
-
-    for a, b in links:
-        parent[root(a)] = root(b)
-    found: dict[Pair, list[Pair]] = {}
-    for node in parent:
-        found.setdefault(root(node), []).append(node)
-    return list(found.values())
+    if not nodes:
+        return []
+    number = {node: n for n, node in enumerate(nodes)}
+    ends = [(number[a], number[b]) for a, b in links if a in number and b in number]
+    index = np.array(ends, np.int64).reshape(-1, 2).T
+    matrix = coo_array((np.ones(len(ends)), index), shape=(len(nodes), len(nodes)))
+    return connected_components(matrix, directed=False)[1].tolist()
