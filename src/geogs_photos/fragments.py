@@ -6,6 +6,10 @@ positioning, adjustment; Pan et al. 2024) takes all pairs at once. It comes next
 the time of incremental mapping and places neither more nor better what that places whole. At last
 matches are verified once more with the focal length of the largest part, which short parts cannot
 tell, and mapped incrementally.
+
+What comes of that tells the camera, and how near matches lie to what one motion of it explains.
+With both, all is mapped once more: what moves by itself lies farther, and no longer pulls the poses
+along.
 """
 
 import shutil
@@ -23,10 +27,12 @@ from geogs.threads import worker_count
 from geogs_photos.contradictions import false_pairs, undisputed
 from geogs_photos.database import SharedCamera, known_cameras
 from geogs_photos.incremental_mapping import (
+    CLOSE,
     LEAST_POINTS,
     largest_first,
     placed_images,
     put_together,
+    refine,
     without_poses,
 )
 from geogs_photos.known_positions import with_known_positions
@@ -35,7 +41,8 @@ from geogs_photos.pycolmap_library import load_colmap
 LEAST_VIEWS = 3
 """Pictures that see a point which passes the scale on from one to another."""
 WHOLE = 0.9
-"""Part of the frames that one reconstruction has to hold for nothing else to be tried."""
+"""Part of the frames that one reconstruction has to hold for nothing else to be tried, and of its
+frames that one of close matches has to hold."""
 
 
 def rejoined(
@@ -46,7 +53,7 @@ def rejoined(
     seed: int,
     progress: Callable[[str, float], None],
 ) -> list[Any]:
-    """Reconstructions by the way that puts most frames into one; ``parts`` are by the first.
+    """Reconstructions by the way that puts most frames into one, of close matches where these do.
 
     Args:
         parts: by incremental mapping, the largest first.
@@ -76,6 +83,13 @@ def rejoined(
             best[0], database, count, seed, lambda f: progress("finding poses again", f)
         )
         best = max(best, _believed(again, database, is_known), key=_placed)
+    if best:
+        again = _closely(
+            best[0], database, count, cameras, seed, lambda f: progress("finding poses again", f)
+        )
+        closer = _believed(again, database, is_known)
+        if _placed(closer) >= WHOLE * _placed(best):
+            best = closer
     return best
 
 
@@ -186,17 +200,37 @@ def _with_camera_of(
     progress: Callable[[float], None],
 ) -> list[Any]:
     colmap = load_colmap()
-    own = database.with_name("again.db")
-    shutil.copy(database, own)
+    own = _with_cameras(model, database, "again.db")
     with closing(colmap.Database.open(own)) as opened:
-        for number in model.cameras:
-            camera = opened.read_camera(number)
-            camera.params = model.cameras[number].params
-            camera.has_prior_focal_length = True
-            opened.update_camera(camera)
         opened.clear_two_view_geometries()
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     colmap.geometric_verification(own, two_view_geometry_options=verification)
     known = list(model.cameras)
     return put_together(own, own.with_name("again"), count, known, seed, progress)
+
+
+def _closely(
+    model: Any,
+    database: Path,
+    count: int,
+    cameras: Sequence[SharedCamera],
+    seed: int,
+    progress: Callable[[float], None],
+) -> list[Any]:
+    first = refine(load_colmap().Reconstruction(model), cameras)
+    first.update_point_3d_errors()
+    within = CLOSE * first.compute_mean_reprojection_error()
+    own, known = _with_cameras(first, database, "closely.db"), list(first.cameras)
+    return put_together(own, own.with_name("closely"), count, known, seed, progress, within)
+
+
+def _with_cameras(model: Any, database: Path, name: str) -> Path:
+    """A copy of the database, with the cameras of a reconstruction."""
+    own = database.with_name(name)
+    shutil.copy(database, own)
+    with closing(load_colmap().Database.open(own)) as opened:
+        for camera in model.cameras.values():
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)
+    return own

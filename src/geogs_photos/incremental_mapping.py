@@ -1,6 +1,7 @@
 """Poses, cameras and points of matched photographs, by pycolmap's incremental mapping."""
 
 import itertools
+import math
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -23,6 +24,12 @@ FREE_POINTS = 300
 """Points that each of these pictures sees, in the mean, at least."""
 MAX_OFFSET = 0.08
 """Most that a found principal point may lie from the middle, as a part of the longer side."""
+CLOSE = 3.0
+"""Times the mean distance of points from where they are seen, within which matches count once that
+is known. To pycolmap's usual four pixels people who cross the view agree with poses that are
+centimetres off; within less than this what rolling rows move counts too little."""
+POSE_FACTOR = 3.0
+"""Times that within which matches place a picture before it takes part in the adjustment."""
 _ITERATIONS, _TOLERANCE = 50, 1e-6
 
 
@@ -33,6 +40,7 @@ def put_together(
     known: Sequence[int],
     seed: int,
     progress: Callable[[float], None],
+    within: float | None = None,
 ) -> list[Any]:
     """Reconstructions of the parts that hang together, the largest first.
 
@@ -43,8 +51,11 @@ def put_together(
         known: numbers of the cameras that stay as they are.
         seed: of the random choices.
         progress: called with the finished part; what it raises ends the work.
+        within: pixels that a point may be from where it is seen; none is pycolmap's usual.
     """
     options = _options(known, seed, min_model_size=LEAST_IMAGES)
+    if within is not None:
+        _keep_within(options, within, of_poses(database, {})[0].cameras.values())
     work.mkdir(parents=True, exist_ok=True)
     models = load_colmap().incremental_mapping(
         database, work, work, options=options, next_image_callback=_counting(2, count, progress)
@@ -62,6 +73,8 @@ def continued(
     """The reconstruction of pictures whose poses are known, and of what joins them; none if these
     see no point.
 
+    How near a point has to be to where it is seen, those of the known poses say.
+
     Args:
         database: with verified matches; its one camera is known.
         work: folder for what pycolmap writes.
@@ -76,9 +89,13 @@ def continued(
     model, count = of_poses(database, known)
     for folder in (begun, went_on):
         folder.mkdir(parents=True, exist_ok=True)
-    model = colmap.triangulate_points(model, database, work, begun, options=options)
-    if not model.num_points3D():
-        return None
+    for is_first in (True, False):
+        model = colmap.triangulate_points(model, database, work, begun, options=options)
+        if not model.num_points3D():
+            return None
+        if is_first:
+            within = CLOSE * model.compute_mean_reprojection_error()
+            _keep_within(options, within, model.cameras.values())
     model.write(begun)
     models = colmap.incremental_mapping(
         database, work, went_on, options=options, input_path=begun,
@@ -95,6 +112,17 @@ def _options(known: Sequence[int], seed: int, **more: Any) -> Any:
     options.constant_cameras = set(known)
     options.mapper.random_seed = options.triangulation.random_seed = seed
     return options
+
+
+def _keep_within(options: Any, within: float, cameras: Iterable[Any]) -> None:
+    """Have points lie within so many pixels of where they are seen, or their rays miss them by as
+    much."""
+    angle = math.degrees(within / min(camera.mean_focal_length() for camera in cameras))
+    options.mapper.filter_max_reproj_error = within
+    options.mapper.abs_pose_max_error = POSE_FACTOR * within
+    points = options.triangulation
+    points.complete_max_reproj_error = points.merge_max_reproj_error = within
+    points.create_max_angle_error = points.continue_max_angle_error = angle
 
 
 def _counting(placed: int, count: int, progress: Callable[[float], None]) -> Callable[[], None]:
@@ -160,9 +188,10 @@ def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:
     trial = colmap.Reconstruction(model)
     for number in free:
         camera = trial.cameras[number]
-        focal, cx, cy, k1 = camera.params
-        camera.model = colmap.CameraModelId.RADIAL
-        camera.params = [focal, cx, cy, k1, 0.0]
+        if camera.model != colmap.CameraModelId.RADIAL:
+            focal, cx, cy, k1 = camera.params
+            camera.model = colmap.CameraModelId.RADIAL
+            camera.params = [focal, cx, cy, k1, 0.0]
     if free:
         _adjust(colmap, trial, set(model.cameras) - free, with_centres=True)
         if all(_is_central(trial.cameras[number]) for number in free):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
+from geogs.application.structure_from_motion.completion import as_seen
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
@@ -61,7 +62,7 @@ def test_of_all_ways_the_one_that_puts_most_into_one(
     def by_way(name: str, sizes: list[int]):
         def way(*given: object) -> list[Part]:
             asked.append(name)
-            assert Path("pruned" if false and name != "without" else "all") in given
+            assert Path("pruned" if "without" in asked[:-1] else "all") in given
             return [Part(n) for n in sizes]
 
         return way
@@ -73,10 +74,21 @@ def test_of_all_ways_the_one_that_puts_most_into_one(
     monkeypatch.setattr(fragments, "_without", lambda *given: (by_rest(*given), Path("pruned")))
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
+    monkeypatch.setattr(fragments, "_closely", by_way("closely", []))
     parts = [Part(n) for n in first]
     found = rejoined(parts, Path("all"), 100, [CAMERA], 0, lambda *_: None)
-    assert asked == tried
+    assert asked == [*tried, *(["closely"] if best else [])]
     assert (found[0].frames if found else None) == best
+
+
+@pytest.mark.parametrize(("closely", "taken"), [([90], 90), ([89], 100), ([], 100)])
+def test_close_matches_are_taken_where_they_place_nearly_as_much(monkeypatch, closely, taken):
+    monkeypatch.setattr(fragments, "believed", lambda part, _: part)
+    monkeypatch.setattr(fragments, "with_known_positions", lambda part, _: part)
+    monkeypatch.setattr(fragments, "false_pairs", lambda *_: [])
+    monkeypatch.setattr(fragments, "_closely", lambda *_: [Part(n) for n in closely])
+    found = rejoined([Part(100)], Path("all"), 100, [CAMERA], 0, lambda *_: None)
+    assert found[0].frames == taken
 
 
 def model_of(pictures: int, points: Iterable[Sequence[int]]) -> Any:
@@ -145,6 +157,8 @@ def test_each_way_places_a_room(monkeypatch):
         found = {"globally": fragments._globally(given[0], False, 0)}
         arguments = (parts[0], given[0], 9, 0, lambda _: None)
         found["again"] = fragments._with_camera_of(*arguments)
+        one = SharedCamera(as_seen(room.camera, None), is_known=False)
+        found["closely"] = fragments._closely(*arguments[:3], [one], 0, lambda _: None)
         rest = fragments._without([(1, 2), (4, 9)], given[0], 9, [], 0, lambda _: None)
         found["without"] = rest[0]
         for way in found.values():

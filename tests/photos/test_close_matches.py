@@ -1,0 +1,39 @@
+"""People who cross the view do not pull the poses of frames along that show little else."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geogs.application.structure_from_motion.completion import as_seen
+from geogs.config import InputConfig
+from geogs.io.sources.sniff import open_source
+from geogs_photos import incremental_mapping
+from geogs_photos.completion import place_lost
+from geogs_synth.sequence.replica_files import write_sequence
+
+LOST = range(6, 11)
+"""Frames that people fill to a half."""
+
+
+def errors(room: Path) -> np.ndarray:
+    """How far the lost frames come to lie from where they were taken, metres."""
+    T_wc = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)
+    source = open_source((room,), InputConfig())
+    poses = [None if k in LOST else np.linalg.inv(T) for k, T in enumerate(T_wc)]
+    seen_by = as_seen(source.camera, None)
+    found = place_lost(list(source), poses, seen_by, 0, lambda *_: None)
+    assert set(found.numbers) == set(LOST)
+    centres = np.linalg.inv(found.T_cw)[:, :3, 3]
+    return np.linalg.norm(centres - T_wc[list(found.numbers), :3, 3], axis=1)
+
+
+@pytest.mark.system
+def test_lost_frames_stand_to_the_room_and_not_to_people(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    write_sequence(tmp_path, 18, 240, 180, 233, motion="handheld-5hz", moving=0.5)
+    close = errors(tmp_path)
+    monkeypatch.setattr(incremental_mapping, "_keep_within", lambda *_: None)
+    loose = errors(tmp_path)
+    assert close.max() < 0.03
+    assert loose.max() > 0.08
