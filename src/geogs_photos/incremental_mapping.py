@@ -28,6 +28,8 @@ CLOSE = 3.0
 """Times the mean distance of points from where they are seen, within which matches count once that
 is known. To pycolmap's usual four pixels people who cross the view agree with poses that are
 centimetres off; within less than this what rolling rows move counts too little."""
+LEAST_WITHIN = 0.3
+"""Pixels; features are hardly found where they are to less."""
 POSE_FACTOR = 3.0
 """Times that within which matches place a picture before it takes part in the adjustment."""
 _ITERATIONS, _TOLERANCE = 50, 1e-6
@@ -55,7 +57,8 @@ def put_together(
     """
     options = _options(known, seed, min_model_size=LEAST_IMAGES)
     if within is not None:
-        _keep_within(options, within, of_poses(database, {})[0].cameras.values())
+        with closing(load_colmap().Database.open(database)) as opened:
+            _keep_within(options, within, opened.read_all_cameras())
     work.mkdir(parents=True, exist_ok=True)
     models = load_colmap().incremental_mapping(
         database, work, work, options=options, next_image_callback=_counting(2, count, progress)
@@ -116,7 +119,8 @@ def _options(known: Sequence[int], seed: int, **more: Any) -> Any:
 
 def _keep_within(options: Any, within: float, cameras: Iterable[Any]) -> None:
     """Have points lie within so many pixels of where they are seen, or their rays miss them by as
-    much."""
+    much; no more than usual."""
+    within = min(max(within, LEAST_WITHIN), options.mapper.filter_max_reproj_error)
     angle = math.degrees(within / min(camera.mean_focal_length() for camera in cameras))
     options.mapper.filter_max_reproj_error = within
     options.mapper.abs_pose_max_error = POSE_FACTOR * within
