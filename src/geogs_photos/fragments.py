@@ -9,7 +9,8 @@ tell, and mapped incrementally.
 
 What comes of that tells the camera, and how near matches lie to what one motion of it explains.
 With both, all is mapped once more: what moves by itself lies farther, and no longer pulls the poses
-along.
+along. Incremental mapping may fall for false matches then that global mapping did not, so frames
+have to stay about where they were.
 """
 
 import shutil
@@ -19,21 +20,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from geogs.evaluation.trajectory_errors import extent_of
+from geogs.geometry.umeyama import umeyama
 from geogs.threads import worker_count
 from geogs_photos.contradictions import false_pairs, undisputed
 from geogs_photos.database import SharedCamera, known_cameras
 from geogs_photos.incremental_mapping import (
     CLOSE,
+    LEAST_IMAGES,
     LEAST_POINTS,
     largest_first,
     placed_images,
     put_together,
     refine,
     without_poses,
+    world_to_camera,
 )
 from geogs_photos.known_positions import with_known_positions
 from geogs_photos.pycolmap_library import load_colmap
@@ -42,7 +48,9 @@ LEAST_VIEWS = 3
 """Pictures that see a point which passes the scale on from one to another."""
 WHOLE = 0.9
 """Part of the frames that one reconstruction has to hold for nothing else to be tried, and of its
-frames that one of close matches has to hold."""
+frames that one of close matches has to hold at the same places."""
+SAME_PLACE = 0.15
+"""Part of the extent of the path. What moves pulls frames by a tenth; a wrong world is anywhere."""
 
 
 def rejoined(
@@ -84,13 +92,31 @@ def rejoined(
         )
         best = max(best, _believed(again, database, is_known), key=_placed)
     if best:
-        again = _closely(
-            best[0], database, count, cameras, seed, lambda f: progress("finding poses again", f)
-        )
+        first = refine(load_colmap().Reconstruction(best[0]), cameras)
+        again = _closely(first, database, count, seed, lambda f: progress("finding poses again", f))
         closer = _believed(again, database, is_known)
-        if _placed(closer) >= WHOLE * _placed(best):
+        if closer and same_places(first, closer[0]):
             best = closer
     return best
+
+
+def same_places(one: Any, other: Any) -> bool:
+    """Whether ``WHOLE`` of the frames of one reconstruction lie at the same places in the other.
+
+    The same is what is no farther off than ``SAME_PLACE`` of their extent, after the best
+    similarity.
+    """
+    poses = {image.name: world_to_camera(image) for image in placed_images(one)}
+    there = {image.name: world_to_camera(image) for image in placed_images(other)}
+    both = sorted(poses.keys() & there.keys())
+    if len(both) < max(WHOLE * len(poses), LEAST_IMAGES):
+        return False
+    T_wc, found = (np.linalg.inv([of[name] for name in both]) for of in (poses, there))
+    a, b = (torch.from_numpy(T[:, :3, 3]) for T in (found, T_wc))
+    scale, R, t = umeyama(a, b)
+    off = (scale * a @ R.T + t - b).norm(dim=1).numpy()
+    is_same = off <= SAME_PLACE * extent_of(T_wc)
+    return bool(is_same.sum() >= WHOLE * len(poses))
 
 
 def believed(model: Any, database: Path, known: Container[int] = ()) -> Any:
@@ -214,14 +240,12 @@ def _closely(
     model: Any,
     database: Path,
     count: int,
-    cameras: Sequence[SharedCamera],
     seed: int,
     progress: Callable[[float], None],
 ) -> list[Any]:
-    first = refine(load_colmap().Reconstruction(model), cameras)
-    first.update_point_3d_errors()
-    within = CLOSE * first.compute_mean_reprojection_error()
-    own, known = _with_cameras(first, database, "closely.db"), list(first.cameras)
+    model.update_point_3d_errors()
+    within = CLOSE * model.compute_mean_reprojection_error()
+    own, known = _with_cameras(model, database, "closely.db"), list(model.cameras)
     return put_together(own, own.with_name("closely"), count, known, seed, progress, within)
 
 

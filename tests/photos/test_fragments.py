@@ -1,6 +1,7 @@
 """Ways that are tried where structure from motion of a video falls into parts."""
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames
-from geogs.application.structure_from_motion.completion import as_seen
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
@@ -75,20 +75,45 @@ def test_of_all_ways_the_one_that_puts_most_into_one(
     monkeypatch.setattr(fragments, "_globally", by_way("globally", globally))
     monkeypatch.setattr(fragments, "_with_camera_of", by_way("again", again))
     monkeypatch.setattr(fragments, "_closely", by_way("closely", []))
+    _without_refinement(monkeypatch)
     parts = [Part(n) for n in first]
     found = rejoined(parts, Path("all"), 100, [CAMERA], 0, lambda *_: None)
     assert asked == [*tried, *(["closely"] if best else [])]
     assert (found[0].frames if found else None) == best
 
 
-@pytest.mark.parametrize(("closely", "taken"), [([90], 90), ([89], 100), ([], 100)])
-def test_close_matches_are_taken_where_they_place_nearly_as_much(monkeypatch, closely, taken):
+def _without_refinement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fragments, "load_colmap", lambda: SimpleNamespace(Reconstruction=copy))
+    monkeypatch.setattr(fragments, "refine", lambda model, _: model)
+
+
+def path_of(frames: int, astray: int = 0) -> Any:
+    """A reconstruction of a bent path, the last frames of which lie beside it."""
+    images = {}
+    for k in range(frames):
+        T = np.eye(4)
+        T[:3, 3] = -np.array([0.1 * k, np.sin(0.1 * k), 2.0 * (k >= frames - astray)])
+        pose = SimpleNamespace(matrix=lambda T=T: T[:3])
+        images[k] = SimpleNamespace(
+            name=f"{k:03d}", has_pose=True, num_points3D=20, cam_from_world=lambda pose=pose: pose
+        )
+    return SimpleNamespace(images=images, cameras=())
+
+
+@pytest.mark.parametrize(
+    ("closely", "taken"), [((90,), 1), ((89,), 0), ((100, 3), 1), ((100, 20), 0), (None, 0)]
+)
+def test_close_matches_are_taken_where_nearly_all_frames_stay_where_they_were(
+    monkeypatch, closely, taken
+):
     monkeypatch.setattr(fragments, "believed", lambda part, _: part)
     monkeypatch.setattr(fragments, "with_known_positions", lambda part, _: part)
     monkeypatch.setattr(fragments, "false_pairs", lambda *_: [])
-    monkeypatch.setattr(fragments, "_closely", lambda *_: [Part(n) for n in closely])
-    found = rejoined([Part(100)], Path("all"), 100, [CAMERA], 0, lambda *_: None)
-    assert found[0].frames == taken
+    first, again = path_of(100), [] if closely is None else [path_of(*closely)]
+    monkeypatch.setattr(fragments, "_closely", lambda *_: again)
+    _without_refinement(monkeypatch)
+    found = rejoined([first], Path("all"), 100, [CAMERA], 0, lambda *_: None)
+    assert (found[0] is not first) == taken
 
 
 def model_of(pictures: int, points: Iterable[Sequence[int]]) -> Any:
@@ -157,8 +182,7 @@ def test_each_way_places_a_room(monkeypatch):
         found = {"globally": fragments._globally(given[0], False, 0)}
         arguments = (parts[0], given[0], 9, 0, lambda _: None)
         found["again"] = fragments._with_camera_of(*arguments)
-        one = SharedCamera(as_seen(room.camera, None), is_known=False)
-        found["closely"] = fragments._closely(*arguments[:3], [one], 0, lambda _: None)
+        found["closely"] = fragments._closely(*arguments)
         rest = fragments._without([(1, 2), (4, 9)], given[0], 9, [], 0, lambda _: None)
         found["without"] = rest[0]
         for way in found.values():
