@@ -20,13 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from geogs.evaluation.trajectory_errors import extent_of
-from geogs.geometry.umeyama import umeyama
 from geogs.threads import worker_count
 from geogs_photos.contradictions import false_pairs, undisputed
 from geogs_photos.database import SharedCamera, known_cameras
@@ -38,6 +36,7 @@ from geogs_photos.incremental_mapping import (
     placed_images,
     put_together,
     refine,
+    shifts,
     without_poses,
     world_to_camera,
 )
@@ -106,17 +105,13 @@ def same_places(one: Any, other: Any) -> bool:
     The same is what is no farther off than ``SAME_PLACE`` of their extent, after the best
     similarity.
     """
-    poses = {image.name: world_to_camera(image) for image in placed_images(one)}
-    there = {image.name: world_to_camera(image) for image in placed_images(other)}
-    both = sorted(poses.keys() & there.keys())
-    if len(both) < max(WHOLE * len(poses), LEAST_IMAGES):
+    images, there = placed_images(one), {image.image_id for image in placed_images(other)}
+    both = [image for image in images if image.image_id in there]
+    if len(both) < max(WHOLE * len(images), LEAST_IMAGES):
         return False
-    T_wc, found = (np.linalg.inv([of[name] for name in both]) for of in (poses, there))
-    a, b = (torch.from_numpy(T[:, :3, 3]) for T in (found, T_wc))
-    scale, R, t = umeyama(a, b)
-    off = (scale * a @ R.T + t - b).norm(dim=1).numpy()
-    is_same = off <= SAME_PLACE * extent_of(T_wc)
-    return bool(is_same.sum() >= WHOLE * len(poses))
+    extent = extent_of(np.linalg.inv([world_to_camera(image) for image in both]))
+    is_same = shifts(other, one, [image.image_id for image in both]) <= SAME_PLACE * extent
+    return bool(is_same.sum() >= WHOLE * len(images))
 
 
 def believed(model: Any, database: Path, known: Container[int] = ()) -> Any:

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
+from geogs.geometry.umeyama import umeyama
 from geogs.threads import worker_count
 from geogs_photos.database import SharedCamera
 from geogs_photos.pycolmap_library import load_colmap
@@ -177,6 +179,17 @@ def world_to_camera(image: Any) -> Float64[np.ndarray, "4 4"]:
     T = np.eye(4)
     T[:3] = image.cam_from_world().matrix()
     return T
+
+
+def shifts(one: Any, other: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "n"]:
+    """How far pictures were taken in one reconstruction from where they were in another, after the
+    similarity that fits them best, in units of the other."""
+    before, now = (
+        torch.from_numpy(np.stack([m.images[n].projection_center() for n in numbers]))
+        for m in (one, other)
+    )
+    scale, R, t = umeyama(before, now)
+    return (scale * before @ R.T + t - now).norm(dim=1).numpy()
 
 
 def refine(model: Any, cameras: Sequence[SharedCamera]) -> Any:

@@ -9,12 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 from scipy.linalg import logm
 
-from geogs.geometry.umeyama import umeyama
-from geogs_photos.incremental_mapping import placed_images, world_to_camera
+from geogs_photos.incremental_mapping import placed_images, shifts, world_to_camera
 from geogs_photos.pycolmap_library import load_colmap
 from geogs_photos.verified_matches import MAX_ERROR
 
@@ -52,13 +50,8 @@ def with_rows_at_once(
     found = _adjusted(model, times, float(np.clip(best, -MAX_READOUT, MAX_READOUT)) * step, adjust)
     for number in [n for n, point in found.points3D.items() if not point.error <= MAX_ERROR]:
         found.delete_point3D(number)
-    images = placed_images(found)
-    before, now = (
-        torch.from_numpy(np.stack([m.images[i.image_id].projection_center() for i in images]))
-        for m in (model, found)
-    )
-    scale, R, t = umeyama(before, now)
-    return found, UNSURE_FRACTION * (scale * before @ R.T + t - now).norm(dim=1).numpy()
+    numbers = [image.image_id for image in placed_images(found)]
+    return found, UNSURE_FRACTION * shifts(model, found, numbers)
 
 
 def _square(model: Any) -> float:

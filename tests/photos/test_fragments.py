@@ -95,8 +95,9 @@ def path_of(frames: int, astray: int = 0) -> Any:
         T[:3, 3] = -np.array([0.1 * k, np.sin(0.1 * k), 2.0 * (k >= frames - astray)])
         pose = SimpleNamespace(matrix=lambda T=T: T[:3])
         images[k] = SimpleNamespace(
-            name=f"{k:03d}", has_pose=True, num_points3D=20, cam_from_world=lambda pose=pose: pose
-        )
+            image_id=k, name=f"{k:03d}", has_pose=True, num_points3D=20,
+            cam_from_world=lambda pose=pose: pose, projection_center=lambda T=T: -T[:3, 3],
+        )  # fmt: skip
     return SimpleNamespace(images=images, cameras=())
 
 
