@@ -3,9 +3,10 @@
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from geogs.application.structure_from_motion.completion import about
 from geogs.io.sources.calibration import Calibration
@@ -13,7 +14,7 @@ from geogs.stopwatch import StageProgress
 from geogs.types import FoundFrames, Frame
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.deviations import pose_deviations
-from geogs_photos.fragments import believed
+from geogs_photos.fragments import believed, parts_of_one_scale
 from geogs_photos.incremental_mapping import continued, placed_images, world_to_camera
 from geogs_photos.photo_features import frame_features
 from geogs_photos.photo_pairs import frame_pairs
@@ -45,12 +46,33 @@ def place_lost(
         model = believed(model, database, known)
     images = placed_images(model)
     is_known = np.array([image.image_id in known for image in images], bool)
-    beside = [sorted(about([k], np.flatnonzero(is_known).tolist())) for k in range(len(images))]
     if is_known.all():
         return FoundFrames.none()
+    deviations = deviations_by_part(model, images, is_known)
     poses = np.stack([world_to_camera(image) for image in images])
-    deviations = pose_deviations(model, images, poses, True, beside)
     of = [frames[int(image.name)] for image in images]
     times = np.array([frame.timestamp for frame in of], np.float64)
     numbers = tuple(frame.index for frame in of)
     return FoundFrames(numbers, times, poses, *deviations).of(~is_known)
+
+
+def deviations_by_part(
+    model: Any, images: Sequence[Any], is_known: Bool[np.ndarray, "n"]
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Standard deviations of the pictures' centres (world units) and orientations (radians) beside
+    the known ones nearest to each; infinite where no two of them are joined to it, as one tells no
+    scale.
+
+    Known ones at either end of a stretch, whose matches do not join them, are parts of their own:
+    how these lie to each other is not for matches to tell.
+    """
+    position, rotation = np.full((2, len(images)), np.inf)
+    for part in parts_of_one_scale(model, [image.image_id for image in images]):
+        known = [n for n, k in enumerate(part) if is_known[k]]
+        if len(known) < 2:
+            continue
+        own = [images[k] for k in part]
+        poses = np.stack([world_to_camera(image) for image in own])
+        beside = [sorted(about([n], known)) for n in range(len(own))]
+        position[part], rotation[part] = pose_deviations(model, own, poses, True, beside)
+    return position, rotation

@@ -7,11 +7,16 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.linalg import block_diag
 
+from geogs_photos.incremental_mapping import without_poses
 from geogs_photos.pycolmap_library import load_colmap
 
 COMMON_ERROR_FACTOR = 2.3
 """Times a deviation is larger than if all points erred by themselves: one that is seen a little
 beside its place is so in most views. Measured on videos with a truth (docs/photographs.md)."""
+NEAREST = 0.02
+"""Part of the median depth of what a picture sees: a point nearer to it is false, and would be
+worth more than thousands of others. One in the very centre of a picture's camera, as false matches
+make it, leaves no covariance at all."""
 
 
 def pose_deviations(
@@ -25,7 +30,8 @@ def pose_deviations(
 
     From the covariance of the adjustment; what a similarity of the world
     changes is taken out, so that it is what is left after the best alignment. Infinite where the
-    covariance cannot be computed.
+    covariance cannot be computed. What other pictures see, and points in front of the lens, count
+    for nothing.
 
     Args:
         model: the reconstruction.
@@ -36,6 +42,7 @@ def pose_deviations(
             as their matches leave them: what hangs on at an end sways with that. None fits all.
     """
     colmap = load_colmap()
+    model = _evidence(model, images, T_cw)
     error = float(model.compute_mean_reprojection_error())  # deviation of a measured point, pixels
     options = colmap.BundleAdjustmentOptions(
         print_summary=False, refine_principal_point=not is_known
@@ -96,6 +103,23 @@ def _left(
         free[:, rows] -= gauge[own] @ np.linalg.pinv(gauge[rows])
         left[k] = np.sqrt(np.trace(free @ covariance @ free.T).clip(0))
     return left
+
+
+def _evidence(model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 4"]) -> Any:
+    """The reconstruction with these pictures alone, without points nearer than ``NEAREST``."""
+    model = load_colmap().Reconstruction(model)
+    own = [image.image_id for image in images]
+    placed = {image.image_id for image in model.images.values() if image.has_pose}
+    model, near = without_poses(model, placed - {*own}), set[int]()
+    for number, T in zip(own, T_cw, strict=True):
+        seen = [p.point3D_id for p in model.images[number].points2D if p.has_point3D()]
+        xyz = np.array([model.points3D[point].xyz for point in seen]).reshape(-1, 3)
+        depth = xyz @ T[2, :3] + T[2, 3]
+        is_near = depth < NEAREST * (np.median(depth) if len(depth) else 0.0)
+        near.update(np.array(seen, np.int64)[is_near].tolist())
+    for point in near:
+        model.delete_point3D(point)
+    return model
 
 
 def _covariance(model: Any, config: Any, options: Any) -> Any | None:

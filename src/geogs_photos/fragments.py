@@ -132,14 +132,29 @@ def firmly_joined(model: Any, known: Container[int] = ()) -> Any:
     and how far one is as seen from the other is made up: about a single centre any scale fits.
     """
     images = sorted(image.image_id for image in model.images.values() if image.has_pose)
-    place = {number: k for k, number in enumerate(images)}
-    views = (sorted({e.image_id for e in p.track.elements}) for p in model.points3D.values())
-    firm = [seen_by for seen_by in views if len(seen_by) >= LEAST_VIEWS]
-    rows = [(k, place[number]) for k, seen_by in enumerate(firm) for number in seen_by]
-    point, image = np.array(rows, np.int64).reshape(-1, 2).T
-    seen = csr_array((np.ones(len(rows), np.int64), (point, image)), (len(firm), len(images)))
+    seen = _firm_points(model, images)
     kept = of_one_scale(seen, np.array([number in known for number in images], bool))
     return without_poses(model, set(images) - {images[k] for k in kept})
+
+
+def parts_of_one_scale(model: Any, numbers: Sequence[int]) -> list[list[int]]:
+    """Places of pictures in ``numbers`` whose scale is one, part by part, the largest first."""
+    seen, left, parts = _firm_points(model, numbers), np.arange(len(numbers)), list[list[int]]()
+    while len(left):
+        kept = left[of_one_scale(seen[:, left], np.zeros(len(left), bool))]
+        left = np.setdiff1d(left, kept)
+        parts.append(kept.tolist())
+    return parts
+
+
+def _firm_points(model: Any, numbers: Sequence[int]) -> csr_array:
+    """1 where a point (row) that passes the scale on is seen by one of these pictures (column)."""
+    place = {number: k for k, number in enumerate(numbers)}
+    views = (sorted({e.image_id for e in p.track.elements}) for p in model.points3D.values())
+    firm = [seen_by for seen_by in views if len(seen_by) >= LEAST_VIEWS]
+    rows = [(k, place[n]) for k, seen_by in enumerate(firm) for n in seen_by if n in place]
+    point, image = np.array(rows, np.int64).reshape(-1, 2).T
+    return csr_array((np.ones(len(rows), np.int64), (point, image)), (len(firm), len(numbers)))
 
 
 def of_one_scale(seen: csr_array, known: Bool[np.ndarray, "n"]) -> Int64[np.ndarray, "m"]:

@@ -1,6 +1,7 @@
 """Deviations against random poses that are aligned one by one."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from geogs.geometry.umeyama import umeyama
 from geogs_photos import deviations
+from geogs_photos.completion import deviations_by_part
 from geogs_photos.deviations import pose_deviations, without_gauge
+from geogs_photos.incremental_mapping import placed_images, world_to_camera
 
 
 def test_against_samples_that_are_aligned():
@@ -125,5 +128,70 @@ def test_a_covariance_that_overflows_tells_nothing(monkeypatch):
     images = [SimpleNamespace(image_id=n) for n in range(4)]
     T_cw = np.tile(np.eye(4), (4, 1, 1))
     model = SimpleNamespace(compute_mean_reprojection_error=lambda: 0.5)
+    monkeypatch.setattr(deviations, "_evidence", lambda *given: model)
     for known in pose_deviations(model, images, T_cw, False):
         np.testing.assert_array_equal(known, np.inf)
+
+
+def walks(*starts: float) -> Any:
+    """A reconstruction of walks of six pictures each, none of which sees what another does."""
+    colmap, random = pytest.importorskip("pycolmap"), np.random.default_rng(3)
+    model = colmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        colmap.Camera(model="SIMPLE_PINHOLE", width=400, height=300, params=[300, 200, 150],
+                      camera_id=1)
+    )  # fmt: skip
+    for walk, start in enumerate(starts):
+        points = random.uniform((start - 1, -1, 3), (start + 1, 1, 6), (40, 3))
+        numbers = range(6 * walk + 1, 6 * walk + 7)
+        for k, number in enumerate(numbers):
+            centre = np.array([start + 0.1 * k, 0.02 * k * k, 0.0])
+            seen = (points - centre)[:, :2] / points[:, 2:] * 300 + (200, 150)
+            seen = [*(seen + random.normal(0, 0.3, seen.shape)), np.full(2, 100.0)]
+            image = colmap.Image(f"{number:02d}", seen, camera_id=1, image_id=number)
+            pose = np.hstack([np.eye(3), -centre[:, None]])
+            model.add_image_with_trivial_frame(image, colmap.Rigid3d(pose))
+        for n, point in enumerate(points):
+            track = colmap.Track([colmap.TrackElement(k, n) for k in numbers])
+            add_point(model, point, track)
+    return model
+
+
+def add_point(model: Any, at: np.ndarray, track: Any) -> None:
+    model.points3D[model.add_point3D(at, track, np.zeros(3, np.uint8))].error = 0.3
+
+
+def told_of(model: Any, numbers: range) -> tuple[np.ndarray, np.ndarray]:
+    images = [image for image in placed_images(model) if image.image_id in numbers]
+    return pose_deviations(model, images, np.stack([*map(world_to_camera, images)]), True)
+
+
+def test_a_point_in_the_centre_of_a_camera_says_nothing():
+    model = walks(0)
+    before = told_of(model, range(1, 7))
+    assert np.isfinite(before).all()
+    colmap = pytest.importorskip("pycolmap")
+    for away in (1e-10, 0.03):
+        at = model.images[2].projection_center() + np.array([0, 0, away])
+        track = colmap.Track([colmap.TrackElement(k, 40) for k in (2, 4)])
+        trial = colmap.Reconstruction(model)
+        add_point(trial, at, track)
+        np.testing.assert_allclose(told_of(trial, range(1, 7)), before)
+
+
+def test_frames_found_at_either_end_are_told_by_what_is_known_there():
+    """Matches do not say how the ends lie to each other, and all together have no covariance."""
+    model = walks(0, 30)
+    images = placed_images(model)
+    is_known = np.array([k % 3 > 0 for k in range(12)])
+    position, rotation = deviations_by_part(model, images, is_known)
+    for walk in (range(6), range(6, 12)):
+        alone = walks(0, 30)
+        own = [images[k] for k in walk]
+        beside = [[k for k in range(6) if is_known[walk[k]]]] * 6
+        poses = np.stack([*map(world_to_camera, own)])
+        there = pose_deviations(alone, own, poses, True, beside)
+        assert np.isfinite(there).all()
+        np.testing.assert_allclose((position[walk], rotation[walk]), there)
+    unknown, _ = deviations_by_part(model, images, np.arange(12) < 6)
+    np.testing.assert_array_equal(np.isfinite(unknown), np.arange(12) < 6)
