@@ -11,11 +11,11 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop import lens_correction
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
-from geogs.loop.straightening import BentImages, FrameViews
+from geogs.loop.straightening import BentImages
 from geogs.tracking.tracker import Tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.straight_view import StraightView
+from geogs.world.straight_view import FrameViews, StraightView
 from planted_walk import PlantedFlow, centre_error, true_inverse_depth, walked_tracker
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)

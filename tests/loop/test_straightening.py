@@ -9,7 +9,6 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.loop.straightening import (
     BentImages,
-    FrameViews,
     straight_rows,
     straighten_cells,
     straighten_frames,
@@ -23,7 +22,7 @@ from geogs.world.edges import pack_matches, unpacked_positions
 from geogs.world.frames import FrameLog, FrameRecord, Observation
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
-from geogs.world.straight_view import StraightView
+from geogs.world.straight_view import FrameViews, StraightView
 
 CAMERA = Camera(fx=110.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 GRID = SampleGrid(CAMERA)

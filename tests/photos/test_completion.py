@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
-from geogs.application.structure_from_motion.completion import about, as_seen
-from geogs.types import FoundFrames, FoundLens, Frame, Uncertainty
+from geogs.application.structure_from_motion import completion
+from geogs.application.structure_from_motion.completion import LostFrames, about, as_seen
+from geogs.config import InputConfig
+from geogs.io.sources.sniff import open_source
+from geogs.types import FoundFrames, FoundLens, Frame, FrameLens, Trajectory, Uncertainty
+from geogs.world.straight_view import FrameViews, StraightView
 from geogs_photos.completion import place_lost
 from handheld_walk import handheld_trajectory
+from io_samples import write_image
 from lit_rooms import lit_room
 from posed_layouts import render_room
 
@@ -34,6 +39,34 @@ def test_what_is_found_is_as_unsure_as_what_is_around_and_by_itself():
     np.testing.assert_allclose(both.position, [3, 5, 3])
     np.testing.assert_allclose(both.rotation, [3, 5, 3])
     np.testing.assert_allclose(both.depth, 3)
+
+
+def test_known_frames_are_shown_as_the_lens_of_all_saw_them(monkeypatch, tmp_path):
+    """And where the axis of a lost one lay nobody knows, which turns it."""
+    room = render_room(4, 1, 32, 24)
+    own = FrameLens(right=0.05)
+    wander = FoundLens(0.0, 0.0, 0.0, 0.0, varies_centre=0.03)
+    views = FrameViews(StraightView(room.camera, wander), {1: own, 2: own})
+    for k, image in enumerate(room.images):
+        write_image(tmp_path / f"{k}.png", image)
+    camera = ",".join(str(getattr(room.camera, k)) for k in ("fx", "fy", "cx", "cy"))
+    video = open_source((tmp_path,), InputConfig(intrinsics=camera))
+    states = np.array([True, True, True, False])
+    trajectory = Trajectory(np.arange(4) / 10, room.T_wc[:4], states)
+    given = []
+
+    def found(frames, T_cw, seen_by, seed, report) -> FoundFrames:
+        given.extend(frames)
+        deviation = np.array([0.0])
+        return FoundFrames((3,), np.array([0.3]), np.eye(4)[None], deviation, deviation)
+
+    monkeypatch.setattr(completion, "place_lost", found)
+    lost = LostFrames(video, views, trajectory, range(4), trajectory, 0)
+    (turned,) = lost._find(lost.known, [3], lambda *_: None).rotation
+    for frame, read in zip(given, video, strict=True):
+        np.testing.assert_array_equal(frame.image, views.alike(frame.index, read.image))
+        assert np.array_equal(frame.image, read.image) == (frame.index in (0, 3))
+    assert turned == pytest.approx(np.sqrt(2) * 0.03)
 
 
 @pytest.mark.system

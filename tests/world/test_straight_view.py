@@ -9,8 +9,8 @@ import torch
 
 from geogs.bundle.uncertainty.lens_error import lens_shapes
 from geogs.geometry.camera import Camera
-from geogs.types import FoundLens
-from geogs.world.straight_view import StraightView
+from geogs.types import FoundLens, FrameLens
+from geogs.world.straight_view import FrameViews, StraightView
 from geogs_synth.camera.radial_camera import RadialCamera
 from lit_rooms import lit_room
 
@@ -125,3 +125,24 @@ def test_the_lens_is_that_of_the_matches():
     wanted = wanted + lens.right * shapes[3] + lens.down * shapes[4]
     bent = StraightView(CAMERA, lens).bent(pixels)
     np.testing.assert_allclose(pixels - bent, wanted, atol=1e-4)
+
+
+def test_what_a_frame_has_of_its_own_is_taken_off():
+    views = FrameViews(StraightView(CAMERA, LENS), {7: FrameLens(0.02, 0.03, -0.02)})
+
+    def shown(view: StraightView) -> np.ndarray:
+        """Waves, as a lens shows them to which the pinhole's pixels bend."""
+        pixels = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), -1)
+        x, y = np.nan_to_num(view.straight(torch.from_numpy(pixels))).transpose(2, 0, 1)
+        wave = 127 + 60 * np.sin(x / 9) + 60 * np.cos(y / 7)
+        return np.repeat(wave[..., None], 3, 2).round().astype(np.uint8)
+
+    own, common = shown(views.of(7)), shown(views.view)
+    inside = np.s_[12:-12, 12:-12]
+
+    def farthest(image: np.ndarray) -> int:
+        return int(np.abs(image.astype(int) - common)[inside].max())
+
+    assert farthest(views.alike(7, own)) <= 3
+    assert farthest(own) > 50
+    assert views.alike(8, own) is own

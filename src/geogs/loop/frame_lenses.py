@@ -27,7 +27,6 @@ from geogs.bundle.uncertainty.varying_intrinsics import (
     VaryingPrior,
 )
 from geogs.geometry.camera import Camera
-from geogs.loop.straightening import FrameViews
 from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
 from geogs.tracking.frames.row_errors import in_parts
 from geogs.tracking.graph.frame_graph import FrameGraph
@@ -35,7 +34,7 @@ from geogs.tracking.keyframe_uncertainty import said_of_frame_lenses
 from geogs.tracking.tracker import Tracker
 from geogs.types import FoundLens, FrameLens
 from geogs.world.edges import PackedEdge, Pair
-from geogs.world.straight_view import StraightView
+from geogs.world.straight_view import FrameViews, StraightView
 
 ROUNDS = 12
 """At most."""

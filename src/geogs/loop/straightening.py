@@ -5,7 +5,7 @@ can be matched and adjusted once more. Matches between keyframes do not: they ar
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import torch
@@ -20,12 +20,12 @@ from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import seen_by_keyframes, solved_poses
 from geogs.tracking.frames.row_errors import seen_rows
 from geogs.tracking.tracker import Tracker
-from geogs.types import FrameLens, SeenRows
+from geogs.types import SeenRows
 from geogs.world.archive import Archived
 from geogs.world.edges import pack_matches, unpacked_positions
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
-from geogs.world.straight_view import StraightView
+from geogs.world.straight_view import FrameViews, StraightView
 
 FARTHEST = 0.1
 """Fraction of the long edge; what seems to lie farther off straight has no match."""
@@ -51,7 +51,7 @@ class BentImages:
         pieces = keyframes.table.arrays.pieces
         return BentImages(keyframes, {name: dict(pieces.get(name, {})) for name in names})
 
-    def straighten(self, views: "FrameViews") -> None:
+    def straighten(self, views: FrameViews) -> None:
         """Have the keyframes' images as the table's pinhole sees them, always made of those that
         were tracked; normals and depths go along pixel by pixel."""
         table, bent = self.keyframes.table, self.pieces["image"]
@@ -67,21 +67,6 @@ class BentImages:
         table.lens = views.view.lens
         own = {k.id: views.own.get(k.frame_index) for k in self.keyframes}
         table.frame_lenses = {id: lens for id, lens in own.items() if lens is not None}
-
-
-@dataclass(frozen=True)
-class FrameViews:
-    """How frames of a video are straightened, whose lenses may have something of their own."""
-
-    view: StraightView
-    """By the lens of all."""
-    own: Mapping[int, FrameLens] = field(default_factory=dict)
-    """By the indices of the frames."""
-
-    def of(self, frame: int) -> StraightView:
-        """That of a frame."""
-        own = self.own.get(frame)
-        return self.view if own is None else self.view.of_frame(own)
 
 
 def straighten(tracker: Tracker, views: FrameViews, images: BentImages) -> None:

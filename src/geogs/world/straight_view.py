@@ -1,6 +1,7 @@
 """Pixels that a found lens shows, and those of the pinhole that it was taken for."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -131,3 +132,38 @@ class StraightView:
     def _nearest(self) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
         u, v = (np.rint(m).astype(int) for m in self._maps)
         return v.clip(0, self.camera.height - 1), u.clip(0, self.camera.width - 1)
+
+
+@dataclass(frozen=True)
+class FrameViews:
+    """How frames of a video are straightened, whose lenses may have something of their own."""
+
+    view: StraightView
+    """By the lens of all."""
+    own: Mapping[int, FrameLens] = field(default_factory=dict)
+    """By the indices of the frames."""
+
+    def of(self, frame: int) -> StraightView:
+        """That of a frame."""
+        own = self.own.get(frame)
+        return self.view if own is None else self.view.of_frame(own)
+
+    @staticmethod
+    def of_pinhole(camera: Camera) -> "FrameViews":
+        """Those of frames that are straight already."""
+        return FrameViews(StraightView(camera, FoundLens(0.0, 0.0, 0.0, 0.0)))
+
+    def alike(self, frame: int, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """The image of a frame as the lens of all saw it: what its own has beside that taken off.
+
+        What is beyond the border gets its colour.
+        """
+        if frame not in self.own:
+            return image
+        all_, own = self.view.seen_by, self.of(frame).seen_by
+        factor = all_.fx / own.fx
+        to = [[factor, 0.0, all_.cx - factor * own.cx], [0.0, factor, all_.cy - factor * own.cy]]
+        size = (self.view.camera.width, self.view.camera.height)
+        return cv2.warpAffine(
+            image, np.array(to), size, flags=RESAMPLING, borderMode=cv2.BORDER_REPLICATE
+        )

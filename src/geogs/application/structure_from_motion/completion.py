@@ -22,7 +22,7 @@ from geogs.io.sources.frame_source import Source
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.threads import worker_count
 from geogs.types import FoundFrames, FoundLens, Frame, Trajectory, Uncertainty
-from geogs.world.straight_view import StraightView
+from geogs.world.straight_view import FrameViews, StraightView
 
 NEIGHBOURS = 10
 """Frames with a place before each lost one, and as many after it, about which it is looked for."""
@@ -41,7 +41,7 @@ class LostFrames:
     def __init__(
         self,
         video: Source,
-        seen_by: Calibration,
+        views: FrameViews,
         trajectory: Trajectory,
         sharp: Iterable[int],
         keyframes: Trajectory,
@@ -51,14 +51,14 @@ class LostFrames:
 
         Args:
             video: is read once more.
-            seen_by: the camera of its frames, with its distortion where they still bend.
+            views: how its frames are straightened, where they still bend.
             trajectory: of all frames.
             sharp: frames about which the others are looked for, those of them that have a place.
             keyframes: a frame whose place is not known to a part of their extent stays lost.
             seed: of the random choices.
         """
         # A copy, as a source knows how far it has been read.
-        self._video, self._seen_by, self._seed = copy.copy(video), seen_by, seed
+        self._video, self._views, self._seed = copy.copy(video), views, seed
         self._most_deviation = MAX_POSITION_DEVIATION * extent_of(keyframes.T_wc)
         self._times = trajectory.timestamps
         states, T_wc = trajectory.states, trajectory.T_wc
@@ -120,10 +120,14 @@ class LostFrames:
         if not near:
             return FoundFrames.none()
         frames = _read(self._video, {*wanted, *near})
-        T_cw = [known.get(frame.index) for frame in frames]
-        found = place_lost(frames, T_cw, self._seen_by, self._seed, report)
+        frames = [replace(f, image=self._views.alike(f.index, f.image)) for f in frames]
+        T_cw, view = [known.get(frame.index) for frame in frames], self._views.view
+        seen_by = as_seen(view.camera, view.lens)
+        found = place_lost(frames, T_cw, seen_by, self._seed, report)
         times = 1.0 if self._video.shutter.readout else FACTOR_WITHOUT_READOUT
-        found = replace(found, position=times * found.position, rotation=times * found.rotation)
+        # What a lost frame's lens has of its own turns it: no keyframe tells it.
+        rotation = np.hypot(times * found.rotation, math.sqrt(2) * view.lens.varies_centre)
+        found = replace(found, position=times * found.position, rotation=rotation)
         return found.of(found.position <= self._most_deviation)
 
 

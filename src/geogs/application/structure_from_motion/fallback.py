@@ -18,14 +18,16 @@ from geogs.application.results.verdict import (
 )
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.agreement import has_wrong_joint, rotations_agree
-from geogs.application.structure_from_motion.completion import LostFrames, as_seen
+from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
 from geogs.errors import InputError, TrackingLost
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
+from geogs.slam import Slam
 from geogs.types import FoundFrames
+from geogs.world.straight_view import FrameViews, StraightView
 
 if TYPE_CHECKING:
     from geogs.application.structure_from_motion.offline import PlacedOffline
@@ -109,8 +111,7 @@ class TrackedOrPlaced(Work):
             return False
         keyframes = [slam.world.keyframes[i].frame_index for i in slam.segments.main.segment.free]
         lost = LostFrames(
-            source, as_seen(slam.camera, slam.lens), result.trajectory, keyframes,
-            result.keyframes, slam.config.seed,
+            source, _views(slam), result.trajectory, keyframes, result.keyframes, slam.config.seed
         )  # fmt: skip
         found = FoundFrames.none()
 
@@ -224,6 +225,15 @@ def impossible(settings: RunSettings, source: Source) -> str:
     if settings.scale_from or source.uses_depth or source.uses_poses:
         return "it knows no metres; geogs run --offline without them does it."
     return ""
+
+
+def _views(slam: Slam) -> FrameViews:
+    """How the frames of a tracked video are straightened, by what the adjustment found."""
+    if slam.lens is None:
+        return FrameViews.of_pinhole(slam.camera)
+    table = slam.world.keyframes
+    own = {table[id].frame_index: lens for id, lens in table.frame_lenses.items()}
+    return FrameViews(StraightView(slam.camera, slam.lens), own)
 
 
 def _is_shape_known(judged: Verdict) -> bool:

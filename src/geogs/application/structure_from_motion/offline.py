@@ -11,7 +11,7 @@ from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames, choose_frames
-from geogs.application.structure_from_motion.completion import LostFrames, as_seen
+from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.offline_plan import offline_config
 from geogs.application.structure_from_motion.photos import (
     PlacedVideo,
@@ -28,6 +28,7 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
+from geogs.world.straight_view import FrameViews
 
 MIN_CLIP_FPS = 8.0
 """Images a second, as recorded, below which a readout that nobody gave is not searched in clips:
@@ -119,8 +120,8 @@ class PlacedOffline(Work):
             T_cw = _place_all(self.source, scene, placed, config, driver.report)
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
         lost = LostFrames(
-            self.source, as_seen(self.source.camera, None), self.trajectory, placed.numbers,
-            scene.keyframe_trajectory(), config.seed,
+            self.source, FrameViews.of_pinhole(self.source.camera), self.trajectory,
+            placed.numbers, scene.keyframe_trajectory(), config.seed,
         )  # fmt: skip
         scene.found = lost.search(driver, self._stopwatch)
         for number, pose in zip(scene.found.numbers, scene.found.T_cw, strict=True):
