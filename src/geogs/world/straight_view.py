@@ -160,10 +160,8 @@ class FrameViews:
         """
         if frame not in self.own:
             return image
-        all_, own = self.view.seen_by, self.of(frame).seen_by
-        factor = all_.fx / own.fx
-        to = [[factor, 0.0, all_.cx - factor * own.cx], [0.0, factor, all_.cy - factor * own.cy]]
-        size = (self.view.camera.width, self.view.camera.height)
-        return cv2.warpAffine(
-            image, np.array(to), size, flags=RESAMPLING, borderMode=cv2.BORDER_REPLICATE
-        )
+        common, own = self.view.seen_by, self.of(frame).seen_by
+        factor = common.fx / own.fx
+        right, down = common.cx - factor * own.cx, common.cy - factor * own.cy
+        to, size = np.array([[factor, 0, right], [0, factor, down]]), (common.width, common.height)
+        return cv2.warpAffine(image, to, size, flags=RESAMPLING, borderMode=cv2.BORDER_REPLICATE)
