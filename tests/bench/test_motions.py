@@ -152,6 +152,7 @@ def test_a_camera_that_stands_still_has_orientations_alone(tmp_path: Path) -> No
 
 
 @pytest.mark.system
+@pytest.mark.long
 def test_the_camera_does_not_turn_with_a_truck_ahead(tmp_path: Path) -> None:
     """It keeps its place over a sixth of the image while the street bends: with all matches alike
     the camera goes straight on, and is some 4 degrees off after these frames."""

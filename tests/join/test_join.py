@@ -26,7 +26,7 @@ def make_parts(folder):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("adjust", [False, True])
+@pytest.mark.parametrize("adjust", [pytest.param(False, marks=pytest.mark.long), True])
 def test_two_parts_of_a_room_become_one_and_another_room_stays_apart(once, tmp_path, adjust):
     folder = once("parts-of-two-rooms", make_parts)
     parts = [Part(name, folder / name) for name in "abx"]

@@ -118,7 +118,13 @@ def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 4)
 
 
-@pytest.mark.parametrize(("focal", "centre"), [(0.02, 0.0), (0.0, 0.012), (0.02, 0.012)])
+@pytest.mark.parametrize(
+    ("focal", "centre"),
+    [
+        *(pytest.param(*s, marks=pytest.mark.long) for s in ((0.02, 0.0), (0.0, 0.012))),
+        (0.02, 0.012),
+    ],
+)
 def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypatch, focal, centre):
     sizes = sizes_of(focal, centre)
     tracker, truth = tracker_of(sizes)

@@ -262,7 +262,7 @@ def test_a_guess_that_is_far_off_is_found_by_all_matches():
     assert abs(lens.focal * 0.75 - 1) < lens.deviation_focal
 
 
-@pytest.mark.parametrize("is_found", [True, False])
+@pytest.mark.parametrize("is_found", [pytest.param(True, marks=pytest.mark.long), False])
 def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeypatch, is_found):
     tracker, _ = tracker_of((0.02, -0.03), -0.03)
     if not is_found:

@@ -18,7 +18,9 @@ def zoomed(image: np.ndarray, factor: float) -> np.ndarray:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("last", "is_known"), [(1.0, True), (1.5, False)])
+@pytest.mark.parametrize(
+    ("last", "is_known"), [pytest.param(1.0, True, marks=pytest.mark.long), (1.5, False)]
+)
 def test_frames_of_a_zoom_have_no_place_that_counts(last, is_known):
     pytest.importorskip("pycolmap")
     room = render_room(14, 3, 240, 180)
