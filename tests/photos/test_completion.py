@@ -41,7 +41,8 @@ def test_what_is_found_is_as_unsure_as_what_is_around_and_by_itself():
     np.testing.assert_allclose(both.depth, 3)
 
 
-def test_known_frames_are_shown_as_the_lens_of_all_saw_them(monkeypatch, tmp_path):
+@pytest.mark.parametrize(("readout", "times"), [("auto", 3), (0.0, 1), (0.02, 1)])
+def test_known_frames_are_shown_as_the_lens_of_all_saw_them(monkeypatch, tmp_path, readout, times):
     """And where the axis of a lost one lay nobody knows, which turns it."""
     room = render_room(4, 1, 32, 24)
     own = FrameLens(right=0.05)
@@ -50,23 +51,24 @@ def test_known_frames_are_shown_as_the_lens_of_all_saw_them(monkeypatch, tmp_pat
     for k, image in enumerate(room.images):
         write_image(tmp_path / f"{k}.png", image)
     camera = ",".join(str(getattr(room.camera, k)) for k in ("fx", "fy", "cx", "cy"))
-    video = open_source((tmp_path,), InputConfig(intrinsics=camera))
+    video = open_source((tmp_path,), InputConfig(intrinsics=camera, readout=readout))
     states = np.array([True, True, True, False])
     trajectory = Trajectory(np.arange(4) / 10, room.T_wc[:4], states)
     given = []
 
     def found(frames, T_cw, seen_by, seed, report) -> FoundFrames:
         given.extend(frames)
-        deviation = np.array([0.0])
+        deviation = np.array([1e-5])
         return FoundFrames((3,), np.array([0.3]), np.eye(4)[None], deviation, deviation)
 
     monkeypatch.setattr(completion, "place_lost", found)
     lost = LostFrames(video, views, trajectory, range(4), trajectory, 0)
-    (turned,) = lost._find(lost.known, [3], lambda *_: None).rotation
+    around = lost._find(lost.known, [3], lambda *_: None)
+    assert around.position == pytest.approx(times * 1e-5)
     for frame, read in zip(given, video, strict=True):
         np.testing.assert_array_equal(frame.image, views.alike(frame.index, read.image))
         assert np.array_equal(frame.image, read.image) == (frame.index in (0, 3))
-    assert turned == pytest.approx(np.sqrt(2) * 0.03)
+    assert around.rotation == pytest.approx(np.sqrt(2) * 0.03)
 
 
 @pytest.mark.system

@@ -20,6 +20,11 @@ class Shutter:
     error: float = 0.0
     """Standard error where the video gave it, or left it open, seconds; 0 where it was told."""
 
+    @property
+    def is_told(self) -> bool:
+        """Whether the video showed it or somebody said it, if only that it is global."""
+        return self.readout != 0 or (self.error == 0 and self != Shutter())
+
     def __post_init__(self) -> None:
         if not (math.isfinite(self.readout) and abs(self.readout) <= LONGEST):
             raise InputError(

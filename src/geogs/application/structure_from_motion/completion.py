@@ -124,7 +124,7 @@ class LostFrames:
         T_cw, view = [known.get(frame.index) for frame in frames], self._views.view
         seen_by = as_seen(view.camera, view.lens)
         found = place_lost(frames, T_cw, seen_by, self._seed, report)
-        times = 1.0 if self._video.shutter.readout else FACTOR_WITHOUT_READOUT
+        times = 1.0 if self._video.shutter.is_told else FACTOR_WITHOUT_READOUT
         # What a lost frame's lens has of its own turns it: no keyframe tells it.
         rotation = np.hypot(times * found.rotation, math.sqrt(2) * view.lens.varies_centre)
         found = replace(found, position=times * found.position, rotation=rotation)
