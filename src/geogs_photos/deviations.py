@@ -109,8 +109,7 @@ def _evidence(model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 
     """The reconstruction with these pictures alone, without points nearer than ``NEAREST``."""
     model = load_colmap().Reconstruction(model)
     own = [image.image_id for image in images]
-    placed = {image.image_id for image in model.images.values() if image.has_pose}
-    model, near = without_poses(model, placed - {*own}), set[int]()
+    model, near = without_poses(model, {*model.reg_image_ids()} - {*own}), set[int]()
     for number, T in zip(own, T_cw, strict=True):
         seen = [p.point3D_id for p in model.images[number].points2D if p.has_point3D()]
         xyz = np.array([model.points3D[point].xyz for point in seen]).reshape(-1, 3)

@@ -8,6 +8,7 @@ import pytest
 from geogs.application.structure_from_motion.completion import as_seen
 from geogs.config import InputConfig
 from geogs.io.sources.sniff import open_source
+from geogs.world.straight_view import StraightView
 from geogs_photos import incremental_mapping
 from geogs_photos.completion import place_lost
 from geogs_synth.sequence.replica_files import write_sequence
@@ -21,7 +22,7 @@ def errors(room: Path) -> np.ndarray:
     T_wc = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)
     source = open_source((room,), InputConfig())
     poses = [None if k in LOST else np.linalg.inv(T) for k, T in enumerate(T_wc)]
-    seen_by = as_seen(source.camera, None)
+    seen_by = as_seen(StraightView.of_pinhole(source.camera))
     found = place_lost(list(source), poses, seen_by, 0, lambda *_: None)
     assert set(found.numbers) == set(LOST)
     centres = np.linalg.inv(found.T_cw)[:, :3, 3]

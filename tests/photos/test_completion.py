@@ -25,10 +25,10 @@ def test_the_nearest_known_frames_on_both_sides():
 
 def test_a_lens_that_was_found_since_is_in_the_calibration():
     camera = render_room(1, 1, 32, 24).camera
-    bent = as_seen(camera, FoundLens(0.1, -0.2, 0.01, 0.01, 1.02))
+    bent = as_seen(StraightView(camera, FoundLens(0.1, -0.2, 0.01, 0.01, 1.02)))
     assert bent.fx == pytest.approx(1.02 * camera.fx)
     assert bent.distortion == (0.1, -0.2, 0.0, 0.0)
-    assert as_seen(camera, None).distortion == ()
+    assert as_seen(StraightView.of_pinhole(camera)).distortion == ()
 
 
 def test_what_is_found_is_as_unsure_as_what_is_around_and_by_itself():
@@ -80,7 +80,9 @@ def test_lost_frames_are_placed_and_those_of_another_room_are_not():
     images = [*room.images, *others, np.zeros_like(room.images[0])]
     frames = [Frame(k, k / 10, image) for k, image in enumerate(images)]
     poses = [room.T_cw[k] if k < 6 else None for k in range(len(frames))]
-    found = place_lost(frames, poses, as_seen(room.camera, None), 0, lambda *_: None)
+    found = place_lost(
+        frames, poses, as_seen(StraightView.of_pinhole(room.camera)), 0, lambda *_: None
+    )
     assert found.numbers == (6, 7, 8)
     centres = np.linalg.inv(found.T_cw)[:, :3, 3]
     extent = np.linalg.norm(room.T_wc[:9, :3, 3] - room.T_wc[0, :3, 3], axis=1).max()
@@ -89,5 +91,11 @@ def test_lost_frames_are_placed_and_those_of_another_room_are_not():
     assert np.isfinite(found.position).all()
     assert found.position.max() < 0.05 * extent
     assert not len(
-        place_lost(frames[:3], [None] * 3, as_seen(room.camera, None), 0, lambda *_: None)
+        place_lost(
+            frames[:3],
+            [None] * 3,
+            as_seen(StraightView.of_pinhole(room.camera)),
+            0,
+            lambda *_: None,
+        )
     )

@@ -29,6 +29,11 @@ class StraightView:
     """The pinhole."""
     lens: FoundLens
 
+    @staticmethod
+    def of_pinhole(camera: Camera) -> "StraightView":
+        """The view of images that are straight already."""
+        return StraightView(camera, FoundLens(0.0, 0.0, 0.0, 0.0))
+
     @property
     def seen_by(self) -> Camera:
         """The lens without its distortion."""
@@ -147,11 +152,6 @@ class FrameViews:
         """That of a frame."""
         own = self.own.get(frame)
         return self.view if own is None else self.view.of_frame(own)
-
-    @staticmethod
-    def of_pinhole(camera: Camera) -> "FrameViews":
-        """Those of frames that are straight already."""
-        return FrameViews(StraightView(camera, FoundLens(0.0, 0.0, 0.0, 0.0)))
 
     def alike(self, frame: int, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """The image of a frame as the lens of all saw it: what its own has beside that taken off.

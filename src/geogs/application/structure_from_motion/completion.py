@@ -16,12 +16,11 @@ from geogs.application.structure_from_motion.photos import SECONDS_PER_FRAME, pl
 from geogs.errors import InputError
 from geogs.evaluation.duration import duration
 from geogs.evaluation.trajectory_errors import extent_of
-from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.threads import worker_count
-from geogs.types import FoundFrames, FoundLens, Frame, Trajectory, Uncertainty
+from geogs.types import FoundFrames, Frame, Trajectory, Uncertainty
 from geogs.world.straight_view import FrameViews, StraightView
 
 NEIGHBOURS = 10
@@ -122,8 +121,7 @@ class LostFrames:
         frames = _read(self._video, {*wanted, *near})
         frames = [replace(f, image=self._views.alike(f.index, f.image)) for f in frames]
         T_cw, view = [known.get(frame.index) for frame in frames], self._views.view
-        seen_by = as_seen(view.camera, view.lens)
-        found = place_lost(frames, T_cw, seen_by, self._seed, report)
+        found = place_lost(frames, T_cw, as_seen(view), self._seed, report)
         times = 1.0 if self._video.shutter.is_told else FACTOR_WITHOUT_READOUT
         # What a lost frame's lens has of its own turns it: no keyframe tells it.
         rotation = np.hypot(times * found.rotation, math.sqrt(2) * view.lens.varies_centre)
@@ -140,12 +138,9 @@ def about(wanted: Iterable[int], known: Collection[int]) -> set[int]:
     return near
 
 
-def as_seen(camera: Camera, lens: FoundLens | None) -> Calibration:
+def as_seen(view: StraightView) -> Calibration:
     """What images are seen by that were taken for those of a pinhole, with what was found since."""
-    bend: tuple[float, ...] = ()
-    if lens is not None:
-        view = StraightView(camera, lens)
-        camera, bend = view.seen_by, view.distortion
+    camera, bend = view.seen_by, view.distortion if any(view.distortion) else ()
     return Calibration(
         camera.fx, camera.fy, camera.cx, camera.cy, bend, width=camera.width, height=camera.height
     )

@@ -229,11 +229,10 @@ def impossible(settings: RunSettings, source: Source) -> str:
 
 def _views(slam: Slam) -> FrameViews:
     """How the frames of a tracked video are straightened, by what the adjustment found."""
-    if slam.lens is None:
-        return FrameViews.of_pinhole(slam.camera)
-    table = slam.world.keyframes
+    table, camera = slam.world.keyframes, slam.camera
     own = {table[id].frame_index: lens for id, lens in table.frame_lenses.items()}
-    return FrameViews(StraightView(slam.camera, slam.lens), own)
+    lens = slam.lens
+    return FrameViews(StraightView(camera, lens) if lens else StraightView.of_pinhole(camera), own)
 
 
 def _is_shape_known(judged: Verdict) -> bool:

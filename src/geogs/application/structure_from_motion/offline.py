@@ -28,7 +28,7 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
-from geogs.world.straight_view import FrameViews
+from geogs.world.straight_view import FrameViews, StraightView
 
 MIN_CLIP_FPS = 8.0
 """Images a second, as recorded, below which a readout that nobody gave is not searched in clips:
@@ -120,7 +120,7 @@ class PlacedOffline(Work):
             T_cw = _place_all(self.source, scene, placed, config, driver.report)
         self.trajectory = bridged(placed.timestamps, T_cw, [None] * len(T_cw))
         lost = LostFrames(
-            self.source, FrameViews.of_pinhole(self.source.camera), self.trajectory,
+            self.source, FrameViews(StraightView.of_pinhole(self.source.camera)), self.trajectory,
             placed.numbers, scene.keyframe_trajectory(), config.seed,
         )  # fmt: skip
         scene.found = lost.search(driver, self._stopwatch)
