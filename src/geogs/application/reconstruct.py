@@ -92,7 +92,7 @@ def reconstruct(
     begin = time.perf_counter()
     config, progress = config or ReconstructConfig(), progress or RunProgress()
     used = require_device(device)
-    with compiling(used) as kernels:
+    with compiling(used, knows_poses=True) as kernels:
         if not isinstance(source, PosedSource):
             if poses == "auto":
                 with tempfile.TemporaryDirectory(prefix="geogs-photos-") as kept:
@@ -147,7 +147,10 @@ def reconstruct_to_folder(
         edge = config.input.long_edge or RECORDED
         plan(photographs, (edge, 3 * edge // 4), stages)
 
-    with claimed(settings.output or wanted) as output, compiling(device) as kernels:
+    with (
+        claimed(settings.output or wanted) as output,
+        compiling(device, knows_poses=True) as kernels,
+    ):
         if finds_poses:
             with stop:
                 source = open_photographs(

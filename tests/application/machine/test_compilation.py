@@ -15,7 +15,7 @@ from pathlib import Path
 from dataclasses import replace
 from numba.core.dispatcher import Dispatcher
 import geogs
-from geogs.application.machine.compilation import KERNELS, ON_GPU, PARTS
+from geogs.application.machine.compilation import KERNELS, ON_GPU, PARTS, POSED_ON_GPU
 from geogs.application.machine.rehearsal import rehearse
 
 def used():
@@ -24,7 +24,7 @@ def used():
     return {(d.py_func.__qualname__, str(s)) for d in found for s in d.signatures}
 
 before = set()
-for part, kernels in ON_GPU.items():
+for part, kernels in (POSED_ON_GPU | ON_GPU).items():
     rehearse(part)
     assert len({name for name, _ in used() - before}) == kernels, used() - before
     before = used()
@@ -86,6 +86,9 @@ def test_with_a_gpu_only_what_the_cpu_does_beside_it_is_compiled(tmp_path, monke
     )
     with compiling(torch.device("cuda")):
         assert [command[-1] for command in begun] == ["planes", "turn", "lens"]
+    begun.clear()
+    with compiling(torch.device("cuda"), knows_poses=True):
+        assert [command[-1] for command in begun] == ["look", "planes"]
 
 
 def test_a_process_that_fails_or_lasts_holds_nobody_up():

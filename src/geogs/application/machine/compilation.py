@@ -26,7 +26,9 @@ up to what makes a map, up to a mesh."""
 PARTS = {"map": KERNELS_OF_MAP, "mesh": KERNELS - KERNELS_OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
 ON_GPU = {"planes": 4, "turn": 2, "lens": 3}
-"""The same with a GPU, which calls nothing else of it; what takes longest goes first."""
+"""The same where a GPU does the rest; what takes longest goes first."""
+POSED_ON_GPU = {"look": 5, "planes": 4}
+"""The same where poses are known, too."""
 _NICENESS = 5
 """Added to the niceness of each part over what goes before it, images first of all."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
@@ -76,9 +78,10 @@ class Compilation:
 
 
 @contextmanager
-def compiling(device: torch.device) -> Iterator[Compilation]:
+def compiling(device: torch.device, knows_poses: bool = False) -> Iterator[Compilation]:
     """Inside, what a command needs of the CPU is compiled beside it, if it is not."""
-    parts = PARTS if device.type == "cpu" else ON_GPU
+    on_gpu = POSED_ON_GPU if knows_poses else ON_GPU
+    parts = PARTS if device.type == "cpu" else on_gpu
     if is_compiled(parts) or not sys.executable:
         yield Compilation()
         return
@@ -156,7 +159,7 @@ def main(arguments: list[str]) -> None:
     """Compile all, or the parts that are named, with a line for each kernel."""
     parts = arguments or [*PARTS]
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_NICENESS * (1 + [*(ON_GPU | PARTS)].index(parts[0])))
+        os.nice(_NICENESS * (1 + [*(POSED_ON_GPU | ON_GPU | PARTS)].index(parts[0])))
     if not is_compiled(parts):
         compile_now(parts, lambda name: print(name, flush=True))
 

@@ -10,9 +10,10 @@ from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, solve_shared
 from geogs.config import MeshConfig, ReconstructConfig
-from geogs.depth.depth_view import KeyframeDepth
+from geogs.depth.depth_view import KeyframeDepth, ViewPose
 from geogs.depth.revision.segment_planes import on_planes
 from geogs.geometry.camera import Camera
+from geogs.mapping.first_look import first_points
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.reconstruction import Reconstruction
@@ -37,10 +38,17 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """``map`` follows and maps the wall on a CPU, ``mesh`` extracts its mesh; ``turn``, ``lens``
-    and ``planes`` do what of ``map`` no GPU does. Leaves nothing."""
+    """``map`` follows and maps the wall on a CPU, ``mesh`` extracts its mesh; ``look``, ``planes``,
+    ``turn`` and ``lens`` do what no GPU does. Leaves nothing."""
     for step in _STEPS[part]:
         step()
+
+
+def _look() -> None:
+    """A first look at the wall from known poses."""
+    poses = [ViewPose(number, _pose(number)) for number in range(VIEWS)]
+    pictures = _pictures()
+    first_points(poses, lambda number: (pictures[number], None), CAMERA, lambda done: None)
 
 
 def _turn() -> None:
@@ -109,6 +117,7 @@ _STEPS = {
     "mesh": (_mesh,),
     "turn": (_turn,),
     "lens": (_lens,),
+    "look": (_look,),
     "planes": (_bare,),
 }
 
