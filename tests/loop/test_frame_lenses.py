@@ -118,6 +118,7 @@ def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 4)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("focal", "centre"),
     [
@@ -151,6 +152,7 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     assert shown is None or np.array_equal(shown, view.is_seen)
 
 
+@pytest.mark.system
 def test_what_frames_have_of_their_own_is_taken_off_beside_the_lens_of_all(monkeypatch):
     """The lens of all takes the place of what frames were corrected by."""
     order = []

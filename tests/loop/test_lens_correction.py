@@ -19,16 +19,18 @@ from geogs.world.straight_view import FrameViews, StraightView
 from planted_walk import PlantedFlow, centre_error, true_inverse_depth, walked_tracker
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
-GRID, COUNT = SampleGrid(CAMERA), 24
+GRID, COUNT = SampleGrid(CAMERA), 16
+LONG = 24
+"""Keyframes of a corridor that is long enough to lose its scale."""
 BEND = 0.06, -0.1
 NOISE = np.random.default_rng(0).integers(1, 255, (CAMERA.height, CAMERA.width), dtype=np.uint8)
 """By which images that are straight are told."""
 
 
-def forward(turn: float = 0.08) -> Tensor:
+def forward(turn: float = 0.08, count: int = COUNT) -> Tensor:
     """World to camera: straight on along a corridor, looking about by such an angle."""
-    k = np.arange(COUNT)
-    xi = np.zeros((COUNT, 6))
+    k = np.arange(count)
+    xi = np.zeros((count, 6))
     xi[:, 4] = 1.57 + turn * np.sin(0.5 * k)
     T_wc = se3_exp(torch.from_numpy(xi))
     T_wc[:, :3, 3] = torch.from_numpy(np.stack([0.2 * k, 0.03 * np.sin(k), 0.0 * k], -1))
@@ -92,9 +94,12 @@ def image_of(number: int) -> np.ndarray:
 
 
 def tracker_of(
-    bend: tuple[float, float], focal: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)
+    bend: tuple[float, float],
+    focal: float = 0.0,
+    centre: tuple[float, float] = (0.0, 0.0),
+    count: int = COUNT,
 ) -> tuple[Tracker, Tensor]:
-    T = forward(0.3 if focal else 0.08)  # what tells a focal length is rotation
+    T = forward(0.3 if focal else 0.08, count)  # what tells a focal length is rotation
     flow = BentFlow(T, bend, focal, centre)
     return walked_tracker(CAMERA, flow, image_of), T
 
@@ -104,14 +109,15 @@ def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 3)
 
 
+@pytest.mark.system
 def test_a_corridor_through_a_lens_that_nobody_told_keeps_its_scale(monkeypatch):
-    tracker, truth = tracker_of(BEND)
+    tracker, truth = tracker_of(BEND, count=LONG)
     believed = lens_correction.EVIDENCE
     monkeypatch.setattr(lens_correction, "EVIDENCE", np.inf)
     global_bundle(tracker)
     bent = centre_error(tracker, truth)
     assert bent > 0.008
-    tracker, truth = tracker_of(BEND)
+    tracker, truth = tracker_of(BEND, count=LONG)
     monkeypatch.setattr(lens_correction, "EVIDENCE", believed)
     global_bundle(tracker)
     assert centre_error(tracker, truth) < 0.2 * bent
@@ -145,6 +151,7 @@ def test_deviations_are_the_standard_errors_that_those_before_the_run_are(monkey
     assert three.deviation_k2 == pytest.approx(3 * one.deviation_k2)
 
 
+@pytest.mark.system
 def test_the_end_of_tracking_straightens_images_once():
     tracker, truth = tracker_of(BEND)
     global_bundle(tracker)
@@ -169,6 +176,7 @@ def test_the_end_of_tracking_straightens_images_once():
     assert tracker.keyframes[3].image is straight
 
 
+@pytest.mark.system
 def test_what_straight_images_still_bend_is_part_of_the_lens(monkeypatch):
     tracker, _ = tracker_of(BEND)
     tracker.map.graph.operator.left = 0.01, -0.02
@@ -185,13 +193,14 @@ def test_what_straight_images_still_bend_is_part_of_the_lens(monkeypatch):
     assert tracker.keyframes.table.lens == last
 
 
+@pytest.mark.system
 def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatch):
     tracker, truth = tracker_of(BEND, -0.05)
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", np.inf)
     global_bundle(tracker)
     bent = centre_error(tracker, truth)
     assert tracker.keyframes.grid.camera == CAMERA
-    monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)  # two dozen keyframes tell little
+    monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)  # a few keyframes tell little
     tracker, _ = tracker_of(BEND, -0.05)
     global_bundle(tracker, ends=True)
     unsure = tracker.keyframes.table.lens
@@ -209,6 +218,7 @@ def test_a_focal_length_that_was_found_without_the_lens_is_found_anew(monkeypatc
     assert centre_error(tracker, truth) < 0.5 * bent
 
 
+@pytest.mark.system
 def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypatch):
     monkeypatch.setattr(lens_correction, "EVIDENCE", np.inf)
     tracker, _ = tracker_of((0.02, -0.03), -0.03)
@@ -223,6 +233,7 @@ def test_a_lens_that_was_but_found_is_asked_for_however_little_is_left(monkeypat
     assert (lens.k1, lens.k2) == pytest.approx((0.02, -0.03), abs=0.006)
 
 
+@pytest.mark.system
 def test_a_principal_point_is_found_where_nobody_told_of_the_lens():
     """Off by 0.04 focal lengths, of which straight images have none left."""
     bend, centre = (0.02, -0.03), (0.01, -0.04)
@@ -242,6 +253,7 @@ def test_a_principal_point_is_found_where_nobody_told_of_the_lens():
     assert np.array_equal(straight, StraightView(CAMERA, lens).image(image_of(3)))
 
 
+@pytest.mark.system
 def test_a_principal_point_that_is_hardly_off_stays_the_middle():
     tracker, _ = tracker_of((0.02, -0.03), -0.03, (0.0005, 0.0))
     tracker.keyframes.table.focal_deviation = 0.01
@@ -252,6 +264,7 @@ def test_a_principal_point_that_is_hardly_off_stays_the_middle():
     assert (lens.k1, lens.k2) == pytest.approx((0.02, -0.03), abs=0.006)
 
 
+@pytest.mark.system
 def test_a_guess_that_is_far_off_is_found_by_all_matches():
     tracker, _ = tracker_of((0.02, -0.03), 0.25)
     tracker.keyframes.table.focal_deviation = 0.35
@@ -262,6 +275,7 @@ def test_a_guess_that_is_far_off_is_found_by_all_matches():
     assert abs(lens.focal * 0.75 - 1) < lens.deviation_focal
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("is_found", [pytest.param(True, marks=pytest.mark.long), False])
 def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeypatch, is_found):
     tracker, _ = tracker_of((0.02, -0.03), -0.03)

@@ -47,11 +47,19 @@ def tracked() -> tuple[list[int], float]:
     return placed, error_cm(found.T_wc[placed, :3, 3], truth[:, :3, 3])
 
 
-def test_a_start_is_made_from_what_one_structure_holds(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.system
+def test_a_start_is_made_from_what_one_structure_holds():
     placed, error = tracked()
     assert placed[:6] == [0, 1, 2, 3, 4, 5]
     assert error < 0.4
-    # Without asking what holds them together none has a place, or all have, and most a wrong one.
+
+
+@pytest.mark.long
+@pytest.mark.system
+def test_without_asking_what_holds_them_together_none_has_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """None at all, or all, and most a wrong one: what the other test looks at is hard."""
     for module in (initialise, track_from_start):
         monkeypatch.setattr(module, "largest_part", lambda keyframes, *_: frozenset(keyframes.ids))
     assert tracked()[1] > 2
