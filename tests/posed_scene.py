@@ -22,6 +22,9 @@ SMALL = replace(
     ),
 )
 
+BRIEF = replace(SMALL, search=replace(SMALL.search, least_steps=10, repeat=False))
+"""Where a map has to be there, however good it is."""
+
 
 def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [*GEOGS, *map(str, arguments)]

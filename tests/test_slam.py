@@ -344,7 +344,7 @@ CASES = {
     "unrelated frames": ([noise(i, (192, 144)) for i in range(7)], "show no parallax"),
 }
 TURNING = {
-    "static video": ([noise()] * 20, "hardly moves"),
+    "static video": ([noise()] * 12, "hardly moves"),
     "two frames": ([turned(0), turned(4)], "hardly moves"),
     "pure rotation": ([turned(1.4 * i - 14) for i in range(20)], "show no parallax"),
 }

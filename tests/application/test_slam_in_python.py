@@ -109,7 +109,7 @@ def test_what_shows_another_place_is_not_found(first):
 
 @pytest.mark.system
 def test_mapping_beside_tracking_comes_to_the_same_where_nothing_is_late(small_room):
-    source = geogs.open_source(small_room, InputConfig(stop=22))
+    source = geogs.open_source(small_room, InputConfig(stop=18))
     without_loops = replace(config(), loop=replace(config().loop, enabled=False))
     maps = []
     for live in (False, True):

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.system
 
 TINY = [
     "mapping.render-long-edge=96", "mapping.disk.stride=2", "input.stride=12",
-    "search.least-steps=20", "search.steps-per-view=1", "no-check-poses",
+    "search.least-steps=20", "search.steps-per-view=1", "mesh.voxel=0.08", "no-check-poses",
 ]  # fmt: skip
 
 

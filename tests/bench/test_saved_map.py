@@ -21,6 +21,7 @@ TINY = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("no_report")
 def test_every_rule_moves_the_same_map_by_the_same_correction(small_room, tmp_path):
     rules = ["per_keyframe", "coherent"]
     checkpoints = []

@@ -302,7 +302,9 @@ def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeyp
     assert all(fine for _, fine in matched)
 
 
-def test_while_tracking_goes_on_the_focal_length_stays():
+def test_while_tracking_goes_on_the_focal_length_stays(monkeypatch):
+    monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)
+    monkeypatch.setattr(lens_correction, "FOCAL_DOUBT", 1.0)
     tracker, _ = tracker_of(BEND, -0.05)
     global_bundle(tracker)
     assert tracker.keyframes.grid.camera == CAMERA

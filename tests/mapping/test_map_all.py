@@ -23,7 +23,7 @@ class Interrupted(Exception):
 
 
 def quick() -> Config:
-    return quick_config(pose_iterations=0, final_iterations=40)
+    return quick_config(pose_iterations=0, final_iterations=15)
 
 
 @pytest.fixture(scope="module")

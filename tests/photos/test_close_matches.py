@@ -18,7 +18,8 @@ LOST = range(6, 11)
 
 
 def errors(room: Path) -> np.ndarray:
-    """How far the lost frames come to lie from where they were taken, metres."""
+    """How far the lost frames of a video come to lie from where they were taken, metres."""
+    write_sequence(room, 18, 240, 180, 233, motion="handheld-5hz", moving=0.5)
     T_wc = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)
     source = open_source((room,), InputConfig())
     poses = [None if k in LOST else np.linalg.inv(T) for k, T in enumerate(T_wc)]
@@ -30,11 +31,15 @@ def errors(room: Path) -> np.ndarray:
 
 
 @pytest.mark.system
-def test_lost_frames_stand_to_the_room_and_not_to_people(tmp_path, monkeypatch):
+def test_lost_frames_stand_to_the_room_and_not_to_people(tmp_path):
     pytest.importorskip("pycolmap")
-    write_sequence(tmp_path, 18, 240, 180, 233, motion="handheld-5hz", moving=0.5)
-    close = errors(tmp_path)
+    assert errors(tmp_path).max() < 0.03
+
+
+@pytest.mark.long
+@pytest.mark.system
+def test_matches_that_are_not_close_pull_lost_frames_along_with_people(tmp_path, monkeypatch):
+    """What the other test looks at is hard."""
+    pytest.importorskip("pycolmap")
     monkeypatch.setattr(incremental_mapping, "_keep_within", lambda *_: None)
-    loose = errors(tmp_path)
-    assert close.max() < 0.03
-    assert loose.max() > 0.08
+    assert errors(tmp_path).max() > 0.08

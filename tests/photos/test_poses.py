@@ -79,13 +79,14 @@ def test_places_are_found_and_what_is_left_out_is_named(photographs, tmp_path, c
 
 
 @pytest.mark.system
+@pytest.mark.usefixtures("no_report")
 def test_the_command_goes_from_photographs_to_a_mesh(photographs, tmp_path, capfd):
     folder, room = photographs
     c = room.camera
     code = main([
         "reconstruct", str(folder), "--poses", "auto", "-o", str(tmp_path), "--device", "cpu",
         "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}", "--search.steps-per-view", "1",
-        "--search.least-steps", "20", "--search.no-repeat", "--mapping.render-long-edge", "128",
+        "--search.least-steps", "20", "--search.no-repeat", "--mapping.render-long-edge", "96",
     ])  # fmt: skip
     said = capfd.readouterr()
     assert code == 0, said.err

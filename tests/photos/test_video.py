@@ -80,7 +80,7 @@ def test_deviations_hold_what_the_truth_is_off():
 @pytest.mark.system
 def test_a_focal_length_that_contradicts_the_one_the_video_told_leaves_all_unknown():
     pytest.importorskip("pycolmap")
-    room = render_room(9, 3, 320, 240)
+    room = render_room(9, 3, 240, 180)
     frames = [Frame(k, k / 10, image) for k, image in enumerate(room.images)]
     chosen = ChosenFrames(tuple(frames), np.arange(9) / 10)
     for told, is_believed in ((1.02, True), (1.3, False)):

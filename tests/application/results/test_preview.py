@@ -15,7 +15,7 @@ from geogs.io.writers.replacement import replaced
 from geogs.mesh.mesh_file import read_mesh
 from quick_systems import quick_config
 
-FRAMES = 26
+FRAMES = 20
 
 
 class Looked(RunProgress):
@@ -37,7 +37,7 @@ class Looked(RunProgress):
 @pytest.mark.usefixtures("no_report")
 def test_it_is_there_before_the_map_and_gone_with_the_result(small_room, tmp_path, monkeypatch):
     monkeypatch.setattr(tracked_video, "MIN_PREVIEW_SECONDS", 0.0)
-    config = quick_config(pose_iterations=0, final_iterations=40)
+    config = quick_config(pose_iterations=0, final_iterations=10)
     config = replace(config, input=InputConfig(stop=FRAMES))
     output = tmp_path / "out"
     looked = Looked(output)

@@ -33,7 +33,7 @@ from geogs.slam import Slam
 from geogs.types import FoundFrames
 from io_samples import write_image
 from posed_layouts import Room, render_room
-from posed_scene import SMALL
+from posed_scene import BRIEF
 
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
 LOST = replace(GOOD, is_reliable=False, lost=0.3)
@@ -125,7 +125,7 @@ def write_video(folder: Path) -> list[str]:
 def _lost(monkeypatch) -> None:
     """Tracking is taken to have lost too many of the frames."""
     pytest.importorskip("pycolmap")
-    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
+    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: BRIEF)
     monkeypatch.setattr(fallback, "is_wanted", lambda _: True)
 
 

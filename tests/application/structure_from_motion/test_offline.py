@@ -18,7 +18,7 @@ from geogs.types import Frame
 from geogs_photos.localise import Localiser
 from io_samples import write_image, write_video
 from posed_layouts import render_room
-from posed_scene import SMALL
+from posed_scene import BRIEF
 
 FRAMES = 12
 
@@ -39,7 +39,7 @@ def test_a_readout_found_of_few_images_a_second_is_left_to_their_residuals(
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(chosen_frames, "MIN_FRAMES", FRAMES // 2)
-    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: SMALL)
+    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: BRIEF)
     place, others = Localiser.place, list[int]()
 
     def place_but_one(self: Localiser, frame: Frame) -> np.ndarray | None:

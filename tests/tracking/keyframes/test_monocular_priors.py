@@ -24,7 +24,7 @@ pytestmark = pytest.mark.system
 
 CAMERA = Camera(163.5, 163.5, 95.5, 71.5, 192, 144)
 CONFIG = TrackingConfig(init_keyframes=6)
-FRAMES = 36
+FRAMES = 28
 
 
 @dataclass(frozen=True)
