@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -21,6 +22,17 @@ def cut(length: int) -> Callable:
     return inner
 
 
+@jaxtyped(typechecker=checked)
+def first(rows: Float[np.ndarray, "n 2"], count: int) -> Float[np.ndarray, "n 2"]:
+    """Says that all are given."""
+    return rows[:count]
+
+
+@jaxtyped(typechecker=checked)
+def chosen(values: list[int], side: Literal["left", "right"] = "left") -> list[int]:
+    return values if side == "left" else [str(v) for v in values]  # type: ignore[misc]
+
+
 @pytest.fixture
 def sampled() -> Iterator[None]:
     """As in a test of the whole system."""
@@ -36,6 +48,32 @@ def test_arguments_and_results_are_checked_at_every_call():
             cut(3)(np.zeros((3, 3)))
         with pytest.raises(TypeCheckError, match="return value"):
             cut(2)(np.zeros(3))
+
+
+def test_a_call_of_other_kinds_than_one_that_was_right_is_checked():
+    rows = np.zeros((3, 2))
+    for _ in range(3):
+        assert first(rows, 3).shape == (3, 2)
+        with pytest.raises(TypeCheckError, match="return value"):
+            first(rows, 2)
+        with pytest.raises(TypeCheckError, match="return value"):
+            first(rows, count=2)
+        for wrong in (rows.T, rows.astype(int), rows[0], rows.tolist()):
+            with pytest.raises(TypeCheckError, match="parameters"):
+                first(wrong, 3)
+        with pytest.raises(TypeCheckError, match="parameters"):
+            first(rows, "3")
+
+
+def test_what_lists_and_words_hold_is_looked_at_each_time():
+    for _ in range(3):
+        assert chosen([1, 2]) == [1, 2]
+        with pytest.raises(TypeCheckError, match="parameters"):
+            chosen(["1"])
+        with pytest.raises(TypeCheckError, match="parameters"):
+            chosen([1], "up")
+        with pytest.raises(TypeCheckError, match="return value"):
+            chosen([1], "right")
 
 
 @pytest.mark.usefixtures("sampled")

@@ -128,7 +128,8 @@ def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
     call = [
         "reconstruct", small_room, "-o", tmp_path, "--stride", 6, "--mapping.render-long-edge", 96,
-        "--search.least-steps", 60, "--search.steps-per-view", 10, "--search.no-repeat", "--device", "cpu",
+        "--search.least-steps", 60, "--search.steps-per-view", 10, "--search.no-repeat",
+        "--device", "cpu",
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
     said = stop([*map(str, call)], signal.SIGINT, checkpoints=1)
