@@ -120,6 +120,7 @@ def test_a_small_run_is_near_the_truth(small_room, small_result, tmp_path):
     assert said["position"] < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_sequence_of_euroc_runs_as_it_lies_on_disk(small_room, tmp_path):
     """The truth is the body's, brought to the camera; the result is compared by the clock."""

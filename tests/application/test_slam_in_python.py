@@ -127,7 +127,7 @@ def test_mapping_beside_tracking_comes_to_the_same_where_nothing_is_late(small_r
 
 @pytest.mark.system
 def test_a_frame_does_not_wait_for_a_keyframe_that_is_being_completed(small_room):
-    source = geogs.open_source(small_room, InputConfig(stop=FIRST))
+    source = geogs.open_source(small_room, InputConfig(stop=SECOND))
     slam = geogs.Slam(source.camera, config(), live=True, device="cpu")
     go_on, complete, beside = threading.Event(), slam.segments.complete, 0
 
@@ -150,8 +150,8 @@ def test_a_frame_does_not_wait_for_a_keyframe_that_is_being_completed(small_room
     slam.finish()
     trajectory = slam.trajectory()
     assert trajectory.tracked.all()
-    truth = np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4)[:FIRST]
-    reference = Trajectory(trajectory.timestamps, truth, np.ones(FIRST, dtype=bool))
+    truth = np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4)[:SECOND]
+    reference = Trajectory(trajectory.timestamps, truth, np.ones(SECOND, dtype=bool))
     assert evaluate_trajectory(trajectory, reference).ate_rmse_cm < 0.6
 
 

@@ -71,7 +71,7 @@ def test_there_is_no_online_result(both):
     assert "mapping" not in after.stopwatch.seconds
 
 
-@pytest.mark.parametrize("seen", [AT, FRAMES])
+@pytest.mark.parametrize("seen", [pytest.param(AT, marks=pytest.mark.long), FRAMES])
 def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path, seen: int):
     slam = followed(frames, True, seen)
     if seen == FRAMES:

@@ -91,7 +91,7 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
     monkeypatch.setattr(FrameGraph, "adjust", adjusted)
     monkeypatch.setattr(start_up, "initialise", tried)
     monkeypatch.setattr("geogs.tracking.start.initialise.MAX_DEVIATION", 1e-3)
-    path = [pose(0.08 * np.sin(0.2 * k), yaw=0.3 * np.sin(0.1 * k)) for k in range(40)]
+    path = [pose(0.08 * np.sin(0.2 * k), yaw=0.3 * np.sin(0.1 * k)) for k in range(30)]
     _, results = run(frames(path), replace(CONFIG, init_keyframes=8))
     assert results[-1].state is TrackState.INITIALIZING
     assert sum(attempt is Attempt.FAR_OFF for _, attempt in attempts) >= 3
@@ -182,7 +182,7 @@ def test_no_keyframe_is_made_where_no_depth_is_known(turning_away):
 
 
 def test_frames_before_a_start_are_located_by_its_keyframes():
-    looking = [pose(-0.5, yaw=0.55 * (1 - np.cos(0.18 * k))) for k in range(36)]
+    looking = [pose(-0.5, yaw=0.55 * (1 - np.cos(0.27 * k))) for k in range(24)]
     path = [*looking, *sideways(20)[1:]]
     segments, _ = run(frames(path))
     trajectory = segments.trajectory()

@@ -35,7 +35,7 @@ assert len({name for name, _ in rehearsed}) == KERNELS, rehearsed
 c = geogs.Config()
 mapping = replace(c.mapping, render_long_edge=64, final_iterations=5)
 tracking = replace(c.tracking, init_keyframes=6)
-config = replace(c, mapping=mapping, tracking=tracking, input=replace(c.input, stop=24))
+config = replace(c, mapping=mapping, tracking=tracking, input=replace(c.input, stop=18))
 assert geogs.run(sys.argv[1], config, sys.argv[2], "cpu").mesh is not None
 print(used() - rehearsed)
 """

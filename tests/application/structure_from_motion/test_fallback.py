@@ -2,6 +2,7 @@
 
 import functools
 import json
+import pickle
 import shutil
 import signal
 from collections.abc import Callable
@@ -18,10 +19,11 @@ from geogs.application.checkpoints.run_state import RunMetadata, run_state
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
-from geogs.application.structure_from_motion import fallback, offline_plan
+from geogs.application.structure_from_motion import fallback, offline, offline_plan
 from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.fallback import impossible, is_better, is_wanted
 from geogs.application.structure_from_motion.offline import PlacedOffline
+from geogs.application.structure_from_motion.photos import PlacedVideo
 from geogs.cli.main import main
 from geogs.cli.options import record
 from geogs.cli.run import parse
@@ -161,7 +163,20 @@ def ended(_lost, tracked, tmp_path, no_report) -> Callable[[], dict]:
     return go_on
 
 
+@pytest.fixture
+def _placed_once(once, monkeypatch) -> None:
+    """Where the frames of the video were taken is found once, by whoever asks first."""
+    place = offline.place_frames
+
+    def found(*args: object) -> PlacedVideo:
+        kept = once("placed-video", lambda file: file.write_bytes(pickle.dumps(place(*args))))
+        return pickle.loads(kept.read_bytes())
+
+    monkeypatch.setattr(offline, "place_frames", found)
+
+
 @pytest.mark.system
+@pytest.mark.usefixtures("_placed_once")
 def test_placed_frames_are_taken_where_they_are_better(ended, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(fallback, "is_better", lambda *_: True)
     summary = ended()
@@ -233,6 +248,7 @@ def test_frames_that_are_found_about_the_keyframes_have_a_place(tmp_path, monkey
 
 
 @pytest.mark.system
+@pytest.mark.usefixtures("_placed_once")
 def test_what_turns_the_camera_otherwise_is_not_taken(ended, monkeypatch, capfd):
     judged = PlacedOffline.judged
 

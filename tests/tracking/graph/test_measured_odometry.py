@@ -79,7 +79,7 @@ def errors(tracker: Tracker, path: list[np.ndarray]) -> tuple[float, float | Non
 
 @pytest.mark.system
 def test_poses_bring_metres_and_wrong_ones_are_out_voted():
-    path = sideways(28)
+    path = sideways(22)
     alone, unknown = errors(tracked(path, None), path)
     assert unknown is None
     tracker = tracked(path, drifting(path, 0, wrong=0.2))
