@@ -8,20 +8,28 @@ import pytest
 import torch
 from torch import Tensor
 
+from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
-from geogs.loop.row_correction import FIRST_STEP, _readout_gradient, _Search, correct_rows
+from geogs.loop.row_correction import (
+    FIRST_STEP,
+    _readout_gradient,
+    _Search,
+    correct_rows,
+    let_lenses_move,
+)
 from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.frames.pose_filling import row_errors
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
-from geogs.tracking.row_twists import row_twists
+from geogs.tracking.row_twists import part_seen, row_twists
 from geogs.tracking.tracker import Tracker, lone_tracker
-from geogs.types import FlowMatch, SeenRows
+from geogs.types import FlowMatch, FrameLens, SeenRows
+from geogs.world.edges import edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
 from planted_walk import PlantedFlow, true_inverse_depth
@@ -47,6 +55,16 @@ def row_times(v: Tensor) -> Tensor:
     return READOUT * (v / (CAMERA.height - 1) - 0.5)
 
 
+def sway(k: np.ndarray) -> Tensor:
+    """Where a stabilised lens is at numbers of frames, in focal lengths."""
+    return torch.from_numpy(np.stack([0.01 * np.sin(1.1 * k), 0.008 * np.cos(0.9 * k)], -1))
+
+
+def drift(frame: int, times: Tensor) -> Tensor:
+    """How far it has moved since the frame's own time, of rows at these seconds: nothing."""
+    return torch.zeros(len(times), 2, dtype=torch.float64)
+
+
 class RollingFlow(PlantedFlow):
     """Exact matches between images whose rows were left as they were read."""
 
@@ -59,9 +77,11 @@ class RollingFlow(PlantedFlow):
     def _one(self, i: int, j: int) -> Tensor:
         world, pixels = self._points(i), GRID.pixels.double()
         for _ in range(4):
-            T = pose(j + RATE * row_times(pixels[:, 1]).numpy())
+            times = row_times(pixels[:, 1])
+            T = pose(j + RATE * times.numpy())
             seen = (T[:, :3, :3] @ world[..., None])[..., 0] + T[:, :3, 3]
-            pixels = seen[:, :2] / seen[:, 2:] * CAMERA.fx + torch.tensor([CAMERA.cx, CAMERA.cy])
+            plane = seen[:, :2] / seen[:, 2:] + drift(j, times)
+            pixels = plane * CAMERA.fx + torch.tensor([CAMERA.cx, CAMERA.cy])
         return pixels
 
     @functools.cache  # noqa: B019
@@ -71,7 +91,9 @@ class RollingFlow(PlantedFlow):
         T = pose(i + RATE * row_times(rows).numpy())
         depth = 1 / true_inverse_depth(T, GRID).reshape(-1, GRID.height, GRID.width).double()
         own = depth[range(GRID.height), range(GRID.height)]
-        points = GRID.rays.reshape(GRID.height, GRID.width, 3).double() * own[..., None]
+        rays = GRID.rays.reshape(GRID.height, GRID.width, 3).double().clone()
+        rays[..., :2] -= drift(i, row_times(rows))[:, None]
+        points = rays * own[..., None]
         return ((points - T[:, None, :3, 3]) @ T[:, :3, :3]).reshape(-1, 3)
 
 
@@ -122,6 +144,39 @@ def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch
     global_bundle(tracker)
     assert bent[0] > 0.05
     assert error(tracker.keyframes.poses(tracker.keyframes.ids)) < 0.4 * bent[0]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_rows_tell_whether_a_lens_moved_while_they_were_read(monkeypatch, moves):
+    monkeypatch.setitem(globals(), "READOUT", 0.01)  # no row is off by what is not believed
+    if moves:
+        monkeypatch.setitem(
+            globals(), "drift",
+            lambda n, times: sway(n + RATE * times.numpy()) - sway(np.array([n])),
+        )  # fmt: skip
+    tracker = tracker_of_rows(as_read())
+    graph, log = tracker.map.graph, tracker.segment.frames
+    graph.measure(
+        [(i, j) for i in range(COUNT) for j in range(i + 1, min(i + 4, COUNT))], packed=True
+    )
+    own = {n: FrameLens(0.0, *sway(np.array(n)).tolist()) for n in range(COUNT)}
+    still, moving = (
+        row_errors(log, tracker.keyframes),
+        row_errors(replace(log, lenses=own), tracker.keyframes),
+    )
+    part = part_seen(still, moving, tracker.keyframes, graph.edges, log)
+    assert part == pytest.approx(float(moves), abs=0.3)
+    let_lenses_move(tracker, own)
+    assert log.lenses == (own if moves else {})
+    errors = row_errors(log, tracker.keyframes)
+    for pairs, (shift, _) in edge_shifts(errors, tracker.keyframes, graph.packed):
+        pixels, weight = edge_matches(GRID, [graph.edges[pair] for pair in pairs])
+        T, depth = (
+            tracker.keyframes.relative_poses(pairs),
+            tracker.keyframes.inverse_depths([i for i, _ in pairs]),
+        )
+        off = (pixels + shift - project(CAMERA, GRID.rays, T, depth).pixels)[weight[..., 0] > 0]
+        assert float(off.norm(dim=-1).median()) < 0.03
 
 
 @pytest.mark.parametrize("are_corrected", [False, True])

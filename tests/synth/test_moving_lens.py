@@ -14,6 +14,24 @@ LENS = RadialCamera(Camera(fx=100.0, fy=110.0, cx=39.5, cy=29.5, width=80, heigh
 def test_a_lens_without_these_flaws_is_the_same():
     moving = MovingLens(LENS, Flaws(noise=3.0), seed=1)
     assert moving.at(0.3) is LENS
+    assert moving.in_rows(np.array([0.3, 0.4])) is LENS
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.05])
+def test_each_row_is_seen_by_the_lens_as_it_is_at_its_time(k1):
+    lens = RadialCamera(LENS.camera, k1)
+    moving = MovingLens(lens, Flaws(focusing=0.02, stabilisation=0.015), 1)
+    times = 0.4 + 0.03 * np.arange(60) / 59
+    x, y = moving.in_rows(times).rays
+    for row in (0, 20, 59):
+        own = moving.at(times[row]).rays
+        np.testing.assert_allclose((x[row], y[row]), (own[0][row], own[1][row]), atol=1e-9)
+    assert np.abs(x - moving.at(times[30]).rays[0]).max() > 0.001
+    left, top, right, bottom = moving.in_rows(times).view
+    assert left < x.min()
+    assert right > x.max()
+    assert top < y.min()
+    assert bottom > y.max()
 
 
 def test_focusing_changes_the_focal_length_alone_and_stabilisation_the_centre():

@@ -6,7 +6,7 @@ from functools import partial
 from geogs.bundle.protocols import BundleOptions
 from geogs.loop.frame_lenses import VaryingLens, correct_frame_lenses
 from geogs.loop.lens_correction import correct_lens
-from geogs.loop.row_correction import correct_rows
+from geogs.loop.row_correction import correct_rows, let_lenses_move
 from geogs.loop.straightening import BentImages, straighten
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
@@ -87,6 +87,8 @@ def global_bundle(
     if images is not None or (is_open and config.fine_adjustment):
         tracker.map.graph.edges.clear()
         match(config.fine_adjustment)
+        if found is not None and found.own:
+            let_lenses_move(tracker, found.own)
         correct_rows(tracker, free_poses, free, GLOBAL_OPTIONS, finds_readout=False)
     if images is not None and found is not None:
         more = None

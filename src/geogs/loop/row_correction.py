@@ -7,7 +7,7 @@ was found in the video, and may be off by some percent, is found once more on th
 where all matches together would become neither better nor worse with another.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from geogs.bundle.flow_term import weighed_residuals
@@ -17,8 +17,9 @@ from geogs.tracking.frames.pose_filling import row_errors, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.tracking.graph.frame_graph import FrameGraph
-from geogs.tracking.row_twists import EVIDENCE, row_twists
+from geogs.tracking.row_twists import EVIDENCE, part_seen, row_twists
 from geogs.tracking.tracker import Tracker
+from geogs.types import FrameLens
 from geogs.world.edges import PackedEdge, Pair, edge_matches
 
 ROUNDS = 2
@@ -29,6 +30,8 @@ SETTLED = 0.003
 """Fraction of the readout by less than which a change ends the search."""
 BETWEEN = 4
 """Steps of an adjustment that another follows, which goes on from there."""
+MOVES = 0.6
+"""Part of a lens's motion that rows have to show for it to move while they are read."""
 FIRST_STEP, FARTHEST = 0.04, 0.25
 """Fraction of the readout that is tried first, and by which it changes at most."""
 
@@ -74,6 +77,22 @@ def correct_rows(
         if n == last:
             break
     return search.factor
+
+
+def let_lenses_move(tracker: Tracker, lenses: Mapping[int, FrameLens]) -> None:
+    """Let the principal points of frames' lenses move while rows are read, if the matches say so.
+
+    A stabilised lens moves all the time, a crop is put elsewhere after an image was read. Images
+    and matches are straight by these lenses, and not corrected for the rows yet.
+    """
+    keyframes, log = tracker.keyframes, tracker.map.recorder.log
+    still = row_errors(log, keyframes)
+    log.lenses = dict(lenses)
+    moving = row_errors(log, keyframes)
+    if still is None or moving is None:
+        return
+    if part_seen(still, moving, keyframes, tracker.map.graph.edges, log) < MOVES:
+        log.lenses = {}
 
 
 class _Search:

@@ -76,6 +76,36 @@ def row_twists(
         are_corrected: whether the matches are corrected for the rows already; else as ``errors``
             say.
     """
+    frames, A = _summed(errors, keyframes, edges, log, are_corrected)
+    return RowTwists(frames, *solved_twists(A, errors.twist_deviations(frames)))
+
+
+def part_seen(
+    errors: RowErrors,
+    others: RowErrors,
+    keyframes: KeyframeSet,
+    edges: Mapping[Pair, Edge],
+    log: FrameLog,
+) -> float:
+    """How far matches want the twists of frames to be from those of ``errors`` towards those of
+    ``others``, by least squares: 0 where the former are right, 1 where the latter are, and 0 where
+    nothing tells. Matches are not corrected for the rows yet."""
+    frames, A = _summed(errors, keyframes, edges, log, False)
+    way = (others.twists(frames) - errors.twists(frames))[..., None]
+    _, S, g = _of_twists(A)
+    square = float((way.mT @ S @ way).sum())
+    return float((way * g).sum()) / square if square > 0 else 0.0
+
+
+def _summed(
+    errors: RowErrors,
+    keyframes: KeyframeSet,
+    edges: Mapping[Pair, Edge],
+    log: FrameLog,
+    are_corrected: bool,
+) -> tuple[list[int], Float64[Tensor, "n 12 13"]]:
+    """Frames that matches end in, and the normal equations of a step of the pose and the twist of
+    each, with their right sides."""
     sums: dict[int, Float64[Tensor, "12 13"]] = {}
     for part in chain(  # some edges at a time, as their equations take memory
         _of_keyframes(keyframes, edges), _of_frames(errors, keyframes, log, are_corrected)
@@ -87,9 +117,8 @@ def row_twists(
             part = part._replace(pixels=part.pixels + found.shift)
         for frame, equations in zip(part.target, _equations(errors, keyframes, part), strict=True):
             sums[frame] = sums.get(frame, 0) + equations
-    frames = [*sums]
-    A = torch.stack([*sums.values()]) if sums else torch.zeros(0, 12, 13, dtype=torch.float64)
-    return RowTwists(frames, *solved_twists(A, errors.twist_deviations(frames)))
+    none = torch.zeros(0, 12, 13, dtype=torch.float64)
+    return [*sums], torch.stack([*sums.values()]) if sums else none
 
 
 def solved_twists(
@@ -98,18 +127,25 @@ def solved_twists(
     """Most likely twists, and what they leave open of the poses, by the normal equations of steps
     of the poses and twists, with their right sides, ``EVIDENCE`` of which counts, and the twists'
     deviations before."""
-    H, v = EVIDENCE * A[..., :12], EVIDENCE * A[..., 12:]
-    eye = torch.eye(6, dtype=H.dtype)
-    of_pose, both, of_twist = H[:, :6, :6], H[:, 6:, :6], H[:, 6:, 6:]
-    largest = of_pose.diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-9)
-    damped = of_pose + 1e-9 * largest[:, None, None] * eye
-    follow, step = torch.linalg.solve(damped, torch.cat([both.mT, v[:, :6]], 2)).split([6, 1], 2)
-    S, g = of_twist - both @ follow, v[:, 6:] - both @ step
+    follow, S, g = _of_twists(EVIDENCE * A)
+    eye = torch.eye(6, dtype=A.dtype)
     rows, columns = deviation[..., None], deviation[:, None]
     open_ = rows * torch.linalg.inv(rows * S * columns + eye) * columns
     squares = (follow @ open_ @ follow.mT).diagonal(dim1=1, dim2=2).reshape(-1, 2, 3).sum(2)
     left = [PoseDeviation(*two) for two in squares.clamp(min=0).sqrt().tolist()]
     return (open_ @ g)[..., 0], left
+
+
+def _of_twists(
+    A: Float64[Tensor, "n 12 13"],
+) -> tuple[Float64[Tensor, "n 6 6"], Float64[Tensor, "n 6 6"], Float64[Tensor, "n 6 1"]]:
+    """How poses follow twists, and the twists' own equations once poses are eliminated."""
+    H, v = A[..., :12], A[..., 12:]
+    of_pose, both, of_twist = H[:, :6, :6], H[:, 6:, :6], H[:, 6:, 6:]
+    largest = of_pose.diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-9)
+    damped = of_pose + 1e-9 * largest[:, None, None] * torch.eye(6, dtype=H.dtype)
+    follow, step = torch.linalg.solve(damped, torch.cat([both.mT, v[:, :6]], 2)).split([6, 1], 2)
+    return follow, of_twist - both @ follow, v[:, 6:] - both @ step
 
 
 def _equations(

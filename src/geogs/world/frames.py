@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.config.setting import Range
 from geogs.limits import RIGID, AtLeast0, KeyframeId, Number, Pose, Positive
-from geogs.types import SeenRows
+from geogs.types import FrameLens, SeenRows
 from geogs.world.arrays import NOT_STORED
 from geogs.world.keyframes import Keyframe
 
@@ -86,6 +86,8 @@ class FrameLog:
     """Rectified rows of a rolling shutter, by the indices of the frames."""
     open_rows: SeenRows | None = None
     """Rows of every frame where none are rectified, and nobody knows whether they should be."""
+    lenses: dict[Number, FrameLens] = field(default_factory=dict)
+    """What the lenses of frames were found to have of their own, by the indices of the frames."""
 
     def set_readout(self, factor: float, doubt: float) -> None:
         """Have rows seen over a readout that is so many times what they were rectified by, with its

@@ -52,8 +52,8 @@ class RadialCamera:
     @cached_property
     def rays(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
         """x and y of the ray (x, y, 1) through the centre of every pixel."""
-        x, y = np.meshgrid(*self._axes)
-        if not self.is_distorted:
+        x, y = self._planes
+        if self.k1 == 0 and self.k2 == 0:
             return x, y
         bent = np.hypot(x, y)
         straight = self._radius(bent) / np.maximum(bent, 1e-12)
@@ -99,6 +99,12 @@ class RadialCamera:
     def _axes(self) -> tuple[Float64[np.ndarray, "w"], Float64[np.ndarray, "h"]]:
         c = self.camera
         return (np.arange(c.width) - c.cx) / c.fx, (np.arange(c.height) - c.cy) / c.fy
+
+    @cached_property
+    def _planes(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
+        """What :attr:`rays` are where nothing is distorted."""
+        x, y = np.meshgrid(*self._axes)
+        return x, y
 
     @property
     def _pinhole_reach(self) -> float:

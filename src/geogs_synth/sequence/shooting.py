@@ -93,19 +93,20 @@ class Shooting:
         self, truth: RenderedView, T_wc: np.ndarray, time: float
     ) -> Float32[np.ndarray, "h w 3"]:
         """Mean linear light in [0, 1] over the exposure."""
-        times, lens = self.sample_times(truth, T_wc, time), self._moving_lens.at(time)
-        if len(times) == 1 and self._flaws.readout == 0 and lens is self.lens:
+        times = self.sample_times(truth, T_wc, time)
+        if len(times) == 1 and self._flaws.readout == 0 and self._moving_lens.is_still:
             return (truth.shade / 255) ** 2
         light = np.zeros_like(truth.shade)
         for one in times:
-            light += (self._instant(lens, one).shade / 255) ** 2
+            light += (self._instant(one).shade / 255) ** 2
         return light / len(times)
 
-    def _instant(self, lens: RadialCamera, time: float) -> RenderedView:
+    def _instant(self, time: float) -> RenderedView:
+        lens = self._moving_lens
         if self._flaws.readout == 0:
-            return self._raycaster.render(lens, self._path(np.array([time]))[0], time)
+            return self._raycaster.render(lens.at(time), self._path(np.array([time]))[0], time)
         times = time + self.row_times()
-        return self._raycaster.render_rolling(lens, self._path(times), times)
+        return self._raycaster.render_rolling(lens.in_rows(times), self._path(times), times)
 
     def _image_motion(
         self, truth: RenderedView, T_wc: np.ndarray, time: float, ends: np.ndarray

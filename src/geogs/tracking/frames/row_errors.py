@@ -19,7 +19,7 @@ from torch import Tensor
 from geogs.bundle.projection import MIN_Z, carried_over, project, seen_from_targets
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.shutter.rows import CELL
-from geogs.types import SeenRows, Trajectory
+from geogs.types import FrameLens, SeenRows, Trajectory
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
@@ -64,15 +64,20 @@ class RowErrors:
         rows: Mapping[int, SeenRows],
         frames: Sequence[int],
         trajectory: Trajectory,
+        lenses: Mapping[int, FrameLens] | None = None,
     ) -> None:
         """``rows`` by frame; ``frames`` are those of the trajectory, in its order.
 
-        Frames without rows have no errors, nor have those with too few tracked neighbours.
+        Frames without rows have no errors, nor have those with too few tracked neighbours. What
+        ``lenses`` of frames have of their own is off their images, but not off their rows: a
+        principal point that moves while an image is read shears it as a turn of the camera does.
         """
         self._grid = grid
         nodes = _nodes(trajectory)
         T_wc = torch.from_numpy(trajectory.T_wc)
         self._T_cw = dict(zip(frames, se3_inverse(T_wc), strict=True))
+        if lenses:
+            T_wc = T_wc @ se3_inverse(_turned_by([lenses.get(n) for n in frames]))
         self._rectified: dict[int, _RectifiedFrame] = {}
         self._factor = 1.0
         for n, (frame, around) in enumerate(zip(frames, nodes, strict=True)):
@@ -114,6 +119,15 @@ class RowErrors:
             }
         return other
 
+    def twists(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
+        """Twists of frames per second, as the poses around tell them: the slope of the polynomial
+        through all. Zero for frames without rows."""
+        twists = torch.zeros(len(frames), 6, dtype=torch.float64)
+        known, own = self._known(frames)
+        if known:
+            twists[known] = slope_at_zero(*_nodes_of(own))
+        return twists
+
     def twist_deviations(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
         """Deviations of the twists of frames, as the poses around tell them: how far the slope of
         the polynomial through all of them is from that through the nearest three, in either half.
@@ -123,8 +137,7 @@ class RowErrors:
         deviations = torch.zeros(len(frames), 6, dtype=torch.float64)
         known, own = self._known(frames)
         if known:
-            times = torch.stack([f.times for f in own]).double()
-            moved = se3_log(torch.stack([f.motions for f in own]).double())
+            times, moved = _nodes_of(own)
             nearest = times.abs().argsort(1)[:, :3]
             by_three = slope_at_zero(
                 times.gather(1, nearest), moved.gather(1, nearest[..., None].expand(-1, -1, 6))
@@ -320,6 +333,23 @@ def slope_at_zero(
     """Derivatives at zero of the polynomials through values at so many times."""
     unit = times.abs().amax(1, keepdim=True)
     return torch.linalg.solve(torch.linalg.vander(times / unit), values)[:, 1] / unit
+
+
+def _nodes_of(
+    frames: Sequence[_RectifiedFrame],
+) -> tuple[Float64[Tensor, "n 5"], Float64[Tensor, "n 5 6"]]:
+    """Seconds of the nodes of frames, and the logarithms of the motions to them."""
+    times = torch.stack([f.times for f in frames]).double()
+    return times, se3_log(torch.stack([f.motions for f in frames]).double())
+
+
+def _turned_by(lenses: Sequence[FrameLens | None]) -> Float64[Tensor, "n 4 4"]:
+    """Turns of the camera that move images as the principal points of the lenses do."""
+    twists = torch.zeros(len(lenses), 6, dtype=torch.float64)
+    for twist, lens in zip(twists, lenses, strict=True):
+        if lens is not None:
+            twist[3:5] = torch.tensor([-lens.down, lens.right])
+    return se3_exp(twists)
 
 
 def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
