@@ -87,7 +87,7 @@ class FrameLog:
     open_rows: SeenRows | None = None
     """Rows of every frame where none are rectified, and nobody knows whether they should be."""
     lenses: dict[Number, FrameLens] = field(default_factory=dict)
-    """What the lenses of frames were found to have of their own, by the indices of the frames."""
+    """What lenses of frames have of their own, where it moves on while rows are read; likewise."""
 
     def set_readout(self, factor: float, doubt: float) -> None:
         """Have rows seen over a readout that is so many times what they were rectified by, with its
