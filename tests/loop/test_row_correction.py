@@ -160,10 +160,8 @@ def test_rows_tell_whether_a_lens_moved_while_they_were_read(monkeypatch, moves)
         [(i, j) for i in range(COUNT) for j in range(i + 1, min(i + 4, COUNT))], packed=True
     )
     own = {n: FrameLens(0.0, *sway(np.array(n)).tolist()) for n in range(COUNT)}
-    still, moving = (
-        row_errors(log, tracker.keyframes),
-        row_errors(replace(log, lenses=own), tracker.keyframes),
-    )
+    still = row_errors(log, tracker.keyframes)
+    moving = still.with_lenses(own)
     part = part_seen(still, moving, tracker.keyframes, graph.edges, log)
     assert part == pytest.approx(float(moves), abs=0.3)
     let_lenses_move(tracker, own)

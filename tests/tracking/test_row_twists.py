@@ -5,9 +5,11 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.tracking import row_twists
 from geogs.tracking.frames.row_errors import RowErrors, slope_at_zero
 from geogs.tracking.locate.pose_deviation import PoseDeviation
 from geogs.tracking.row_twists import EVIDENCE, solved_twists
+from geogs.tracking.tracker import lone_tracker
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA
@@ -86,3 +88,25 @@ def test_twists_move_what_rows_show_in_proportion_to_their_times():
     expected = -CAMERA.fx * (1 + x.square()) * 0.1 * after.seconds(frames, pixels)
     torch.testing.assert_close(moved[..., 0], expected, atol=5e-3, rtol=0.05)
     assert not after.seconds([COUNT], pixels).any()
+
+
+@pytest.mark.parametrize("part", [0.0, 0.7, 1.0])
+def test_the_part_seen_is_that_of_least_squares_with_a_pose_of_each_frame(monkeypatch, part):
+    rng, other = np.random.default_rng(7), KNOCK / 10
+    J = torch.from_numpy(rng.normal(size=(COUNT, 40, 12)))
+    pose = torch.from_numpy(rng.normal(size=(COUNT, 6)))
+    before = errors(0 * KNOCK)
+    after = before.with_twists(range(COUNT), other.expand(COUNT, 6))
+    frames = list(range(COUNT))
+    way = after.twists(frames) - before.twists(frames)
+    torch.testing.assert_close(way[FRAME], other, atol=1e-3, rtol=1e-3)
+    noise = torch.from_numpy(rng.normal(size=(COUNT, 40, 1)))
+    r = J @ torch.cat([pose, part * way], 1)[..., None] + noise
+    A = J.mT @ torch.cat([J, r], 2)
+    monkeypatch.setattr(row_twists, "_summed", lambda *_: (frames, A))
+    columns = [torch.block_diag(*J[..., :6]), (J[..., 6:] @ way[..., None]).reshape(-1, 1)]
+    reference = torch.linalg.lstsq(torch.cat(columns, 1), r.reshape(-1, 1)).solution[-1, 0]
+    tracker = lone_tracker(CAMERA)
+    found = row_twists.part_seen(before, after, tracker.keyframes, {}, tracker.segment.frames)
+    assert found == pytest.approx(float(reference), rel=1e-6)
+    assert found == pytest.approx(part, abs=0.1)

@@ -86,12 +86,12 @@ def let_lenses_move(tracker: Tracker, lenses: Mapping[int, FrameLens]) -> None:
     and matches are straight by these lenses, and not corrected for the rows yet.
     """
     keyframes, log = tracker.keyframes, tracker.map.recorder.log
-    own = dict(lenses)
-    still, moving = row_errors(log, keyframes), row_errors(replace(log, lenses=own), keyframes)
-    if still is None or moving is None:
+    still = row_errors(log, keyframes)
+    if still is None:
         return
+    moving = still.with_lenses(lenses)
     if part_seen(still, moving, keyframes, tracker.map.graph.edges, log) > MOVES:
-        log.lenses = own
+        log.lenses = dict(lenses)
 
 
 class _Search:

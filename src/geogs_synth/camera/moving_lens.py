@@ -1,12 +1,10 @@
 """A lens that changes as time goes on: focus breathing and optical stabilisation."""
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.geometry.camera import Camera
 from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.radial_camera import RadialCamera
 
@@ -33,47 +31,54 @@ class MovingLens:
         """The lens of an image whose rows are taken at these seconds."""
         if self.is_still:
             return self._lens
-        rows = tuple(self.at(time).camera for time in times.tolist())
-        return _LensInRows(rows[len(rows) // 2], self._lens.k1, self._lens.k2, rows)
+        lens = self.at(float(times[len(times) // 2]))
+        return _LensInRows(lens.camera, lens.k1, lens.k2, rows=self._intrinsics(times))
 
     def at(self, time: float) -> RadialCamera:
         """The lens at ``time`` seconds."""
-        flaws, camera = self._flaws, self._lens.camera
         if self.is_still:
             return self._lens
-        focus = _wave(time, _FOCUS_PERIODS, self._phases[0])
-        right, down = (_wave(time, _SHAKE_PERIODS, phase) for phase in self._phases[1:])
+        fx, fy, cx, cy = self._intrinsics(np.array([time]))[0].tolist()
+        return replace(self._lens, camera=replace(self._lens.camera, fx=fx, fy=fy, cx=cx, cy=cy))
+
+    def _intrinsics(self, times: Float64[np.ndarray, "t"]) -> Float64[np.ndarray, "t 4"]:
+        """fx, fy, cx and cy at some seconds."""
+        flaws, camera = self._flaws, self._lens.camera
+        focus = _wave(times, _FOCUS_PERIODS, self._phases[0])
+        right, down = (_wave(times, _SHAKE_PERIODS, phase) for phase in self._phases[1:])
         factor = 1 + flaws.focusing * focus
         fx, fy = factor * camera.fx, factor * camera.fy
-        moved = replace(
-            camera, fx=fx, fy=fy,
-            cx=camera.cx + flaws.stabilisation * right * fx,
-            cy=camera.cy + flaws.stabilisation * down * fy,
-        )  # fmt: skip
-        return replace(self._lens, camera=moved)
+        cx, cy = (
+            camera.cx + flaws.stabilisation * right * fx,
+            camera.cy + flaws.stabilisation * down * fy,
+        )
+        return np.stack([fx, fy, cx, cy], 1)
 
 
 @dataclass(frozen=True)
 class _LensInRows(RadialCamera):
     """A lens that changes while an image is read."""
 
-    rows: tuple[Camera, ...] = ()
-    """Its pinhole at the time of each row."""
+    rows: Float64[np.ndarray, "h 4"] = field(kw_only=True)
+    """fx, fy, cx and cy at the time of each row."""
 
     @property
     def is_distorted(self) -> bool:
         """Straight lines look bent where it moves."""
         return True
 
-    @cached_property
+    @property
     def _planes(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
-        c = np.array([(c.fx, c.fy, c.cx, c.cy) for c in self.rows])[..., None]
+        fx, fy, cx, cy = self.rows.T[..., None]
         v, u = np.mgrid[: self.camera.height, : self.camera.width]
-        return (u - c[:, 2]) / c[:, 0], (v - c[:, 3]) / c[:, 1]
+        return (u - cx) / fx, (v - cy) / fy
 
 
 def _wave(
-    time: float, periods: Float64[np.ndarray, "k"], phases: Float64[np.ndarray, "k"]
-) -> float:
+    times: Float64[np.ndarray, "t"],
+    periods: Float64[np.ndarray, "k"],
+    phases: Float64[np.ndarray, "k"],
+) -> Float64[np.ndarray, "t"]:
     """Between -1 and 1."""
-    return float(np.sin(2 * np.pi * time / periods + phases).mean())
+    waves: Float64[np.ndarray, "t"] = np.sin(2 * np.pi * times[:, None] / periods + phases).mean(1)
+    return waves

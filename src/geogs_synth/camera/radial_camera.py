@@ -100,7 +100,7 @@ class RadialCamera:
         c = self.camera
         return (np.arange(c.width) - c.cx) / c.fx, (np.arange(c.height) - c.cy) / c.fy
 
-    @cached_property
+    @property
     def _planes(self) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
         """What :attr:`rays` are where nothing is distorted."""
         x, y = np.meshgrid(*self._axes)

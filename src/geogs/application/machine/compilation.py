@@ -159,7 +159,7 @@ def main(arguments: list[str]) -> None:
     """Compile all, or the parts that are named, with a line for each kernel."""
     parts = arguments or [*PARTS]
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_NICENESS * (1 + [*(POSED_ON_GPU | ON_GPU | PARTS)].index(parts[0])))
+        os.nice(_NICENESS * (1 + [*(ON_GPU | POSED_ON_GPU | PARTS)].index(parts[0])))
     if not is_compiled(parts):
         compile_now(parts, lambda name: print(name, flush=True))
 

@@ -69,9 +69,8 @@ def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
     if not frames.rows:
         return None
     indices = sorted(record.index for record in frames.records)
-    return RowErrors(
-        keyframes.grid, frames.rows, indices, solve_trajectory(frames, keyframes), frames.lenses
-    )
+    errors = RowErrors(keyframes.grid, frames.rows, indices, solve_trajectory(frames, keyframes))
+    return errors.with_lenses(frames.lenses)
 
 
 def rows_in_doubt(

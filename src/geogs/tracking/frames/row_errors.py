@@ -49,6 +49,8 @@ class _RectifiedFrame:
     """The rows of a frame, and how the camera moved around it."""
 
     rows: SeenRows
+    nodes: tuple[int, ...]
+    """Frames around it, this among them."""
     times: Float[Tensor, "5"]
     """Seconds of the nodes, from the frame."""
     motions: Float[Tensor, "5 4 4"]
@@ -64,28 +66,24 @@ class RowErrors:
         rows: Mapping[int, SeenRows],
         frames: Sequence[int],
         trajectory: Trajectory,
-        lenses: Mapping[int, FrameLens] | None = None,
     ) -> None:
         """``rows`` by frame; ``frames`` are those of the trajectory, in its order.
 
-        Frames without rows have no errors, nor have those with too few tracked neighbours. What
-        ``lenses`` of frames have of their own is off their images, but not off their rows: a
-        principal point that moves while an image is read shears it as a turn of the camera does.
+        Frames without rows have no errors, nor have those with too few tracked neighbours.
         """
         self._grid = grid
         nodes = _nodes(trajectory)
         T_wc = torch.from_numpy(trajectory.T_wc)
         self._T_cw = dict(zip(frames, se3_inverse(T_wc), strict=True))
-        if lenses:
-            T_wc = T_wc @ se3_inverse(_turned_by([lenses.get(n) for n in frames]))
         self._rectified: dict[int, _RectifiedFrame] = {}
         self._factor = 1.0
         for n, (frame, around) in enumerate(zip(frames, nodes, strict=True)):
             if frame in rows and around is not None:
                 times = trajectory.timestamps[around] - trajectory.timestamps[n]
                 motions = (se3_inverse(T_wc[around]) @ T_wc[n]).float()
+                own = tuple(frames[node] for node in around)
                 self._rectified[frame] = _RectifiedFrame(
-                    rows[frame], torch.from_numpy(times).float(), motions
+                    rows[frame], own, torch.from_numpy(times).float(), motions
                 )
 
     def merged(self, other: "RowErrors") -> "RowErrors":
@@ -117,6 +115,27 @@ class RowErrors:
             other._rectified = self._rectified | {
                 frames[n]: replace(f, motions=T) for n, f, T in zip(known, own, moved, strict=True)
             }
+        return other
+
+    def with_lenses(self, lenses: Mapping[int, FrameLens]) -> "RowErrors":
+        """The same, the principal points of frames' lenses moving on while rows are read.
+
+        What lenses have of their own is off the images, but not off the rows: a principal point
+        that moves while an image is read shears it as a turn of the camera does.
+        """
+        if not lenses:
+            return self
+        other, none = copy.copy(self), FrameLens()
+        turns = {frame: _turn_of(lenses.get(frame, none)) for frame in self._T_cw}
+        other._rectified = {
+            frame: replace(
+                f,
+                motions=torch.stack([turns[n] for n in f.nodes])
+                @ f.motions
+                @ se3_inverse(turns[frame]),
+            )
+            for frame, f in self._rectified.items()
+        }
         return other
 
     def twists(self, frames: Sequence[int]) -> Float64[Tensor, "n 6"]:
@@ -343,13 +362,9 @@ def _nodes_of(
     return times, se3_log(torch.stack([f.motions for f in frames]).double())
 
 
-def _turned_by(lenses: Sequence[FrameLens | None]) -> Float64[Tensor, "n 4 4"]:
-    """Turns of the camera that move images as the principal points of the lenses do."""
-    twists = torch.zeros(len(lenses), 6, dtype=torch.float64)
-    for twist, lens in zip(twists, lenses, strict=True):
-        if lens is not None:
-            twist[3:5] = torch.tensor([-lens.down, lens.right])
-    return se3_exp(twists)
+def _turn_of(lens: FrameLens) -> Float[Tensor, "4 4"]:
+    """The turn of a camera that moves an image as the principal point of its lens does."""
+    return se3_exp(torch.tensor([0.0, 0.0, 0.0, -lens.down, lens.right, 0.0]))
 
 
 def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
