@@ -114,7 +114,7 @@ def test_a_start_does_not_believe_what_a_failed_one_held_for_moving(
             return Attempt.FAILED
         found = initialise(graph, config, flows)
         judged = [k.moving for k in graph.keyframes]
-        shares[-1] = max(1.0 if m is None else float(m.float().mean()) for m in judged)
+        shares[-1] = max(0.0 if m is None else float(m.float().mean()) for m in judged)
         return found
 
     monkeypatch.setattr(start_up, "initialise", tried)

@@ -60,7 +60,7 @@ class Keyframe:
     """Factor by which corrections have multiplied the lengths around it; what was measured from it
     at another scale is to be multiplied by the ratio of the two."""
     moving: Bool[Tensor, "p"] | None = None
-    """Cells that show something dynamic; none where nobody has judged yet."""
+    """Cells that show something dynamic; none where nothing does, or nobody has judged yet."""
     measured: MeasuredCells | None = None
     """What a depth sensor says; none without, or where the map is not metric."""
     pose: MeasuredPose | None = None

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Int64
 
 from geogs.config import MappingConfig
 from geogs.depth.depth_engine import Progress
@@ -16,6 +17,8 @@ from geogs.world.map import MapTable, TrainingPlace
 if TYPE_CHECKING:
     from geogs.mapping.training.trainer_choice import MapTrainer
 
+# Most views that are shuffled all together, about as many as stay in memory; of more, so many.
+_SHUFFLED, _BLOCK = 128, 32
 # Most steps between two reports of progress.
 _REPORTED_STEPS = 20
 # Steps that are timed, and again so often if they take less than so many seconds.
@@ -82,7 +85,7 @@ class FullTraining:
         """The next view, in random order, each once before any comes again."""
         table = self._table
         if not table.order:
-            table.order = table.random.of_numpy.permutation(len(self._mapped)).tolist()
+            table.order = random_order(len(self._mapped), table.random.of_numpy).tolist()
         id = self._mapped[table.order.pop()].id
         return draw_batch([id], self._views, self._config, table.random.of_numpy)
 
@@ -93,6 +96,18 @@ class FullTraining:
             return self._mapped
         left = set(self._table.order)
         return [view for n, view in enumerate(self._mapped) if n not in left]
+
+
+def random_order(count: int, random: np.random.Generator) -> Int64[np.ndarray, "count"]:
+    """The numbers below ``count``, shuffled; of a long video, in blocks of consecutive keyframes.
+
+    The blocks come in random order, shuffled within. Their views have most partners in common, so
+    that few of either are read from the file.
+    """
+    if count <= _SHUFFLED:
+        return random.permutation(count)
+    blocks = np.split(np.arange(count), np.arange(random.integers(1, _BLOCK + 1), count, _BLOCK))
+    return np.concatenate([random.permutation(blocks[i]) for i in random.permutation(len(blocks))])
 
 
 def seconds_per_step(

@@ -47,9 +47,15 @@ def static_weight(
     weight: Float[Tensor, "e p 2"],
 ) -> Float[Tensor, "e p 2"]:
     """Weights of matches, none of those from or to a cell that is dynamic."""
-    if all(keyframes[k].moving is None for k in {k for e in directed for k in e}):
+    some = [
+        n for n, (i, j) in enumerate(directed)
+        if keyframes[i].moving is not None or keyframes[j].moving is not None
+    ]  # fmt: skip
+    if not some:
         return weight
-    return weight * _static(keyframes, directed, pixels)[..., None]
+    weight = weight.clone()
+    weight[some] *= _static(keyframes, [directed[n] for n in some], pixels[some])[..., None]
+    return weight
 
 
 def propagated(
@@ -106,8 +112,8 @@ def update_dynamic(
         dynamic = dynamic_cells(keyframes.grid, total, count, before, threshold)
         border = _mean(keyframes.grid, stands.to(total), 5) >= MIN_DYNAMIC_AROUND
         dynamic |= stands | border
-        for n, k in enumerate(ids.tolist()):
-            keyframes[k].moving = dynamic[n].clone()
+        for n, (k, is_any) in enumerate(zip(ids.tolist(), dynamic.any(1).tolist(), strict=True)):
+            keyframes[k].moving = dynamic[n].clone() if is_any else None
 
 
 def dynamic_cells(
