@@ -98,7 +98,7 @@ class FullTraining:
         return [view for n, view in enumerate(self._mapped) if n not in left]
 
 
-def random_order(count: int, random: np.random.Generator) -> Int64[np.ndarray, "count"]:
+def random_order(count: int, random: np.random.Generator) -> Int64[np.ndarray, "n"]:
     """The numbers below ``count``, shuffled; of a long video, in blocks of consecutive keyframes.
 
     The blocks come in random order, shuffled within. Their views have most partners in common, so
