@@ -46,7 +46,7 @@ def seen_by(T_cw: np.ndarray, depth: float = 2.0) -> Sightings:
     return sightings(T_cw, CAMERA, typical, points)
 
 
-def slow_order(seen: Sightings, sharpness: np.ndarray) -> list[int]:
+def slow_order(seen: Sightings, sharpness: np.ndarray, copy: float = 0.02) -> list[int]:
     """The definition, all of it anew for every choice."""
     rays: list[dict[int, np.ndarray]] = [{} for _ in range(seen.views)]
     for point, view, ray in zip(seen.point, seen.view, seen.ray, strict=True):
@@ -71,7 +71,7 @@ def slow_order(seen: Sightings, sharpness: np.ndarray) -> list[int]:
                     new = 1.0 if angle > 75.0 else 0.5
                 news.append(new)
                 gain += new / len(others)
-            if news and np.mean(news) <= 0.02:
+            if news and np.mean(news) <= copy:
                 continue
             if gain * sharpness[view] > most * (1 + 1e-6):
                 best, most = view, gain * sharpness[view]
@@ -87,6 +87,14 @@ def test_the_order_is_that_of_the_definition():
     order = list(coverage_order(seen, sharpness))
     assert order == slow_order(seen, sharpness)
     assert len(order) == 16
+
+
+@pytest.mark.parametrize("copy", [0.1, 0.3])
+def test_those_are_copies_that_see_nothing_from_elsewhere(copy):
+    seen = seen_by(walk(40, turn=1.0))
+    order = list(coverage_order(seen, np.ones(40), copy))
+    assert order == slow_order(seen, np.ones(40), copy)
+    assert {0.1: 12, 0.3: 3}[copy] < len(order) < {0.1: 30, 0.3: 15}[copy]
 
 
 def test_every_beginning_covers_what_as_many_evenly_spread_ones_do():

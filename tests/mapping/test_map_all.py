@@ -56,9 +56,14 @@ def both(frames):
 def test_poses_are_the_same_and_the_surface_nearly(both):
     online, after = both
     assert np.array_equal(online.trajectory().T_wc, after.trajectory().T_wc)
-    assert after.executor.mapper.table.mapped == online.executor.mapper.table.mapped
+    every, mapped = (slam.executor.mapper.table.mapped for slam in both)
+    assert set(mapped) <= set(every)
+    # The camera of this room moves slowly: one keyframe or another sees nothing from elsewhere.
+    assert 0.7 * len(every) < len(mapped) < len(every)
     assert after.world.is_refined
-    for a, b in zip(online.renders(), after.renders(), strict=True):
+    of_all = dict(zip(every, online.renders(), strict=True))
+    for id, b in zip(mapped, after.renders(), strict=True):
+        a = of_all[id]
         seen = (a.depth > 0) & (b.depth > 0)
         assert seen.float().mean() > 0.9 * (a.depth > 0).float().mean()
         assert float(((a.depth - b.depth).abs() / a.depth)[seen].median()) < 0.01

@@ -1,4 +1,4 @@
-"""Selection of the images with known poses that make a map: those that cover it from all sides.
+"""Selection of the images that make a map: those that cover it from all sides.
 
 The scene is represented by points. An image gains at a point that no chosen image sees yet, and
 where its ray makes an angle with theirs from which depth can be triangulated. Images are chosen
@@ -16,7 +16,7 @@ from geogs.geometry.camera import Camera
 
 # Rays of each image that make points of the scene, across and down.
 _ACROSS, _DOWN = 4, 3
-# Most points of the scene, and how many of their cells the usual depth spans.
+# Most points of the scene by default, and how many of their cells the usual depth spans.
 _POINTS, _CELLS = 1000, 10.0
 # A point counts as seen from 1/x to x times the depth that is usual in the image.
 _DEPTHS = 3.0
@@ -25,7 +25,7 @@ _SAME_SIDE = 75.0
 # Worth of a point that one image sees, over one that two see well; and of one whose rays are too
 # far apart to be matched.
 _ALONE, _UNMATCHED = 0.5, 0.5
-# Newness below which an image is taken for a copy of one that was chosen.
+# Newness below which an image is taken for a copy of those that were chosen.
 _COPY = 0.02
 # Nearest images whose detail is compared; least worth of a blurred one.
 _ALIKE, _LEAST_SHARP = 6, 0.3
@@ -49,8 +49,9 @@ def scene_points(
     camera: Camera,
     typical: Float64[np.ndarray, "v"],
     random: np.random.Generator,
+    most: int = _POINTS,
 ) -> Float64[np.ndarray, "p 3"]:
-    """Evenly spread points of the scene, at the usual depth of each image."""
+    """Evenly spread points of the scene, at the usual depth of each image; ``most`` of them."""
     u = (np.arange(_ACROSS) + 0.5) / _ACROSS * camera.width
     v = (np.arange(_DOWN) + 0.5) / _DOWN * camera.height
     x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
@@ -59,8 +60,8 @@ def scene_points(
     points = (local @ T_cw[:, :3, :3]).reshape(-1, 3)
     side = float(np.median(typical)) / _CELLS
     _, first = np.unique(np.floor(points / side).astype(np.int64), axis=0, return_index=True)
-    if len(first) > _POINTS:
-        first = random.choice(first, _POINTS, replace=False)
+    if len(first) > most:
+        first = random.choice(first, most, replace=False)
     return points[np.sort(first)]
 
 
@@ -88,12 +89,16 @@ def sightings(
     return Sightings(all_points, all_views, np.concatenate(ray)[by_point], len(T_cw))
 
 
-def coverage_order(seen: Sightings, sharpness: Float64[np.ndarray, "v"]) -> Iterator[int]:
+def coverage_order(
+    seen: Sightings, sharpness: Float64[np.ndarray, "v"], copy: float = _COPY
+) -> Iterator[int]:
     """Indices of the images, the one of most gain first; copies of chosen ones are left out.
 
     Args:
         seen: which points the images see.
         sharpness: factor on the gain of each image, at most 1.
+        copy: newness of an image's rays, in the mean, up to which it is a copy; that of a ray is
+            its angle to the nearest chosen one, over the best for matching, at most 1.
     """
     points = int(seen.point.max(initial=-1)) + 1
     begin = np.searchsorted(seen.point, np.arange(points + 1))
@@ -106,7 +111,7 @@ def coverage_order(seen: Sightings, sharpness: Float64[np.ndarray, "v"]) -> Iter
     gain, fresh = _ALONE * sees, sees.copy()
     count, left = np.zeros(points, np.int64), np.ones(seen.views, bool)
     while True:
-        left &= (fresh > _COPY * sees) | (sees == 0)
+        left &= (fresh > copy * sees) | (sees == 0)
         if not left.any():
             return
         best = int(np.argmax(np.where(left, gain * sharpness, -1.0)))

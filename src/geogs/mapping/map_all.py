@@ -3,13 +3,21 @@
 import time
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from geogs.depth.depth_engine import Progress, silent
+from geogs.mapping.coverage import coverage_order, scene_points, sightings
+from geogs.mapping.keyframe_depths import tracked_depth
 from geogs.mapping.mapper import SEARCHED, Mapper
 from geogs.mapping.training.full import seconds_per_step
 from geogs.threads import worker_count
 
 # Most and least keyframes whose depths are searched in one go.
 _AT_ONCE, _FIRST = 16, 4
+# Newness of its rays from which on a keyframe says enough that others do not.
+_NEWNESS = 0.1
+# Points of the scene for each keyframe by which that is told; of few keyframes so many in all.
+_POINTS_EACH, _POINTS = 4, 1000
 
 
 def map_all(
@@ -18,13 +26,14 @@ def map_all(
     progress: Progress = silent,
     time_budget: float | None = None,
 ) -> None:
-    """Search the depths of observed keyframes, grow the map with all of them, and train it.
+    """Search the depths of observed keyframes, grow the map with them, and train it.
 
-    An exception raised by ``progress`` keeps what there is by then. About a fraction ``SEARCHED``
-    of a time budget, in seconds, is for depths, of keyframes evenly spread over all; those without
-    depth are left out. Depths that exist already stay.
+    Keyframes that see hardly anything from elsewhere than others (:func:`covering`) get no depth;
+    others are matched with them. An exception raised by ``progress`` keeps what there is by then.
+    About a fraction ``SEARCHED`` of a time budget, in seconds, is for depths, of keyframes evenly
+    spread over all; those without depth are left out. Depths that exist already stay.
     """
-    ids = [i for i in keyframe_ids if not mapper.views[i].has_depth]
+    ids = [i for i in covering(mapper, keyframe_ids) if not mapper.views[i].has_depth]
     until = None
     if time_budget is not None:
         ids, until = spread_order(ids), time.perf_counter() + SEARCHED * time_budget
@@ -40,6 +49,23 @@ def map_all(
         affordable = int((1 - SEARCHED) * time_budget / seconds)
         steps = min(steps, max(affordable, len(mapper.table.mapped)))
     mapper.train(steps, lambda done: progress(SEARCHED + (1 - SEARCHED) * done))
+
+
+def covering(mapper: Mapper, keyframe_ids: Sequence[int]) -> list[int]:
+    """Those of some observed keyframes that show the scene as all do, in their order.
+
+    Where a camera lingers or comes again, others see the same points along nearly the same rays.
+    """
+    views, camera = [mapper.views[i] for i in keyframe_ids], mapper.cameras.render
+    if not views:
+        return []
+    T_cw = np.stack([view.T_cw.numpy() for view in views])
+    typical = np.array([tracked_depth(view.keyframe) for view in views])
+    most = max(_POINTS, _POINTS_EACH * len(views))
+    points = scene_points(T_cw, camera, typical, np.random.default_rng(0), most)
+    seen = sightings(T_cw, camera, typical, points)
+    chosen = coverage_order(seen, np.ones(len(views)), _NEWNESS)
+    return sorted(keyframe_ids[n] for n in chosen)
 
 
 def spread_order(items: Sequence[int]) -> list[int]:

@@ -215,5 +215,9 @@ def check_loops(table: LoopTable, keyframes: KeyframeTable, segments: Container[
         ((c[:, 0] < 0) | (c[:, 0] >= words) | (c[:, 1] < 1)).any() for c in counts
     ):
         raise InputError("the index of appearance is incomplete")
+    proposed = [f.candidate for found in table.found for f in found]
+    ends = [id for pair in (*proposed, *table.loops) for id in (pair.first, pair.second)]
+    if not {*vocabulary.keyframes, *ends} <= {*table.keyframes} & table.features.keys():
+        raise InputError("a keyframe that loops name was never searched for them")
     if not all(number in segments for number in table.constraints):
         raise InputError("the segment of a relative pose is missing")
