@@ -6,8 +6,10 @@ import numpy as np
 import torch
 
 from geogs.config import LossConfig
+from geogs.depth.depth_engine import DepthEngine, silent
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
+from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.keyframes import Keyframe
 from keyframe_samples import Sample, segment_of, views_of
@@ -54,6 +56,22 @@ def test_a_depth_without_normals_takes_them_away():
     assert pool[keyframe.id].constants.prior_normal is not None
     pool[keyframe.id].set_depth(depth_with(None))
     assert pool[keyframe.id].constants.prior_normal is None
+
+
+class Sees(DepthEngine):
+    """An engine whose depths come with normals."""
+
+    def estimate(self, tasks, progress=silent):
+        return [depth_with(facing()) for _ in tasks]
+
+
+def test_those_of_the_search_are_left_out():
+    made = keyframes()
+    pool = views_of(made[0].table, CAMERAS, LossConfig())
+    views = [pool.add(keyframe.id) for keyframe in made]
+    KeyframeDepths(Sees(), pool, None, bare_planes=False).estimate(views)
+    assert all(view.dense.normal is None for view in views)
+    assert all(view.constants.prior_normal is None for view in views)
 
 
 def test_those_of_a_prior_come_first():

@@ -106,16 +106,15 @@ class DenseDepth:
         return replace(self, confidence=confidence, median=inside.median().cpu(), written=None)
 
     def unknown_in(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
-        """The depth with confidence 0 in the mask, and without normals: on bare walls the network's
-        are worse than the map's. Depth and median stay."""
+        """The depth with confidence 0 in the mask. Depth and median stay."""
         confidence = torch.where(mask.to(self.confidence.device), 0.0, self.confidence)
-        return replace(self, confidence=confidence, normal=None)
+        return replace(self, confidence=confidence)
 
     def under(self, sky: Bool[Tensor, "h w"] | None) -> "DenseDepth":
         """The depth with that sky, if any."""
         if sky is None:
             return self
-        return replace(self, confidence=torch.where(sky, 0.0, self.confidence), sky=sky)
+        return replace(self.unknown_in(sky), sky=sky)
 
     def through_sky(self) -> "DenseDepth":
         """The depth with its sky behind everything, at confidence 1."""

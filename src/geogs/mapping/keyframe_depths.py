@@ -1,6 +1,7 @@
 """The dense depths of the map's keyframes: searched, fused with a sensor, and checked."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from operator import attrgetter
 
 from jaxtyping import Bool, Float
@@ -44,7 +45,11 @@ class KeyframeDepths:
         self.bare_planes = bare_planes
 
     def estimate(self, views: Sequence[MapView], progress: Progress = silent) -> None:
-        """Search the depths of some views, not too many at once."""
+        """Search the depths of some views, not too many at once.
+
+        Normals that the depth network gives are left out: as N_f of the map's loss they make
+        facets smoother, and its depths less right (docs/depth-network.md).
+        """
 
         def on(done: float) -> None:
             progress((start + done * len(batch)) / len(views))
@@ -53,7 +58,7 @@ class KeyframeDepths:
             batch = views[start : start + SEARCHED_TOGETHER]
             depths = self.engine.estimate([self._task(view) for view in batch], on)
             for view, depth in zip(batch, self._planar(batch, depths), strict=True):
-                view.set_depth(self._with_sensor(view, depth))
+                view.set_depth(replace(self._with_sensor(view, depth), normal=None))
 
     def check(self, views: Sequence[MapView]) -> None:
         """Revise the depths of views by those of their neighbours, all as they were estimated."""
