@@ -216,8 +216,10 @@ def check_loops(table: LoopTable, keyframes: KeyframeTable, segments: Container[
     ):
         raise InputError("the index of appearance is incomplete")
     proposed = [f.candidate for found in table.found for f in found]
-    ends = [id for pair in (*proposed, *table.loops) for id in (pair.first, pair.second)]
-    if not {*vocabulary.keyframes, *ends} <= {*table.keyframes} & table.features.keys():
+    pairs = [(pair.first, pair.second) for pair in proposed]
+    pairs += [(loop.first, loop.second) for loop in table.loops]
+    named = {*vocabulary.keyframes, *(id for pair in pairs for id in pair)}
+    if not named <= {*table.keyframes} & table.features.keys():
         raise InputError("a keyframe that loops name was never searched for them")
     if not all(number in segments for number in table.constraints):
         raise InputError("the segment of a relative pose is missing")
