@@ -33,7 +33,8 @@ def load_colmap() -> Any:
 @contextmanager
 def _request_to_end_kept() -> Iterator[None]:
     """Its import makes a request to end print a stack: what was there before is put back, and a
-    request that comes meanwhile waits."""
+    request that comes meanwhile waits; but for one that another thread takes in the hundredths of a
+    second until then."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -16,7 +16,7 @@ from geogs.mesh.decimation.deviation import (
 from geogs.mesh.decimation.deviation_kernels import triangle_distance
 from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.volume.device_marching import device_surface
-from geogs.mesh.volume.free_space import SeenFree
+from geogs.mesh.volume.free_space import FreeSpace
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import SparseTsdf
 from surface_shapes import hills
@@ -86,9 +86,9 @@ def test_it_is_cleaned_as_on_the_host(device, most):
     config, tsdf = MeshConfig(min_component_faces=8, max_components=most), volume(device)
     expected = extract_surface(host(tsdf), 1.5)
     before = expected
-    expected, up = cleaned(expected, config, SeenFree(host(tsdf), 1.5))
+    expected, up = cleaned(expected, config, FreeSpace.of(host(tsdf), 1.5))
     assert len(expected.faces) != len(before.faces)
-    made, normals = cleaned(device_surface(tsdf, 1.5), config, SeenFree(tsdf, 1.5))
+    made, normals = cleaned(device_surface(tsdf, 1.5), config, FreeSpace.of(tsdf, 1.5))
     assert_same_surface(made, expected)
     order, other = (np.lexsort(v.vertices.cpu().numpy().round(5).T) for v in (made, expected))
     np.testing.assert_allclose(normals.cpu().numpy()[order], up.numpy()[other], atol=1e-4)
@@ -100,7 +100,7 @@ def test_without_a_surface_the_error_is_that_of_the_host():
         with pytest.raises(
             InputError, match=f"No surface was seen with a total weight of {weight:g}"
         ):
-            cleaned(found, config, SeenFree(tsdf, weight))
+            cleaned(found, config, FreeSpace.of(tsdf, weight))
 
 
 @pytest.mark.parametrize("count", [1, 30, 300, 2000])

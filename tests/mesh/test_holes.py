@@ -12,7 +12,7 @@ from geogs.mesh.extract import extract_mesh
 from geogs.mesh.holes import IsFree, border_loops
 from geogs.mesh.tensor_mesh import TensorMesh
 from geogs.mesh.triangle_mesh import DepthMapView, Mesh
-from geogs.mesh.volume.free_space import FreeSpace, SeenFree
+from geogs.mesh.volume.free_space import FreeSpace
 from geogs.mesh.volume.tsdf import BLOCK, SparseTsdf
 
 N = 21
@@ -96,7 +96,7 @@ def test_what_is_free_is_asked_of_the_voxel_nearest_to_a_point():
     tsdf.integrate(depth, torch.ones(30, 40), camera, torch.eye(4, dtype=torch.float64))
     random = np.random.default_rng(0)
     points = random.uniform([-1, -1, 1.2], [1, 1, 2.5], (200, 3))
-    free, asked, expected = FreeSpace.of(tsdf, 0.9), SeenFree(tsdf, 0.9), []
+    free, expected = FreeSpace.of(tsdf, 0.9), []
     for point in points:
         voxel = np.rint(point / 0.1).astype(int)
         block = voxel // BLOCK
@@ -107,11 +107,10 @@ def test_what_is_free_is_asked_of_the_voxel_nearest_to_a_point():
             and float(tsdf.weight[slot[0]][place]) >= 0.9
             and float(tsdf.distance[slot[0]][place]) > 0.5
         )
-    assert free(points).tolist() == asked(points).tolist() == expected
+    assert free(points).tolist() == expected
     assert 0.03 < np.mean(expected) < 0.97
     far = np.array([[1e9, 0.0, 0.0]])
     assert not free(far)[0]
-    assert not asked(far)[0]
 
 
 @pytest.mark.parametrize("looked_through", [False, True])

@@ -68,12 +68,13 @@ def without_degenerate_faces(mesh: TensorMesh) -> TensorMesh:
 
 
 def _have_areas(mesh: TensorMesh) -> Bool[Tensor, "m"]:
-    a, b, c = mesh.corners()
-    u, v, w = b - a, c - a, c - b
-    area = torch.linalg.cross(u, v).square().sum(-1)
-    scale = sum(edge.square().sum(-1).mean() for edge in (u, v, w)) / 3
+    areas, squares = [], []
+    for _, u, v, w in mesh.edges():
+        areas.append(torch.linalg.cross(u, v).square().sum(-1))
+        squares.append(u.square().sum() + v.square().sum() + w.square().sum())
+    mean = torch.stack(squares).sum() / (3 * len(mesh.faces))
     i, j, k = mesh.faces.unbind(1)
-    return (i != j) & (j != k) & (k != i) & (area > 1e-12 * scale**2)
+    return (i != j) & (j != k) & (k != i) & (torch.cat(areas) > 1e-12 * mean**2)
 
 
 def large_components(
@@ -125,16 +126,16 @@ def components_on_host(mesh: TensorMesh) -> Int[Tensor, "n"]:
 
 def border_edges(mesh: TensorMesh) -> Int[Tensor, "e 2"]:
     """Edges (start, end) of faces that no face has in the other direction, in no order."""
-    start, end = mesh.faces.flatten(), mesh.faces.roll(-1, 1).flatten()
-    low, high = torch.minimum(start, end), torch.maximum(start, end)
-    pair = low * len(mesh.vertices) + high
-    keys = torch.unique(2 * pair + (start > end))[:, None]
-    other = torch.cat([keys[1:], keys[:1]], 0), torch.cat([keys[-1:], keys[:-1]], 0)
-    alone = (torch.cat(other, 1) != (keys ^ 1)).all(1)
-    keys = keys[alone, 0]
-    low, high = (keys // 2) // len(mesh.vertices), (keys // 2) % len(mesh.vertices)
-    edges = torch.stack([low, high], -1)
-    edges = torch.where((keys % 2 == 1)[:, None], edges.flip(1), edges)
+    start, end, count = mesh.faces, mesh.faces.roll(-1, 1), len(mesh.vertices)
+    keys = 2 * (torch.minimum(start, end) * count + torch.maximum(start, end)) + (start > end)
+    keys = keys.flatten().sort().values.unique_consecutive()
+    alone = torch.ones_like(keys, dtype=torch.bool)
+    is_pair = (keys[1:] ^ 1) == keys[:-1]
+    alone[1:] &= ~is_pair
+    alone[:-1] &= ~is_pair
+    keys = keys[alone]
+    low, high, turned = keys // 2 // count, keys // 2 % count, keys % 2 == 1
+    edges = torch.stack([torch.where(turned, high, low), torch.where(turned, low, high)], -1)
     return edges[low != high]
 
 

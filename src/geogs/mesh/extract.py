@@ -20,7 +20,7 @@ from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.volume.block_count import fitting, fitting_voxel
 from geogs.mesh.volume.contraction import UNCONTRACTED, Contraction
 from geogs.mesh.volume.device_marching import device_surface
-from geogs.mesh.volume.free_space import SeenFree
+from geogs.mesh.volume.free_space import FreeSpace
 from geogs.mesh.volume.level_set import extract_surface
 from geogs.mesh.volume.tsdf import BLOCK, BYTES_PER_BLOCK, LIMIT, SparseTsdf, band_blocks, pack
 from geogs.threads import on_one_torch_thread
@@ -165,8 +165,10 @@ def extract_mesh(
             )
         plan = replace(plan, voxel=_COARSER * plan.voxel)
         _log.info("too large: voxel %.4g", plan.voxel)
-    surface = _clean_surface(tsdf, config)
-    del tsdf
+    found, is_free = _level_set(tsdf, config)
+    del tsdf  # what takes most of the memory
+    clean, normals = cleaned(found, config, is_free)
+    surface = _Surface(clean.vertices, clean.faces.to(torch.int32), normals)
     seen = None
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
@@ -211,15 +213,10 @@ class _Surface:
         return _Surface(vertices, faces, TensorMesh(vertices, faces.long()).normals())
 
 
-def _clean_surface(tsdf: SparseTsdf, config: MeshConfig) -> _Surface:
-    """The surface in a volume, cleaned. Raises InputError if there is none."""
-    is_free = SeenFree(tsdf, config.min_weight)
-    if tsdf.device.type == "cpu":
-        mesh = extract_surface(tsdf, config.min_weight)
-    else:
-        mesh = device_surface(tsdf, config.min_weight)
-    found, normals = cleaned(mesh, config, is_free)
-    return _Surface(found.vertices, found.faces.to(torch.int32), normals)
+def _level_set(tsdf: SparseTsdf, config: MeshConfig) -> tuple[TensorMesh, FreeSpace]:
+    """The surface in a volume, and where nothing is."""
+    extract = extract_surface if tsdf.device.type == "cpu" else device_surface
+    return extract(tsdf, config.min_weight), FreeSpace.of(tsdf, config.min_weight)
 
 
 def _merged_mesh(

@@ -1,11 +1,15 @@
 """A mesh on the device where it was made."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+_FACES_AT_ONCE = 2**17
+"""Faces that are looked at in float64 at a time; bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +31,19 @@ class TensorMesh:
 
     def normals(self) -> Float[Tensor, "n 3"]:
         """Unit normals in float32, the mean of a vertex's faces weighted by area."""
-        a, b, c = self.corners()
-        total = vertex_sums(torch.linalg.cross(b - a, c - a), self.faces, len(self.vertices))
+        total = self.vertices.new_zeros(self.vertices.shape, dtype=torch.float64)
+        for faces, u, v, _ in self.edges():
+            normal = torch.linalg.cross(u, v)
+            for corner in faces.unbind(1):
+                total.index_add_(0, corner, normal)
         return torch.nn.functional.normalize(total, dim=-1, eps=1e-300).float()
 
-    def corners(self) -> tuple[Tensor, ...]:
-        """The three corners of each face, float64."""
-        return self.vertices.double()[self.faces].unbind(1)
+    def edges(self) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Some faces at a time, with their edges from the first corner to the second and the third,
+        and from that one to this, float64."""
+        for faces in self.faces.split(_FACES_AT_ONCE):
+            a, b, c = self.vertices[faces].double().unbind(1)
+            yield faces, b - a, c - a, c - b
 
     def kept(self, keep: Bool[Tensor, "m"]) -> "TensorMesh":
         """Some of the faces and the vertices that they use."""

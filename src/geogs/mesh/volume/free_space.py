@@ -14,27 +14,6 @@ FREE = 0.5
 
 
 @dataclass(frozen=True)
-class SeenFree:
-    """Whether points lie where a volume is free, asked of the volume itself."""
-
-    tsdf: SparseTsdf
-    min_weight: float
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Whether the voxel nearest to each point is free; where there is none it is not."""
-        volume = self.tsdf
-        block, inner, is_within = (
-            torch.from_numpy(part).to(volume.device) for part in _nearest(points, volume.voxel)
-        )
-        slot = volume.slots_of(block)
-        known = (slot >= 0) & is_within
-        slot, (x, y, z) = slot[known], inner[known].unbind(-1)
-        is_seen = volume.weight[slot, x, y, z] >= self.min_weight
-        known[known.clone()] = is_seen & (volume.distance[slot, x, y, z] > FREE)
-        return known.cpu().numpy()
-
-
-@dataclass(frozen=True)
 class FreeSpace:
     """A bit for every voxel of a volume, which takes a 64th of the volume's memory."""
 
@@ -48,9 +27,10 @@ class FreeSpace:
     def of(tsdf: SparseTsdf, min_weight: float) -> "FreeSpace":
         """Free voxels of the blocks that belong to the box of a volume."""
         own = tsdf.owns(tsdf.coordinates)
-        is_free = (tsdf.weight[own] >= min_weight) & (tsdf.distance[own] > FREE)
+        is_free = ((tsdf.weight[own] >= min_weight) & (tsdf.distance[own] > FREE)).flatten(1)
+        bit = 2 ** torch.arange(7, -1, -1, dtype=torch.uint8, device=tsdf.device)
+        bits = (is_free.unflatten(1, (-1, 8)) * bit).sum(-1, dtype=torch.uint8).cpu().numpy()
         keys = pack(tsdf.coordinates[own]).cpu().numpy()
-        bits = np.packbits(is_free.flatten(1).cpu().numpy(), axis=1)
         order = np.argsort(keys)
         return FreeSpace(tsdf.voxel, keys[order], bits[order])
 
