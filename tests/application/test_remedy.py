@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from geogs.application import remedy as module
-from geogs.application.remedy import RECORD_AGAIN, remedy
+from geogs.application.remedy import RECORD_AGAIN, WITHOUT_STABILISATION, remedy
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.cli.run import parse
@@ -91,3 +91,9 @@ def test_the_command_keeps_what_was_given(photos):
     assert options.config.mapping == preset("fast").mapping
     assert options.config.input.intrinsics == given.intrinsics
     assert Config().input.stride == 1
+
+
+def test_a_lens_that_changes_is_not_mended_by_a_setting(photos):
+    photos(False)
+    stabilised = replace(LOST, lens_change=0.12)
+    assert remedy(VIDEO, source(False, 0.09), stabilised, 90.0) == WITHOUT_STABILISATION

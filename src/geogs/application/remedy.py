@@ -2,7 +2,7 @@
 
 import shlex
 
-from geogs.application.results.verdict import Verdict
+from geogs.application.results.verdict import MAX_LENS_CHANGE, Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.fallback import impossible, is_wanted
 from geogs.application.structure_from_motion.offline_plan import offline_plan
@@ -15,6 +15,11 @@ from geogs.io.sources.posed.posed_source import PosedSource
 RECORD_AGAIN = (
     "No setting is likely to help. Record it again: slowly, moving sideways instead of turning on "
     "the spot, in good light, and geogs run it."
+)
+
+WITHOUT_STABILISATION = (
+    "No setting is likely to help. Record it again with stabilisation and autofocus off, without "
+    "zooming, and geogs run it."
 )
 
 
@@ -34,6 +39,8 @@ def remedy(
         return ""
     if source.is_live:
         return "Record it: geogs run RECORDING waits for no camera, and tries more."
+    if judged and judged.lens_change > MAX_LENS_CHANGE:
+        return WITHOUT_STABILISATION
     command = f"geogs run {arguments(settings)}"
     again = f", in about {duration(took)}" if took else ""
     if not (is_placed_enough or _was_placed(settings, source)):

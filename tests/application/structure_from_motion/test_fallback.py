@@ -21,7 +21,12 @@ from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion import fallback, offline, offline_plan
 from geogs.application.structure_from_motion.completion import LostFrames
-from geogs.application.structure_from_motion.fallback import impossible, is_better, is_wanted
+from geogs.application.structure_from_motion.fallback import (
+    TrackedOrPlaced,
+    impossible,
+    is_better,
+    is_wanted,
+)
 from geogs.application.structure_from_motion.offline import PlacedOffline
 from geogs.application.structure_from_motion.photos import PlacedVideo
 from geogs.cli.main import main
@@ -40,6 +45,7 @@ from posed_scene import BRIEF
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
 LOST = replace(GOOD, is_reliable=False, lost=0.3)
 FLAT = replace(GOOD, is_reliable=False, depth=0.29)
+STABILISED = replace(GOOD, is_reliable=False, lens_change=0.12)
 TURNED = Verdict(False, "Rotation only.", 0.0, 1.0, np.inf, np.inf, np.inf)
 FRAMES = 16
 
@@ -50,7 +56,9 @@ def test_another_way_is_wanted_where_frames_are_missing_or_nothing_is_to_be_reli
     for judged in (None, LOST, TURNED, replace(GOOD, lost=0.12), replace(GOOD, is_reliable=False)):
         assert is_wanted(judged)
     assert not is_wanted(FLAT)  # all frames have a place, and fewer matches know no depth better
+    assert not is_wanted(STABILISED)  # nor is one lens for all frames right
     assert is_wanted(replace(FLAT, lost=0.06))
+    assert is_wanted(replace(STABILISED, lost=0.06))
 
 
 @pytest.mark.parametrize(
@@ -245,6 +253,19 @@ def test_frames_that_are_found_about_the_keyframes_have_a_place(tmp_path, monkey
     assert 9 in asked[0].numbers
     assert summary["verdict"]["lost"] == 0
     assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == FRAMES
+
+
+@pytest.mark.system
+@pytest.mark.usefixtures("_placed_once")
+def test_one_lens_for_all_is_not_relied_on_where_tracking_saw_it_change(ended, monkeypatch):
+    judged = TrackedOrPlaced._judged
+    monkeypatch.setattr(fallback, "is_better", lambda *_: True)
+    monkeypatch.setattr(
+        TrackedOrPlaced, "_judged", lambda *a: replace(judged(*a), lens_change=0.12)
+    )
+    summary = ended()
+    assert "offline" in summary
+    assert "the lens changes from image to image" in summary["verdict"]["sentence"]
 
 
 @pytest.mark.system

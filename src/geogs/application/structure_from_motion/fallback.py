@@ -13,6 +13,7 @@ from geogs.application.progress.plan import Plan
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
+    MAX_LENS_CHANGE,
     MAX_POSITION_DEVIATION,
     Verdict,
 )
@@ -155,6 +156,7 @@ class TrackedOrPlaced(Work):
         )
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
+        placed.scene.lens_change = 0.0 if tracked is None else tracked.lens_change
         found = placed.judged()
         is_other = tracked is not None and self._rotates_otherwise(placed)
         is_taken = is_better(found, tracked) and not is_other
@@ -195,7 +197,9 @@ def is_wanted(tracked: Verdict | None) -> bool:
     """Whether another way to place the frames is worth its time; none where nothing was tracked."""
     if tracked is None or tracked.is_reliable:
         return _placed_part(tracked) < 1 - MAX_UNKNOWN
-    return _placed_part(tracked) <= 1 - CLEARLY_MORE or _is_shape_known(tracked)
+    # As many frames are not to be relied on either, where one lens for all explains no video.
+    as_many = _is_shape_known(tracked) and tracked.lens_change <= MAX_LENS_CHANGE
+    return as_many or _placed_part(tracked) <= 1 - CLEARLY_MORE
 
 
 def is_better(placed: Verdict, tracked: Verdict | None) -> bool:

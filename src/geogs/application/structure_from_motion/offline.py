@@ -171,6 +171,8 @@ class OfflineScene(Reconstruction):
         """Frames placed against the points of the others."""
         self.instead_of = ""
         """What was said of tracking, where the video was tracked before."""
+        self.lens_change = 0.0
+        """What tracking found of it: structure from motion takes the lens for one in all frames."""
         self.found = FoundFrames.none()
         """Frames that were lost, and found once the others had been placed."""
 
@@ -182,7 +184,9 @@ class OfflineScene(Reconstruction):
         """What the adjustment leaves open."""
         placed = self._placed
         times = placed.timestamps[list(placed.numbers)]
-        known = Uncertainty(times, placed.deviation, placed.rotation, placed.depth)
+        known = Uncertainty(
+            times, placed.deviation, placed.rotation, placed.depth, lens_change=self.lens_change
+        )
         return known.with_found(self.found)
 
     def statistics(self) -> dict[str, object]:
