@@ -283,6 +283,8 @@ class Uncertainty(ShortRepr):
     """Part of the cost of the matches that is left because the lens changes from frame to frame."""
     joined: Annotated[float, Range(0, 1)] = 1.0
     """Fraction of the keyframes in the largest part that one rigid structure holds together."""
+    lens_varies: bool = False
+    """Whether lenses of the frames' own were found, and taken off the matches."""
 
     def at(self, timestamps: Float[np.ndarray, "m"]) -> "Uncertainty":
         """Interpolated in time, constant beyond the ends; infinite where there is nothing."""

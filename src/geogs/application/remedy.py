@@ -2,7 +2,7 @@
 
 import shlex
 
-from geogs.application.results.verdict import MAX_LENS_CHANGE, Verdict
+from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.fallback import impossible, is_wanted
 from geogs.application.structure_from_motion.offline_plan import offline_plan
@@ -39,7 +39,7 @@ def remedy(
         return ""
     if source.is_live:
         return "Record it: geogs run RECORDING waits for no camera, and tries more."
-    if judged and judged.lens_change > MAX_LENS_CHANGE:
+    if judged and judged.lens_varies:
         return WITHOUT_STABILISATION
     command = f"geogs run {arguments(settings)}"
     again = f", in about {duration(took)}" if took else ""

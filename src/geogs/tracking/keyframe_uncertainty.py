@@ -94,8 +94,9 @@ def keyframe_uncertainty(tracker: Tracker, errors: RowErrors | None = None) -> U
     held = largest_part(tracker.keyframes, edges, MIN_SHARED, fixed).intersection(ids)
     joined = max(len(held), 1) / max(len(ids), 1)
     return Uncertainty(
-        times, position, rotation, depth, focal, misfit(residual), change, lenses, joined
-    )
+        times, position, rotation, depth, focal, misfit(residual), change, lenses, joined,
+        bool(tracker.keyframes.table.frame_lenses),
+    )  # fmt: skip
 
 
 def misfit(residuals: Float[np.ndarray, "n"]) -> float:

@@ -72,6 +72,11 @@ def test_what_no_camera_explains_is_not_relied_on():
         ({"focal_change": 0.04}, {"focal_change": 0.14}, "more than 14%, as where somebody zooms"),
         ({"joined": 0.97}, {"joined": 0.6}, "the longest of which has 60% of the keyframes"),
         ({"lens_change": 0.06}, {"lens_change": 0.3}, "the lens changes from image to image"),
+        (
+            {"lens_change": 0.02, "lens_varies": True},
+            {"lens_change": 0.045, "lens_varies": True},
+            "the lens changes from image to image",
+        ),
     ],
 )
 def test_where_tracking_fails_or_somebody_zooms_nothing_is_relied_on(fine, wrong, reason):

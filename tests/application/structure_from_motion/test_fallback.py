@@ -45,7 +45,7 @@ from posed_scene import BRIEF
 GOOD = Verdict(True, "Reliable.", 0.0, 0.0, 0.01, 0.1, 0.02)
 LOST = replace(GOOD, is_reliable=False, lost=0.3)
 FLAT = replace(GOOD, is_reliable=False, depth=0.29)
-STABILISED = replace(GOOD, is_reliable=False, lens_change=0.12)
+STABILISED = replace(GOOD, is_reliable=False, lens_varies=True)
 TURNED = Verdict(False, "Rotation only.", 0.0, 1.0, np.inf, np.inf, np.inf)
 FRAMES = 16
 
@@ -261,7 +261,7 @@ def test_one_lens_for_all_is_not_relied_on_where_tracking_saw_it_change(ended, m
     judged = TrackedOrPlaced._judged
     monkeypatch.setattr(fallback, "is_better", lambda *_: True)
     monkeypatch.setattr(
-        TrackedOrPlaced, "_judged", lambda *a: replace(judged(*a), lens_change=0.12)
+        TrackedOrPlaced, "_judged", lambda *a: replace(judged(*a), lens_varies=True)
     )
     summary = ended()
     assert "offline" in summary

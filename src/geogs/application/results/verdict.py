@@ -27,6 +27,9 @@ MAX_FOCAL_CHANGE = 0.05
 MAX_LENS_CHANGE = 0.1
 """Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
 has one (docs/lens.md)."""
+MAX_LENS_CHANGE_LEFT = 0.03
+"""The same where such lenses were found: up to 0.02 where they are right, 0.046 and 0.06 where the
+map was wrong from its start (docs/lens.md)."""
 MIN_JOINED = 0.95
 """Fraction of the keyframes that one structure holds; of the others a few may be out of place."""
 NO_SHAPE = 0.5
@@ -59,6 +62,8 @@ class Verdict:
     """Part of the matches' cost that is left because the lens changes from frame to frame."""
     joined: float = 1.0
     """Fraction of the keyframes in the largest part that one rigid structure holds together."""
+    lens_varies: bool = False
+    """Whether the lens changes from frame to frame, in a way that was found or not."""
 
     @property
     def has_shape(self) -> bool:
@@ -117,7 +122,10 @@ def verdict(
             "parts of the video want focal lengths that differ by more than "
             f"{known.focal_change:.0%}, as where somebody zooms"
         )
-    if known.lens_change > MAX_LENS_CHANGE:
+    is_changing = known.lens_change > (
+        MAX_LENS_CHANGE_LEFT if known.lens_varies else MAX_LENS_CHANGE
+    )
+    if is_changing:
         reasons.append(
             "the lens changes from image to image (stabilisation, focus, zoom) in a way that the "
             "video does not tell"
@@ -141,7 +149,7 @@ def verdict(
         )
     return Verdict(
         not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal,
-        known.focal_change, known.lens_change, known.joined,
+        known.focal_change, known.lens_change, known.joined, known.lens_varies or is_changing,
     )  # fmt: skip
 
 

@@ -13,7 +13,6 @@ from geogs.application.progress.plan import Plan
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
-    MAX_LENS_CHANGE,
     MAX_POSITION_DEVIATION,
     Verdict,
 )
@@ -156,7 +155,7 @@ class TrackedOrPlaced(Work):
         )
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
-        placed.scene.lens_change = 0.0 if tracked is None else tracked.lens_change
+        placed.scene.lens_varies = tracked is not None and tracked.lens_varies
         found = placed.judged()
         is_other = tracked is not None and self._rotates_otherwise(placed)
         is_taken = is_better(found, tracked) and not is_other
@@ -197,8 +196,8 @@ def is_wanted(tracked: Verdict | None) -> bool:
     """Whether another way to place the frames is worth its time; none where nothing was tracked."""
     if tracked is None or tracked.is_reliable:
         return _placed_part(tracked) < 1 - MAX_UNKNOWN
-    # As many frames are not to be relied on either, where one lens for all explains no video.
-    as_many = _is_shape_known(tracked) and tracked.lens_change <= MAX_LENS_CHANGE
+    # As many frames are not to be relied on either where one lens for all of them is wrong.
+    as_many = _is_shape_known(tracked) and not tracked.lens_varies
     return as_many or _placed_part(tracked) <= 1 - CLEARLY_MORE
 
 

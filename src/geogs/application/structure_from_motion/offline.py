@@ -1,5 +1,6 @@
 """A video without tracking: sharp frames, structure from motion, every frame against the map."""
 
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -171,8 +172,8 @@ class OfflineScene(Reconstruction):
         """Frames placed against the points of the others."""
         self.instead_of = ""
         """What was said of tracking, where the video was tracked before."""
-        self.lens_change = 0.0
-        """What tracking found of it: structure from motion takes the lens for one in all frames."""
+        self.lens_varies = False
+        """Whether tracking saw that: structure from motion has one lens for all frames."""
         self.found = FoundFrames.none()
         """Frames that were lost, and found once the others had been placed."""
 
@@ -184,8 +185,9 @@ class OfflineScene(Reconstruction):
         """What the adjustment leaves open."""
         placed = self._placed
         times = placed.timestamps[list(placed.numbers)]
+        lens_change = math.inf if self.lens_varies else 0.0
         known = Uncertainty(
-            times, placed.deviation, placed.rotation, placed.depth, lens_change=self.lens_change
+            times, placed.deviation, placed.rotation, placed.depth, lens_change=lens_change
         )
         return known.with_found(self.found)
 
