@@ -185,11 +185,8 @@ class _Matches:
         """Evidence on the lens of each keyframe."""
         return varying_evidence(self.grid, self.problem, OPTIONS)
 
-    def lens_change(self) -> float:
-        """Part of their cost that lenses of their own would take off; 0 where nothing tells."""
-        said = self.frame_lenses()
-        if said is None:
-            return 0.0
+    def lens_change(self, said: VaryingEvidence) -> float:
+        """Part of their cost that lenses of their own would take off."""
         step, _ = said.told(self.times, torch.zeros_like(said.gradient), FIRST, self.shared)
         return max(0.0, said.explained(step))
 
@@ -205,11 +202,11 @@ class _Matches:
         prior = lens_prior(self.keyframes.table.focal_deviation)
         return torch.tensor(prior, dtype=torch.float64)
 
-    def considered_lenses(self, own: Mapping[int, FrameLens]) -> Considered | None:
+    def considered_lenses(self, said: VaryingEvidence, own: Mapping[int, FrameLens]) -> Considered:
         """What is left open of these, of which the keyframes have some of their own."""
         each = [own.get(k, FrameLens()) for k in self.frames]
         return considered_lenses(
-            self.grid, self.problem, OPTIONS, CELLS,
+            said, self.grid, self.problem, OPTIONS, CELLS,
             torch.tensor([o.sizes for o in each], dtype=torch.float64),
             self.times, self.shared,
         )  # fmt: skip
@@ -241,6 +238,7 @@ def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marg
     longer = (found.normalised_residual / USUAL_RESIDUAL).clamp(min=1)
     longer = torch.where(longer.isfinite(), longer, 1.0)
     said = matches.lens(rows, of_depths=True) if found.is_bounded else None
+    own_lenses = None if said is None else matches.frame_lenses()
     if said is not None:
         found = found.beside(common_errors(matches.grid, matches.problem, OPTIONS, found, CELLS))
     found = replace(
@@ -253,11 +251,11 @@ def _marginals(tracker: Tracker, ids: list[int], rows: RowErrors | None) -> Marg
         doubt = 0.0 if rows is None else rows.doubt
         corrected = 1.0 if table.lens is None else table.lens.focal
         found = found.beside(said.considered(corrected, doubt, table.focal_deviation))
-        left = matches.considered_lenses(table.frame_lenses) if table.frame_lenses else None
-        found = found if left is None else found.beside(left)
+        if own_lenses is not None and table.frame_lenses:
+            found = found.beside(matches.considered_lenses(own_lenses, table.frame_lenses))
     free = (6 * own[:, None] + torch.arange(6)).reshape(-1)
     covariance = found.covariance[free[:, None], free]
     depth, residual = found.relative_depth[own], found.normalised_residual[own]
     change = 0.0 if said is None else said.focal_change
-    lenses = 0.0 if said is None else matches.lens_change()
+    lenses = 0.0 if own_lenses is None else matches.lens_change(own_lenses)
     return Marginals(covariance, depth, residual, found.focal_variance, change, lenses)

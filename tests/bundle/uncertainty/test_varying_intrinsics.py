@@ -180,14 +180,13 @@ def test_between_keyframes_a_focal_length_is_known_worst_half_way():
 
 def test_what_is_left_open_of_lenses_moves_poses_and_depths_the_more_they_vary():
     grid, problem = walk(torch.zeros(N, SHAPES), noise=0.05)
-    said = [
+    evidence = varying_evidence(grid, problem, EXACT, 64)
+    assert evidence is not None
+    little, much = (
         considered_lenses(
-            grid, problem, EXACT, 64, size * planted(True)[:, list(OWN)], TIMES, SHARED
+            evidence, grid, problem, EXACT, 64, size * planted(True)[:, list(OWN)], TIMES, SHARED
         )
         for size in (0.1, 3.0)
-    ]
-    little, much = said
-    assert little is not None
-    assert much is not None
+    )
     assert float(much.covariance.trace()) > float(little.covariance.trace()) > 0
     assert float(much.relative_depth.mean()) > float(little.relative_depth.mean()) > 0

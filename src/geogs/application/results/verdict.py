@@ -94,7 +94,8 @@ def verdict(
     orientation_only = states.count("orientation only") / max(len(states), 1)
     if why_not:
         sentence = f"Rotation only: no shape. {why_not}"
-        return Verdict(False, sentence, lost, orientation_only, *3 * [float("inf")])
+        nothing = float("inf")
+        return Verdict(False, sentence, lost, orientation_only, nothing, nothing, nothing)
     position = _median(known.position) / max(extent, 1e-12)
     depth, rotation = _median(known.depth), float(np.degrees(_median(known.rotation)))
     reasons = []

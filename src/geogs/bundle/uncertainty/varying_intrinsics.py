@@ -236,6 +236,7 @@ def varying_evidence(
 
 
 def considered_lenses(
+    evidence: VaryingEvidence,
     grid: SampleGrid,
     problem: AnyProblem,
     options: BundleOptions,
@@ -243,19 +244,18 @@ def considered_lenses(
     own: Float[Tensor, "n 3"],
     times: Float[Tensor, "n"],
     shared: Float[Tensor, "5"],
-) -> Considered | None:
+) -> Considered:
     """What is left open of the lens of each frame, once it was found, and what that does to poses
     and depths; of the focal length of all nothing is said.
 
     Args:
-        grid, problem, options, cells: as of :func:`varying_evidence`; None where that has none.
+        evidence: of the same problem.
+        grid, problem, options: as of :func:`varying_evidence`.
+        cells: of a frame at most, whose depths are looked at.
         own: what was found, which tells by how much lenses vary.
         times: of the frames.
         shared: deviations of the lens of all.
     """
-    evidence = varying_evidence(grid, problem, options, cells)
-    if evidence is None:
-        return None
     zero, n = torch.zeros_like(evidence.gradient), len(times)
     prior = FIRST
     for _ in range(EXPECTATIONS):
