@@ -46,8 +46,8 @@ AMBIGUOUS = 0.02
 """Part of the cost that nothing else may take off in the end: 0.037 where the map was wrong from
 its start, which lenses that change hid, up to 0.009 where they were found (docs/lens.md)."""
 AMBIGUOUS_ROWS = 0.06
-"""The same before rows have seen the lens move, which shears and stretches what they show: 0.032
-and 0.042. What is left after that the verdict knows."""
+"""The same beside a rolling shutter, whose rows are sheared and stretched by a lens that moves while
+they are read: 0.022 to 0.042. The verdict asks again once that is taken off."""
 TOLD = 1e-6
 """Deviation of what is shared of a lens that somebody told of."""
 
@@ -128,8 +128,7 @@ def correct_frame_lenses(
         said = said_of_frame_lenses(tracker, tracker.segment.ids)
         if last < SETTLED and not sizes.grow(said):
             break
-    ambiguous = AMBIGUOUS_ROWS if log.rows and before is None else AMBIGUOUS
-    if last > UNSETTLED or sizes.left > ambiguous:
+    if last > UNSETTLED or sizes.left > (AMBIGUOUS_ROWS if log.rows else AMBIGUOUS):
         graph.edges.update(measured)
         for keyframe, T_cw, depth, information in kept:
             keyframe.T_cw, keyframe.inverse_depth = T_cw, depth
