@@ -18,7 +18,7 @@ from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import solved_poses
 from geogs.tracking.tracker import Tracker
-from geogs.types import FlowMatch, FoundLens
+from geogs.types import FlowMatch, FoundLens, SeenRows
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameRecord, Observation
 from geogs.world.grid import SampleGrid
@@ -195,6 +195,20 @@ def test_what_does_not_settle_leaves_everything_as_it_was(monkeypatch):
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
     assert graph.edges.keys() == edges.keys()
     assert all(torch.equal(graph.edges[e].position, edges[e].position) for e in edges)
+
+
+@pytest.mark.parametrize("has_rows", [False, True])
+def test_what_is_ambiguous_is_left_to_the_verdict_where_rows_may_be_why(monkeypatch, has_rows):
+    tracker, _ = tracker_of(sizes_of(0.0, 0.012))
+    ids, graph = list(range(COUNT)), tracker.map.graph
+    graph.measure([(a, b) for a in ids for b in range(a + 1, min(a + 4, COUNT))], packed=True)
+    graph.adjust(list(graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    monkeypatch.setattr(frame_lenses, "AMBIGUOUS", -1.0)
+    if has_rows:
+        rows = SeenRows(torch.zeros(14, 18, 2).half(), torch.zeros(14, 18).half())
+        tracker.map.recorder.log.rows = dict.fromkeys(ids, rows)
+    found = correct_frame_lenses(tracker, ids[1:], ids, GLOBAL_OPTIONS)
+    assert (found is not None) == has_rows
 
 
 def test_where_matches_tell_nothing_of_straight_images_nothing_is_found(monkeypatch):
