@@ -95,5 +95,7 @@ def test_the_command_keeps_what_was_given(photos):
 
 def test_a_lens_that_changes_is_not_mended_by_a_setting(photos):
     photos(False)
-    stabilised = replace(LOST, lens_varies=True)
+    stabilised = replace(LOST, lost=0.0, lens_varies=True)
     assert remedy(VIDEO, source(False, 0.09), stabilised, 90.0) == WITHOUT_STABILISATION
+    lost = replace(LOST, lens_varies=True)
+    assert "--offline" in remedy(VIDEO, source(False, 0.09), lost, 90.0)

@@ -4,7 +4,7 @@ import shlex
 
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
-from geogs.application.structure_from_motion.fallback import impossible, is_wanted
+from geogs.application.structure_from_motion.fallback import impossible, is_wanted, saw_lens_vary
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.config import InputConfig, preset_of
@@ -39,7 +39,7 @@ def remedy(
         return ""
     if source.is_live:
         return "Record it: geogs run RECORDING waits for no camera, and tries more."
-    if judged and judged.lens_varies:
+    if judged and saw_lens_vary(judged):
         return WITHOUT_STABILISATION
     command = f"geogs run {arguments(settings)}"
     again = f", in about {duration(took)}" if took else ""

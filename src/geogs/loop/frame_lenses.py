@@ -46,8 +46,8 @@ AMBIGUOUS = 0.02
 """Part of the cost that nothing else may take off in the end: 0.037 where the map was wrong from
 its start, which lenses that change hid, up to 0.009 where they were found (docs/lens.md)."""
 AMBIGUOUS_ROWS = 0.06
-"""The same beside a rolling shutter, whose rows are sheared and stretched by a lens that moves while
-they are read: 0.022 to 0.042. The verdict asks again once that is taken off."""
+"""The same beside a rolling shutter, as a lens that moves while rows are read shears and stretches
+what they show: 0.022 to 0.042. The verdict asks again once that is taken off."""
 TOLD = 1e-6
 """Deviation of what is shared of a lens that somebody told of."""
 

@@ -261,7 +261,7 @@ def test_one_lens_for_all_is_not_relied_on_where_tracking_saw_it_change(ended, m
     judged = TrackedOrPlaced._judged
     monkeypatch.setattr(fallback, "is_better", lambda *_: True)
     monkeypatch.setattr(
-        TrackedOrPlaced, "_judged", lambda *a: replace(judged(*a), lens_varies=True)
+        TrackedOrPlaced, "_judged", lambda *a: replace(judged(*a), lens_varies=True, lost=0.05)
     )
     summary = ended()
     assert "offline" in summary

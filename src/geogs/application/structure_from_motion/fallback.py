@@ -155,7 +155,7 @@ class TrackedOrPlaced(Work):
         )
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
-        placed.scene.lens_varies = tracked is not None and tracked.lens_varies
+        placed.scene.lens_varies = tracked is not None and saw_lens_vary(tracked)
         found = placed.judged()
         is_other = tracked is not None and self._rotates_otherwise(placed)
         is_taken = is_better(found, tracked) and not is_other
@@ -197,8 +197,14 @@ def is_wanted(tracked: Verdict | None) -> bool:
     if tracked is None or tracked.is_reliable:
         return _placed_part(tracked) < 1 - MAX_UNKNOWN
     # As many frames are not to be relied on either where one lens for all of them is wrong.
-    as_many = _is_shape_known(tracked) and not tracked.lens_varies
+    as_many = _is_shape_known(tracked) and not saw_lens_vary(tracked)
     return as_many or _placed_part(tracked) <= 1 - CLEARLY_MORE
+
+
+def saw_lens_vary(tracked: Verdict) -> bool:
+    """Whether tracking followed nearly all of a video, through a lens that changes; what it says of
+    lenses where much was lost is part of that."""
+    return tracked.lens_varies and _placed_part(tracked) >= 1 - MAX_UNKNOWN
 
 
 def is_better(placed: Verdict, tracked: Verdict | None) -> bool:
