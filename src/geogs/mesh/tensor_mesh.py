@@ -39,8 +39,8 @@ class TensorMesh:
         return torch.nn.functional.normalize(total, dim=-1, eps=1e-300).float()
 
     def edges(self) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Some faces at a time, with their edges from the first corner to the second and the third,
-        and from that one to this, float64."""
+        """Some faces at a time, with their edges from the first corner to the second, to the third,
+        and from the second to the third, float64."""
         for faces in self.faces.split(_FACES_AT_ONCE):
             a, b, c = self.vertices[faces].double().unbind(1)
             yield faces, b - a, c - a, c - b

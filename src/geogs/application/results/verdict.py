@@ -28,7 +28,7 @@ MAX_LENS_CHANGE = 0.1
 """Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
 has one (docs/lens.md)."""
 MAX_LENS_CHANGE_LEFT = 0.03
-"""The same where such lenses were found: up to 0.02 where they are right, 0.046 and 0.06 where the
+"""The same where such lenses were found: up to 0.024 where they are right, from 0.046 on where the
 map was wrong from its start (docs/lens.md)."""
 MIN_JOINED = 0.95
 """Fraction of the keyframes that one structure holds; of the others a few may be out of place."""
