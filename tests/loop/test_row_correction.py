@@ -22,7 +22,7 @@ from geogs.loop.row_correction import (
     let_lenses_move,
 )
 from geogs.tracking.frame_uncertainty import frame_uncertainty
-from geogs.tracking.frames.pose_filling import row_errors
+from geogs.tracking.frames.pose_filling import row_errors, rows_in_doubt
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
@@ -239,6 +239,18 @@ def test_the_gradient_falls_to_zero_at_the_true_readout():
     ]
     assert at[0] < 0 < at[2]
     assert abs(at[1]) < 0.05 * at[2]
+
+
+@pytest.mark.parametrize("doubt", [0.0, 0.1])
+def test_a_readout_is_doubted_however_far_frames_are_apart(doubt):
+    tracker = tracker_of_rows(as_read(1.15, doubt=doubt))
+    log, keyframes = tracker.map.recorder.log, tracker.keyframes
+    for record in log.records:
+        record.timestamp *= 0.2 * (COUNT - 1) / log.records[-1].timestamp
+    near = row_errors(log, keyframes)
+    assert near.doubt == 0  # poses five a second do not say what rows have seen
+    doubted = rows_in_doubt(log, keyframes, near)
+    assert (None if doubted is None else doubted.doubt) == (doubt or None)
 
 
 @pytest.mark.parametrize(

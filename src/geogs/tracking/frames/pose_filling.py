@@ -1,5 +1,6 @@
 """Pose of every frame on the present keyframes, from the sparse flow kept along the way."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.interpolation import bridged
 from geogs.tracking.frames.rotation_averaging import orientations
-from geogs.tracking.frames.row_errors import RowErrors, in_parts
+from geogs.tracking.frames.row_errors import LONGEST_INTERVAL, RowErrors, in_parts
 from geogs.types import Trajectory
 from geogs.world.edges import in_steps, unpacked_positions
 from geogs.world.frames import FrameLog, FrameRecord, Observation
@@ -64,12 +65,16 @@ def solved_poses(frames: FrameLog, keyframes: KeyframeSet) -> dict[int, Float[Te
     return solved
 
 
-def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
-    """Errors of rectified rows at the present state; none where no rows are rectified."""
+def row_errors(
+    frames: FrameLog, keyframes: KeyframeSet, longest_interval: float = LONGEST_INTERVAL
+) -> RowErrors | None:
+    """Errors of rectified rows at the present state; none where no rows are rectified, nor of
+    frames that are farther apart than ``longest_interval`` seconds."""
     if not frames.rows:
         return None
     indices = sorted(record.index for record in frames.records)
-    errors = RowErrors(keyframes.grid, frames.rows, indices, solve_trajectory(frames, keyframes))
+    trajectory = solve_trajectory(frames, keyframes)
+    errors = RowErrors(keyframes.grid, frames.rows, indices, trajectory, longest_interval)
     return errors.with_lenses(frames.lenses)
 
 
@@ -77,12 +82,16 @@ def rows_in_doubt(
     frames: FrameLog, keyframes: KeyframeSet, known: RowErrors | None = None
 ) -> RowErrors | None:
     """The same (``known`` where they were solved already) where the readout has an error, or is not
-    known at all, so that rows were not rectified; none where it was given."""
+    known at all, so that rows were not rectified; none where it was given. However far frames are
+    apart: poses say how much an error of the readout does, if not what rows have seen."""
     if frames.open_rows is None:
-        errors = known or row_errors(frames, keyframes)
+        if not any(rows.doubt for rows in frames.rows.values()):
+            return None
+        is_known = known is not None and known.doubt > 0
+        errors = known if is_known else row_errors(frames, keyframes, math.inf)
     else:
         every = dict.fromkeys((record.index for record in frames.records), frames.open_rows)
-        errors = row_errors(replace(frames, rows=every), keyframes)
+        errors = row_errors(replace(frames, rows=every), keyframes, math.inf)
         errors = None if errors is None else errors.with_readout(0.0)
     return errors if errors is not None and errors.doubt > 0 else None
 

@@ -66,13 +66,15 @@ class RowErrors:
         rows: Mapping[int, SeenRows],
         frames: Sequence[int],
         trajectory: Trajectory,
+        longest_interval: float = LONGEST_INTERVAL,
     ) -> None:
-        """``rows`` by frame; ``frames`` are those of the trajectory, in its order.
+        """``rows`` by frame; ``frames`` are those of the trajectory, in its order, at most
+        ``longest_interval`` seconds apart.
 
         Frames without rows have no errors, nor have those with too few tracked neighbours.
         """
         self._grid = grid
-        nodes = _nodes(trajectory)
+        nodes = _nodes(trajectory, longest_interval)
         T_wc = torch.from_numpy(trajectory.T_wc)
         self._T_cw = dict(zip(frames, se3_inverse(T_wc), strict=True))
         self._rectified: dict[int, _RectifiedFrame] = {}
@@ -367,10 +369,10 @@ def _turn_of(lens: FrameLens) -> Float[Tensor, "4 4"]:
     return se3_exp(torch.tensor([0.0, 0.0, 0.0, -lens.down, lens.right, 0.0]))
 
 
-def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
+def _nodes(trajectory: Trajectory, longest_interval: float) -> list[np.ndarray | None]:
     """The frames around each whose poses are used; none where too few are known in a row."""
     intervals = np.diff(trajectory.timestamps)
-    linked = (intervals <= LONGEST_INTERVAL) & (intervals > 0)
+    linked = (intervals <= longest_interval) & (intervals > 0)
     linked &= trajectory.tracked[1:] & trajectory.tracked[:-1]
     nodes: list[np.ndarray | None] = [None] * len(trajectory.timestamps)
     ends = np.flatnonzero(np.diff(np.concatenate([[False], linked, [False]]).astype(int)))
