@@ -26,8 +26,10 @@ from geogs.world.keyframes import KeyframeSet
 
 NODES = 5
 """Frames whose poses say where a point is at the time of its row."""
-LONGEST_INTERVAL = 0.07
-"""Seconds between two frames; over more, their poses say less of the rows than the video does."""
+LONGEST_INTERVAL = 0.3
+"""Seconds between two frames; over more, their poses say nothing of the rows. At a fifth of a
+second they say little, but with what matches add (``row_twists``) the error is a third to two
+thirds (docs/shutter.md)."""
 TOGETHER = 64, 512
 """Edges, or frames, that are looked at together, on the CPU and on a GPU; bounds memory."""
 MAX_SHIFT = 0.01
