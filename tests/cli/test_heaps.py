@@ -6,7 +6,7 @@ import sys
 import pytest
 
 COUNT = """
-import ctypes, os, sys, threading
+import ctypes, sys, threading
 from geogs_start import _share_heaps
 
 if {shared}:

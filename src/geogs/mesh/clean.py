@@ -69,9 +69,9 @@ def without_degenerate_faces(mesh: TensorMesh) -> TensorMesh:
 
 def _have_areas(mesh: TensorMesh) -> Bool[Tensor, "m"]:
     areas, squares = [], []
-    for _, u, v, w in mesh.edges():
+    for _, u, v in mesh.sides():
         areas.append(torch.linalg.cross(u, v).square().sum(-1))
-        squares.append(u.square().sum() + v.square().sum() + w.square().sum())
+        squares.append(u.square().sum() + v.square().sum() + (v - u).square().sum())
     mean = torch.stack(squares).sum() / (3 * len(mesh.faces))
     i, j, k = mesh.faces.unbind(1)
     return (i != j) & (j != k) & (k != i) & (torch.cat(areas) > 1e-12 * mean**2)

@@ -32,18 +32,16 @@ class TensorMesh:
     def normals(self) -> Float[Tensor, "n 3"]:
         """Unit normals in float32, the mean of a vertex's faces weighted by area."""
         total = self.vertices.new_zeros(self.vertices.shape, dtype=torch.float64)
-        for faces, u, v, _ in self.edges():
-            normal = torch.linalg.cross(u, v)
-            for corner in faces.unbind(1):
-                total.index_add_(0, corner, normal)
+        for faces, u, v in self.sides():
+            add_at_corners(total, torch.linalg.cross(u, v), faces)
         return torch.nn.functional.normalize(total, dim=-1, eps=1e-300).float()
 
-    def edges(self) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Some faces at a time, with their edges from the first corner to the second, to the third,
-        and from the second to the third, float64."""
+    def sides(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Some faces at a time, with their sides from the first corner to the second and to the
+        third, float64."""
         for faces in self.faces.split(_FACES_AT_ONCE):
             a, b, c = self.vertices[faces].double().unbind(1)
-            yield faces, b - a, c - a, c - b
+            yield faces, b - a, c - a
 
     def kept(self, keep: Bool[Tensor, "m"]) -> "TensorMesh":
         """Some of the faces and the vertices that they use."""
@@ -58,6 +56,13 @@ def vertex_sums(
 ) -> Float[Tensor, "n k"]:
     """Sum of what its faces have, of each of ``count`` vertices."""
     total = values.new_zeros(count, values.shape[1])
+    add_at_corners(total, values, faces)
+    return total
+
+
+def add_at_corners(
+    total: Float[Tensor, "n k"], values: Float[Tensor, "m k"], faces: Int[Tensor, "m 3"]
+) -> None:
+    """Add what faces have to their corners' totals."""
     for corner in faces.unbind(1):
         total.index_add_(0, corner, values)
-    return total

@@ -215,10 +215,11 @@ def check_loops(table: LoopTable, keyframes: KeyframeTable, segments: Container[
         ((c[:, 0] < 0) | (c[:, 0] >= words) | (c[:, 1] < 1)).any() for c in counts
     ):
         raise InputError("the index of appearance is incomplete")
-    proposed = [f.candidate for found in table.found for f in found]
-    pairs = [(pair.first, pair.second) for pair in proposed]
-    pairs += [(loop.first, loop.second) for loop in table.loops]
-    named = {*vocabulary.keyframes, *(id for pair in pairs for id in pair)}
+    named = set(vocabulary.keyframes)
+    for found in table.found:
+        named.update(id for f in found for id in (f.candidate.first, f.candidate.second))
+    for loop in table.loops:
+        named.update((loop.first, loop.second))
     if not named <= {*table.keyframes} & table.features.keys():
         raise InputError("a keyframe that loops name was never searched for them")
     if not all(number in segments for number in table.constraints):

@@ -123,9 +123,8 @@ def verdict(
             "parts of the video want focal lengths that differ by more than "
             f"{known.focal_change:.0%}, as where somebody zooms"
         )
-    is_changing = known.lens_change > (
-        MAX_LENS_CHANGE_LEFT if known.lens_varies else MAX_LENS_CHANGE
-    )
+    most = MAX_LENS_CHANGE_LEFT if known.lens_varies else MAX_LENS_CHANGE
+    is_changing = known.lens_change > most
     if is_changing:
         reasons.append(
             "the lens changes from image to image (stabilisation, focus, zoom) in a way that the "

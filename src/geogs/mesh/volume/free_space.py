@@ -27,7 +27,7 @@ class FreeSpace:
     def of(tsdf: SparseTsdf, min_weight: float) -> "FreeSpace":
         """Free voxels of the blocks that belong to the box of a volume."""
         own = tsdf.owns(tsdf.coordinates)
-        is_free = ((tsdf.weight[own] >= min_weight) & (tsdf.distance[own] > FREE)).flatten(1)
+        is_free = ((tsdf.weight >= min_weight) & (tsdf.distance > FREE))[own].flatten(1)
         bit = 2 ** torch.arange(7, -1, -1, dtype=torch.uint8, device=tsdf.device)
         bits = (is_free.unflatten(1, (-1, 8)) * bit).sum(-1, dtype=torch.uint8).cpu().numpy()
         keys = pack(tsdf.coordinates[own]).cpu().numpy()
