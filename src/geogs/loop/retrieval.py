@@ -3,7 +3,6 @@
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float64, Int64
 
@@ -62,7 +61,6 @@ class AppearanceIndex:
     def __init__(self, vocabulary: Vocabulary | None = None, most_words: int = WORDS) -> None:
         """Goes on with what a ``vocabulary`` has."""
         self._most_words = most_words
-        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         self._vocabulary = v = vocabulary or Vocabulary()
         self._postings = [Posting() for _ in v.words]
         """Inverted index: the keyframes of each word."""
@@ -136,16 +134,13 @@ class AppearanceIndex:
     def _nearest(
         self, features: ImageFeatures
     ) -> tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]:
-        """Nearest word of each indexed descriptor and its distance in bits; 256 without a word."""
+        """Nearest word of each indexed descriptor and its distance in bits; 257 without a word."""
+        from geogs.loop.hamming_kernels import two_nearest
+
         if self._recent is not None and self._recent[0] is features:
             return self._recent[1:]
-        descriptors = features.descriptors[:INDEXED]
-        words = np.zeros(len(descriptors), np.int64)
-        distance = np.full(len(descriptors), 256, np.int64)
-        if len(descriptors) and len(self._vocabulary.words):
-            for match in self._matcher.match(descriptors, self._vocabulary.words):
-                words[match.queryIdx] = match.trainIdx
-                distance[match.queryIdx] = int(match.distance)
+        indexed = features.descriptors[:INDEXED].view(np.uint64)
+        words, distance, _ = two_nearest(indexed, self._vocabulary.words.view(np.uint64))
         self._recent = features, words, distance
         return words, distance
 

@@ -73,7 +73,6 @@ class TwoViewVerifier:
         self.camera = camera
         self._K = camera.K
         self._edge = camera.long_edge
-        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
     def verify(self, first: FeatureView, second: FeatureView) -> TwoViewMatch:
         """Pose of the second view from matches with the first.
@@ -113,24 +112,13 @@ class TwoViewVerifier:
 
     def _match(self, first: ImageFeatures, second: ImageFeatures) -> Int64[np.ndarray, "m 2"]:
         """Mutual nearest descriptors that are clearly nearer than the second nearest."""
-        if len(first) < 2 or len(second) < 2:
-            return np.zeros((0, 2), np.int64)
-        there = self._distinct(first.descriptors, second.descriptors)
-        if not there:
-            return np.zeros((0, 2), np.int64)
+        there = _distinct(first.descriptors, second.descriptors)
         # The way back is only asked of those that were hit.
-        hit = sorted({j for _, j in there})
-        back = self._distinct(second.descriptors[hit], first.descriptors)
-        return np.array(sorted(set(there) & {(i, hit[n]) for n, i in back}), np.int64).reshape(
-            -1, 2
-        )
-
-    def _distinct(
-        self, source: UInt8[np.ndarray, "n 32"], target: UInt8[np.ndarray, "m 32"]
-    ) -> list[tuple[int, int]]:
-        nearest = self._matcher.knnMatch(source, target, k=2)
-        distinct = [(m, n) for m, n in nearest if m.distance < MATCH_RATIO * n.distance]
-        return [(m.queryIdx, m.trainIdx) for m, _ in distinct]
+        hit, at = np.unique(there[:, 1], return_inverse=True)
+        back = _distinct(second.descriptors[hit], first.descriptors)
+        origin = np.full(len(hit), -1)
+        origin[back[:, 0]] = back[:, 1]
+        return there[origin[at] == there[:, 0]]
 
     def _points(
         self, pixels: Float32[np.ndarray, "m 2"], depth: Float32[np.ndarray, "m"]
@@ -220,3 +208,14 @@ class TwoViewVerifier:
         if agreeing < MIN_CONSISTENT:
             return None, f"the depths agree at only {agreeing:.0%} of the matches"
         return float(np.exp(middle)), ""
+
+
+def _distinct(
+    source: UInt8[np.ndarray, "n 32"], target: UInt8[np.ndarray, "m 32"]
+) -> Int64[np.ndarray, "d 2"]:
+    """Descriptors with their nearest in the target, where that is clearly nearer than others."""
+    from geogs.loop.hamming_kernels import two_nearest
+
+    index, nearest, second = two_nearest(source.view(np.uint64), target.view(np.uint64))
+    distinct = np.flatnonzero(nearest < MATCH_RATIO * second)
+    return np.stack([distinct, index[distinct]], -1)

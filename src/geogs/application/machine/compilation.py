@@ -20,12 +20,12 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-KERNELS_OF_SEARCH, KERNELS_OF_MAP, KERNELS = 18, 39, 52
+KERNELS_OF_SEARCH, KERNELS_OF_MAP, KERNELS = 19, 40, 53
 """How many kernels that are called from Python a rehearsal compiles: up to what searches depths,
 up to what makes a map, up to a mesh."""
 PARTS = {"map": KERNELS_OF_MAP, "mesh": KERNELS - KERNELS_OF_MAP}
 """What is compiled side by side, and how many kernels that are; what is needed first goes first."""
-ON_GPU = {"planes": 4, "turn": 2, "lens": 3}
+ON_GPU = {"planes": 4, "turn": 3, "lens": 3}
 """The same where a GPU does the rest; what takes longest goes first."""
 POSED_ON_GPU = {"look": 5, "planes": 4}
 """The same where poses are known, too."""

@@ -13,6 +13,8 @@ from geogs.config import MeshConfig, ReconstructConfig
 from geogs.depth.depth_view import KeyframeDepth, ViewPose
 from geogs.depth.revision.segment_planes import on_planes
 from geogs.geometry.camera import Camera
+from geogs.loop.orb_features import orb_features
+from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.mapping.first_look import first_points
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
@@ -57,6 +59,12 @@ def _turn() -> None:
     first, second, *_ = map(meter.small, _pictures())
     angular_velocity(meter.measure(first, second), 1.0, 0.1)
     rotated(np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def _recognise() -> None:
+    """Two pictures held together by their features."""
+    first, second, *_ = map(orb_features, _pictures())
+    TwoViewVerifier(CAMERA).verify(FeatureView(first), FeatureView(second))
 
 
 def _follow() -> None:
@@ -113,9 +121,9 @@ def _mesh() -> None:
 
 
 _STEPS = {
-    "map": (_turn, _follow, _lens, _map),
+    "map": (_turn, _recognise, _follow, _lens, _map),
     "mesh": (_mesh,),
-    "turn": (_turn,),
+    "turn": (_turn, _recognise),
     "lens": (_lens,),
     "look": (_look,),
     "planes": (_bare,),
