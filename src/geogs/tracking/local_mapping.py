@@ -152,9 +152,8 @@ class LocalMapping:
             if n:
                 pairs = [e for e in edges if e[0] < e[1] and not moving.isdisjoint(e)]
                 self.graph.measure(self.graph.stale(pairs, REMEASURE), fine=False)
-            self.graph.adjust(
-                edges, poses, depths, BundleOptions(iterations=ITERATIONS, huber=HUBER)
-            )
+            options = BundleOptions(iterations=ITERATIONS, huber=HUBER)
+            self.graph.adjust(edges, poses, depths, options, bounded=True)
             if n == 0:
                 self.graph.update_dynamic(deep, self.config.moving)
         self.map.priors.adjust(depths)

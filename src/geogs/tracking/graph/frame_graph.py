@@ -21,6 +21,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.dynamic_cells import static_weight, update_dynamic
+from geogs.tracking.graph.influence import bounded_influence
 from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.graph.proximity import PAIRS_TOGETHER
 from geogs.types import FlowMatch
@@ -168,14 +169,25 @@ class FrameGraph:
         return torch.cat([moved(p) for p in parts] if grid.on_gpu else thread_map(moved, parts))
 
     def problem(
-        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
+        self,
+        directed: Sequence[Pair],
+        free_pose: Iterable[int],
+        free_depth: Iterable[int],
+        bounded: bool = False,
     ) -> tuple[BundleProblem, list[int]]:
-        """The adjustment of the given edges, and the keyframe id of each of its frames."""
-        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
+        """The adjustment of the given edges, and the keyframe id of each of its frames.
+
+        Of what is very near the influence may be ``bounded`` (:func:`bounded_influence`).
+        """
+        problem, ids = self.streamed_problem(directed, free_pose, free_depth, bounded)
         return problem.part(slice(None)), ids
 
     def streamed_problem(
-        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
+        self,
+        directed: Sequence[Pair],
+        free_pose: Iterable[int],
+        free_depth: Iterable[int],
+        bounded: bool = False,
     ) -> tuple[StreamedProblem, list[int]]:
         """The same as :meth:`problem`, with the matches left where they are."""
         directed = sorted(directed)
@@ -183,20 +195,26 @@ class FrameGraph:
         ids = sorted({k for e in directed for k in e} | poses | depths)
         slot = {k: n for n, k in enumerate(ids)}
         edges = [self.edges[e] for e in directed]
+        source = torch.tensor([slot[i] for i, _ in directed], dtype=torch.long)
+        inverse_depth = self.keyframes.inverse_depths(ids)
+        influence = bounded_influence(inverse_depth) if bounded else None
 
         def matches(part: slice) -> tuple[Tensor, Tensor]:
             pixels, weight = edge_matches(self.keyframes.grid, edges[part])
-            return pixels, static_weight(self.keyframes, directed[part], pixels, weight)
+            weight = static_weight(self.keyframes, directed[part], pixels, weight)
+            if influence is not None:
+                weight = weight * influence[source[part].to(influence.device)][..., None]
+            return pixels, weight
 
         depth_terms = (
-            _frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
+            _frame_damping(edges, source.tolist(), len(ids)),
             _measured([self.keyframes[k] for k in ids]),
         )
         motions = None if self.odometry is None else self.odometry.between(ids)
         problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
-            inverse_depth=self.keyframes.inverse_depths(ids),
-            source=torch.tensor([slot[i] for i, _ in directed], dtype=torch.long),
+            inverse_depth=inverse_depth,
+            source=source,
             target=torch.tensor([slot[j] for _, j in directed], dtype=torch.long),
             matches=matches,
             free_pose=torch.tensor([k in poses for k in ids]),
@@ -221,11 +239,15 @@ class FrameGraph:
         free_pose: Sequence[int],
         free_depth: Sequence[int],
         options: BundleOptions,
+        bounded: bool = False,
     ) -> BundleResult | None:
-        """Solve for poses and inverse depths and store them; None (nothing stored) on failure."""
+        """Solve for poses and inverse depths and store them; None (nothing stored) on failure.
+
+        ``bounded`` as in :meth:`problem`.
+        """
         if not directed:
             return None
-        result, ids = self._solve(directed, free_pose, free_depth, options)
+        result, ids = self._solve(directed, free_pose, free_depth, options, bounded)
         if not result.finite:
             return None
         depths, poses = set(free_depth), set(free_pose)
@@ -250,12 +272,13 @@ class FrameGraph:
         free_pose: Sequence[int],
         free_depth: Sequence[int],
         options: BundleOptions,
+        bounded: bool,
     ) -> tuple[BundleResult, list[int]]:
         grid = self.keyframes.grid
         if len(directed) <= STACKED_EDGES[grid.on_gpu]:
-            problem, ids = self.problem(directed, free_pose, free_depth)
+            problem, ids = self.problem(directed, free_pose, free_depth, bounded)
             return self.bundle.solve(problem, options), ids
-        streamed, ids = self.streamed_problem(directed, free_pose, free_depth)
+        streamed, ids = self.streamed_problem(directed, free_pose, free_depth, bounded)
         return large_bundle_solver(grid).solve(streamed, options), ids
 
 

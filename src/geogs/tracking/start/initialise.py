@@ -186,7 +186,7 @@ def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
     for n in rounds:
         graph.measure(graph.stale(near, 0.25), fine=n >= FORGIVING)
         options = BundleOptions(iterations=4, huber=(30.0, 10.0, 3.0)[min(n, 2)])
-        if graph.adjust(list(graph.edges), ids[1:], ids, options) is None:
+        if graph.adjust(list(graph.edges), ids[1:], ids, options, bounded=True) is None:
             return False
         normalise(segment)
         if n >= FORGIVING:
