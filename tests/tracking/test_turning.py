@@ -83,9 +83,9 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
             assert len(adjustments) == FORGIVING  # no time is spent on the rest
         return attempts[-1][1]
 
-    def adjusted(graph, *args):
+    def adjusted(graph, *args, **options):
         adjustments.append(graph)
-        return adjust(graph, *args)
+        return adjust(graph, *args, **options)
 
     adjust = FrameGraph.adjust
     monkeypatch.setattr(FrameGraph, "adjust", adjusted)
