@@ -45,3 +45,12 @@ def test_features_match_where_each_is_clearly_nearest_to_the_other():
     verifier = TwoViewVerifier(CAMERA)
     found = verifier.verify(FeatureView(first), FeatureView(second))
     assert found.matches == len(mutual)
+
+
+def test_descriptors_of_a_checkpoint_may_lie_at_any_byte():
+    source, target = descriptors(20, 1), descriptors(30, 2)
+    shifted = np.frombuffer(b"." + target.tobytes(), np.uint8)[1:].reshape(target.shape)
+    expected = two_nearest(source.view(np.uint64), target.view(np.uint64))
+    found = two_nearest(source.view(np.uint64), shifted.view(np.uint64))
+    for there, true in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(there, true)

@@ -1,7 +1,7 @@
 """Compiled search of binary descriptors: nearest ones by the number of bits that differ.
 
-Ten times as fast as OpenCV's, which takes a row of one image at a time; which of two equally near
-ones is found is the same. The kernel releases the interpreter lock.
+Ten times as fast as OpenCV's matcher, and finds the same of equally near ones. The kernel releases
+the interpreter lock.
 """
 
 import numpy as np
@@ -30,9 +30,9 @@ def _ones(word):
 def two_nearest(source, target):
     """The nearest target of each source, its distance and that of the second nearest, in bits.
 
-    ``source`` (n, 4) and ``target`` (m, 4) are descriptors of 256 bits as uint64, m at least 1;
-    the results (n) int64. Of equally near targets the first is nearest; where there is no second,
-    its distance is 257.
+    ``source`` (n, 4) and ``target`` (m, 4) are descriptors of 256 bits as uint64; the results (n)
+    int64. Of equally near targets the first is nearest; the distance to one that there is not is
+    257.
     """
     index = np.zeros(len(source), np.int64)
     nearest = np.full(len(source), 257, np.int64)

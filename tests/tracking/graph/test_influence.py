@@ -58,7 +58,7 @@ def closely_followed() -> FrameGraph:
 
 
 def error_of_last(graph: FrameGraph, bounded: bool) -> float:
-    """Of its centre, in metres, after two rounds as each new keyframe has them."""
+    """Of its centre, in metres, after three rounds like those of each new keyframe."""
     store = graph.keyframes
     truth = se3_inverse(store.poses(store.ids))[:, :3, 3]
     for _ in range(3):

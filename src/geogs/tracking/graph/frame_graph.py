@@ -169,17 +169,10 @@ class FrameGraph:
         return torch.cat([moved(p) for p in parts] if grid.on_gpu else thread_map(moved, parts))
 
     def problem(
-        self,
-        directed: Sequence[Pair],
-        free_pose: Iterable[int],
-        free_depth: Iterable[int],
-        bounded: bool = False,
+        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
     ) -> tuple[BundleProblem, list[int]]:
-        """The adjustment of the given edges, and the keyframe id of each of its frames.
-
-        Of what is very near the influence may be ``bounded`` (:func:`bounded_influence`).
-        """
-        problem, ids = self.streamed_problem(directed, free_pose, free_depth, bounded)
+        """The adjustment of the given edges, and the keyframe id of each of its frames."""
+        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
         return problem.part(slice(None)), ids
 
     def streamed_problem(
@@ -189,7 +182,10 @@ class FrameGraph:
         free_depth: Iterable[int],
         bounded: bool = False,
     ) -> tuple[StreamedProblem, list[int]]:
-        """The same as :meth:`problem`, with the matches left where they are."""
+        """The same as :meth:`problem`, with the matches left where they are.
+
+        What is very near may be ``bounded`` in its influence (:func:`bounded_influence`).
+        """
         directed = sorted(directed)
         poses, depths = set(free_pose), set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
@@ -243,7 +239,7 @@ class FrameGraph:
     ) -> BundleResult | None:
         """Solve for poses and inverse depths and store them; None (nothing stored) on failure.
 
-        ``bounded`` as in :meth:`problem`.
+        ``bounded`` as in :meth:`streamed_problem`.
         """
         if not directed:
             return None
@@ -275,10 +271,9 @@ class FrameGraph:
         bounded: bool,
     ) -> tuple[BundleResult, list[int]]:
         grid = self.keyframes.grid
-        if len(directed) <= STACKED_EDGES[grid.on_gpu]:
-            problem, ids = self.problem(directed, free_pose, free_depth, bounded)
-            return self.bundle.solve(problem, options), ids
         streamed, ids = self.streamed_problem(directed, free_pose, free_depth, bounded)
+        if len(directed) <= STACKED_EDGES[grid.on_gpu]:
+            return self.bundle.solve(streamed.part(slice(None)), options), ids
         return large_bundle_solver(grid).solve(streamed, options), ids
 
 
