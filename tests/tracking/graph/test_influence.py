@@ -73,3 +73,28 @@ def test_what_moves_past_a_camera_that_rests_does_not_move_it():
     bounded = error_of_last(closely_followed(), bounded=True)
     assert bounded < 0.5 * error_of_last(closely_followed(), bounded=False)
     assert bounded < 0.003
+
+
+def test_what_matches_say_of_depths_is_not_bounded():
+    """A floor three times as near as all else, and some of it ten times: its depths are found, and
+    as well known as without a bound."""
+    T = walk(12)[:5]
+    grid = SampleGrid(CAMERA)
+    d = true_inverse_depth(T, grid)
+    d[:, -4 * grid.width :] *= 3.0
+    d[:, -grid.width :] *= 10 / 3
+    T = T @ se3_inverse(T[0])
+    flow = PlantedFlow(grid, T, d, 0.2)
+    tracker = walked_tracker(CAMERA, flow, lambda n: np.full((4, 4, 3), (n, 0, 0), np.uint8))
+    graph, store = tracker.map.graph, tracker.keyframes
+    graph.measure([(i, j) for i in range(5) for j in range(i + 1, 5)])
+    found = []
+    for bounded in (False, True):
+        options = BundleOptions(8, huber=1e6)
+        graph.adjust(list(graph.edges), store.ids[1:], store.ids, options, bounded=bounded)
+        found.append([store.inverse_depths(store.ids), store.informations(store.ids)])
+    (plain, said), (depth, information) = found
+    is_near = (bounded_influence(plain) < 1) & (said > 0)
+    assert 0.05 < float(is_near.float().mean()) < 0.3
+    assert float((depth[is_near] / plain[is_near] - 1).abs().median()) < 0.02
+    assert float((information[is_near] / said[is_near] - 1).abs().median()) < 0.05

@@ -21,7 +21,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.dynamic_cells import static_weight, update_dynamic
-from geogs.tracking.graph.influence import bounded_influence
+from geogs.tracking.graph.influence import solve_bounded
 from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.graph.proximity import PAIRS_TOGETHER
 from geogs.types import FlowMatch
@@ -180,27 +180,18 @@ class FrameGraph:
         directed: Sequence[Pair],
         free_pose: Iterable[int],
         free_depth: Iterable[int],
-        bounded: bool = False,
     ) -> tuple[StreamedProblem, list[int]]:
-        """The same as :meth:`problem`, with the matches left where they are.
-
-        What is very near may be ``bounded`` in its influence (:func:`bounded_influence`).
-        """
+        """The same as :meth:`problem`, with the matches left where they are."""
         directed = sorted(directed)
         poses, depths = set(free_pose), set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
         slot = {k: n for n, k in enumerate(ids)}
         edges = [self.edges[e] for e in directed]
         source = torch.tensor([slot[i] for i, _ in directed], dtype=torch.long)
-        inverse_depth = self.keyframes.inverse_depths(ids)
-        influence = bounded_influence(inverse_depth) if bounded else None
 
         def matches(part: slice) -> tuple[Tensor, Tensor]:
             pixels, weight = edge_matches(self.keyframes.grid, edges[part])
-            weight = static_weight(self.keyframes, directed[part], pixels, weight)
-            if influence is not None:
-                weight = weight * influence[source[part].to(influence.device)][..., None]
-            return pixels, weight
+            return pixels, static_weight(self.keyframes, directed[part], pixels, weight)
 
         depth_terms = (
             _frame_damping(edges, source.tolist(), len(ids)),
@@ -209,7 +200,7 @@ class FrameGraph:
         motions = None if self.odometry is None else self.odometry.between(ids)
         problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
-            inverse_depth=inverse_depth,
+            inverse_depth=self.keyframes.inverse_depths(ids),
             source=source,
             target=torch.tensor([slot[j] for _, j in directed], dtype=torch.long),
             matches=matches,
@@ -239,7 +230,7 @@ class FrameGraph:
     ) -> BundleResult | None:
         """Solve for poses and inverse depths and store them; None (nothing stored) on failure.
 
-        ``bounded`` as in :meth:`streamed_problem`.
+        What is very near may be ``bounded`` in its influence (:func:`solve_bounded`).
         """
         if not directed:
             return None
@@ -271,10 +262,16 @@ class FrameGraph:
         bounded: bool,
     ) -> tuple[BundleResult, list[int]]:
         grid = self.keyframes.grid
-        streamed, ids = self.streamed_problem(directed, free_pose, free_depth, bounded)
-        if len(directed) <= STACKED_EDGES[grid.on_gpu]:
-            return self.bundle.solve(streamed.part(slice(None)), options), ids
-        return large_bundle_solver(grid).solve(streamed, options), ids
+        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
+
+        def solve(problem: StreamedProblem, options: BundleOptions) -> BundleResult:
+            if len(directed) <= STACKED_EDGES[grid.on_gpu]:
+                return self.bundle.solve(problem.part(slice(None)), options)
+            return large_bundle_solver(grid).solve(problem, options)
+
+        if bounded:
+            return solve_bounded(problem, solve, options), ids
+        return solve(problem, options), ids
 
 
 def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:

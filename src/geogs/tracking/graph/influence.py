@@ -6,8 +6,17 @@ near, gains the influence of that, and can turn the motion of the camera until i
 is left by which it could be told. Once it is told, what is near may count in full.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from geogs.bundle.problem import StreamedProblem
+from geogs.bundle.protocols import BundleOptions, BundleResult
+
+Solve = Callable[[StreamedProblem, BundleOptions], BundleResult]
 
 FARTHER, NEAREST = 0.75, 2.5
 """Multiple of the inverse depth that so much of a keyframe does not exceed, from which on cells
@@ -26,3 +35,24 @@ def bounded_influence(inverse_depth: Float[Tensor, "n p"]) -> Float[Tensor, "n p
     rank = 1 + int(FARTHER * (inverse_depth.shape[1] - 1))
     usual = inverse_depth.kthvalue(rank, 1, keepdim=True).values
     return (NEAREST * usual / inverse_depth.clamp(min=1e-9)).clamp(max=1).square().clamp(min=LEAST)
+
+
+def solve_bounded(problem: StreamedProblem, solve: Solve, options: BundleOptions) -> BundleResult:
+    """Solve with the influence of what is near bounded, then for the depths alone without a bound:
+    what a cell may say of poses is one thing, what its matches say of its own depth another."""
+    influence = bounded_influence(problem.inverse_depth)
+    if bool((influence == 1).all()):
+        return solve(problem, options)
+
+    def matches(part: slice) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+        pixels, weight = problem.matches(part)
+        source = problem.source[part].to(influence.device)
+        return pixels, weight * influence[source][..., None]
+
+    found = solve(replace(problem, matches=matches), options)
+    none = torch.zeros_like(problem.free_pose)
+    held = replace(
+        problem, T_cw=found.T_cw, inverse_depth=found.inverse_depth, free_pose=none, pose_terms=()
+    )
+    of_depths = solve(held, replace(options, iterations=1))
+    return replace(of_depths, finite=found.finite and of_depths.finite)
