@@ -192,6 +192,19 @@ def test_fixed_poses_only_move_depths(device):
     assert float((fast.inverse_depth.cpu() - problem.inverse_depth).abs().max()) > 0.01
 
 
+def test_two_kinds_of_adjustment_in_turns_keep_their_structures(device):
+    camera = camera_for(device)
+    bundle = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device))
+    both = on(scene(camera, frames=3), device)
+    depths = replace(both, free_pose=torch.zeros_like(both.free_pose))
+    found = [bundle.structure_of(problem) for problem in (both, depths, both, depths)]
+    assert [structure.poses for structure in found] == [1, 0, 1, 0]
+    assert found[2] is found[0]
+    assert found[3] is found[1]
+    bundle.structure_of(replace(both, free_depth=torch.zeros_like(both.free_depth)))
+    assert bundle.structure_of(both) is not found[0]
+
+
 def test_fixed_depths_only_move_poses(device):
     camera = camera_for(device)
     problem = scene(camera, frames=3)

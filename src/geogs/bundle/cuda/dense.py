@@ -151,7 +151,7 @@ class CudaDenseBundle:
         device = torch.device(grid.device)
         self.kernels = kernels_for(Path(__file__).with_name("linearise.cu"), device)
         self.solvers = kernels_for(Path(__file__).with_name("solve.cu"), device)
-        self._last: tuple[tuple[bytes, ...], _Structure] | None = None
+        self._latest: dict[tuple[bytes, ...], _Structure] = {}
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         """Take the steps; poses are returned where they were given.
@@ -170,12 +170,15 @@ class CudaDenseBundle:
         return BundleResult(T, found.state.inverse_depth, steps.edges.information, finite)
 
     def structure_of(self, problem: BundleProblem) -> _Structure:
-        """The structure of the last problem, if it is the same: edges are adjusted in rounds."""
+        """The structure of a problem, which the last two keep: edges are adjusted in rounds, poses
+        with depths and depths alone in turns."""
         parts = (problem.source, problem.target, problem.free_pose, problem.free_depth)
         key = tuple(x.cpu().numpy().tobytes() for x in parts)
-        if self._last is None or self._last[0] != key:
-            self._last = key, _structure(problem, problem.inverse_depth.device)
-        return self._last[1]
+        found = self._latest.get(key)
+        if found is None:
+            found = _structure(problem, problem.inverse_depth.device)
+            self._latest = dict([*self._latest.items()][-1:]) | {key: found}
+        return found
 
 
 class _DenseSteps:
