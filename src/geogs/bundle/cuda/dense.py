@@ -19,6 +19,7 @@ from geogs.geometry.least_squares import Step, minimise
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device, upload_indices
 from geogs.world.grid import SampleGrid
+from geogs.world.lru import LruCache
 
 MAX_FEW = 16
 """Free poses up to which one block solves the camera system; ``MAX_POSES`` of the source."""
@@ -151,7 +152,7 @@ class CudaDenseBundle:
         device = torch.device(grid.device)
         self.kernels = kernels_for(Path(__file__).with_name("linearise.cu"), device)
         self.solvers = kernels_for(Path(__file__).with_name("solve.cu"), device)
-        self._latest: dict[tuple[bytes, ...], _Structure] = {}
+        self._structures: LruCache[tuple[bytes, ...], _Structure] = LruCache(2)
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         """Take the steps; poses are returned where they were given.
@@ -170,15 +171,11 @@ class CudaDenseBundle:
         return BundleResult(T, found.state.inverse_depth, steps.edges.information, finite)
 
     def structure_of(self, problem: BundleProblem) -> _Structure:
-        """The structure of a problem, which the last two keep: edges are adjusted in rounds, poses
-        with depths and depths alone in turns."""
+        """The structure of a problem. Those of the last two are kept: edges are adjusted in rounds,
+        poses with depths and depths alone in turns."""
         parts = (problem.source, problem.target, problem.free_pose, problem.free_depth)
         key = tuple(x.cpu().numpy().tobytes() for x in parts)
-        found = self._latest.get(key)
-        if found is None:
-            found = _structure(problem, problem.inverse_depth.device)
-            self._latest = dict([*self._latest.items()][-1:]) | {key: found}
-        return found
+        return self._structures.get(key, lambda: _structure(problem, problem.inverse_depth.device))
 
 
 class _DenseSteps:

@@ -176,10 +176,7 @@ class FrameGraph:
         return problem.part(slice(None)), ids
 
     def streamed_problem(
-        self,
-        directed: Sequence[Pair],
-        free_pose: Iterable[int],
-        free_depth: Iterable[int],
+        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
     ) -> tuple[StreamedProblem, list[int]]:
         """The same as :meth:`problem`, with the matches left where they are."""
         directed = sorted(directed)
@@ -187,21 +184,20 @@ class FrameGraph:
         ids = sorted({k for e in directed for k in e} | poses | depths)
         slot = {k: n for n, k in enumerate(ids)}
         edges = [self.edges[e] for e in directed]
-        source = torch.tensor([slot[i] for i, _ in directed], dtype=torch.long)
 
         def matches(part: slice) -> tuple[Tensor, Tensor]:
             pixels, weight = edge_matches(self.keyframes.grid, edges[part])
             return pixels, static_weight(self.keyframes, directed[part], pixels, weight)
 
         depth_terms = (
-            _frame_damping(edges, source.tolist(), len(ids)),
+            _frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
             _measured([self.keyframes[k] for k in ids]),
         )
         motions = None if self.odometry is None else self.odometry.between(ids)
         problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
             inverse_depth=self.keyframes.inverse_depths(ids),
-            source=source,
+            source=torch.tensor([slot[i] for i, _ in directed], dtype=torch.long),
             target=torch.tensor([slot[j] for _, j in directed], dtype=torch.long),
             matches=matches,
             free_pose=torch.tensor([k in poses for k in ids]),
@@ -234,7 +230,11 @@ class FrameGraph:
         """
         if not directed:
             return None
-        result, ids = self._solve(directed, free_pose, free_depth, options, bounded)
+        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
+        if bounded:
+            result = solve_bounded(problem, self._solve, options)
+        else:
+            result = self._solve(problem, options)
         if not result.finite:
             return None
         depths, poses = set(free_depth), set(free_pose)
@@ -253,25 +253,11 @@ class FrameGraph:
                 keyframe.information = information[m].clone()
         return result
 
-    def _solve(
-        self,
-        directed: Sequence[Pair],
-        free_pose: Sequence[int],
-        free_depth: Sequence[int],
-        options: BundleOptions,
-        bounded: bool,
-    ) -> tuple[BundleResult, list[int]]:
+    def _solve(self, problem: StreamedProblem, options: BundleOptions) -> BundleResult:
         grid = self.keyframes.grid
-        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
-
-        def solve(problem: StreamedProblem, options: BundleOptions) -> BundleResult:
-            if len(directed) <= STACKED_EDGES[grid.on_gpu]:
-                return self.bundle.solve(problem.part(slice(None)), options)
-            return large_bundle_solver(grid).solve(problem, options)
-
-        if bounded:
-            return solve_bounded(problem, solve, options), ids
-        return solve(problem, options), ids
+        if len(problem.source) <= STACKED_EDGES[grid.on_gpu]:
+            return self.bundle.solve(problem.part(slice(None)), options)
+        return large_bundle_solver(grid).solve(problem, options)
 
 
 def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
