@@ -127,3 +127,18 @@ def test_random_disks_follow_their_seed():
     assert torch.equal(first.quaternion, same.quaternion)
     assert not torch.allclose(first.quaternion, other.quaternion)
     assert len(turned(points[:0]).position) == 0
+
+
+def test_normals_that_were_seen_stand_however_slanted_and_zero_asks_the_points():
+    points = plane(24, 0.04)
+    footprint = torch.full((len(points),), 0.04)
+    seen = torch.zeros_like(points)
+    edge_on = torch.linalg.cross(points[0], torch.tensor([0.0, 1.0, 0.0]))
+    seen[0] = torch.nn.functional.normalize(edge_on, dim=0)  # 90 degrees from the ray
+    alone = initialise_disks(points, torch.zeros(3), footprint, points[:0], CONFIG)
+    given = initialise_disks(points, torch.zeros(3), footprint, points[:0], CONFIG, seen)
+    R = quaternion_to_matrix(given.quaternion)
+    assert torch.allclose(R[0, :, 2], seen[0], atol=1e-5)
+    assert (torch.linalg.det(R) - 1).abs().max() < 1e-5
+    assert torch.equal(given.quaternion[1:], alone.quaternion[1:])
+    assert torch.equal(given.log_scale, alone.log_scale)

@@ -38,6 +38,9 @@ class DiskConfig(Settings, group="mapping.disk"):
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
     fill_confidence: Fraction = 0.1
     """Least confidence of a depth that makes a disk where nothing better has come since."""
+    fit_normals: bool = True
+    """Lay a new disk into the plane of the depths around its pixel, as far as to the next disk,
+    where there is one; off takes that of the points nearest to it, as the paper does."""
     scale_factor: Positive = 0.6
     """Initial standard deviation in distances to the nearest points."""
     bound_spacing: bool = True

@@ -55,6 +55,7 @@ def paper_disks() -> DiskConfig:
         edge_stride=8,
         insert_confidence=0.5,
         fill_confidence=0.5,
+        fit_normals=False,
         scale_factor=1.0,
         bound_spacing=False,
         planarity_threshold=0.3,

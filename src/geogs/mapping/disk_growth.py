@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from geogs.config import MappingConfig
+from geogs.geometry.fitted_normals import fitted_normals
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import confident_jumps
@@ -54,17 +55,22 @@ class DiskGrowth:
         )  # fmt: skip
         z = depth[v, u]
         T_wc = view.T_wc.float().to(depth.device)
+        normals = None
+        if config.fit_normals:
+            fitted = fitted_normals(depth, confidence, camera, (v, u), config.stride)
+            normals = fitted @ T_wc[:3, :3].T
         rays = camera.rays(device=depth.device)[v, u]
         points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
         if config.carve:
             others = [other for other in self.voters(view) if other.id != view.id]
             kept = self.depths.keep(points, others)
             points, z, spacing = points[kept], z[kept], spacing[kept]
+            normals = None if normals is None else normals[kept]
         if len(points) + len(disks) < NEIGHBOURS or len(points) == 0:
             return
         footprint = spacing * z / camera.fx
         existing = disks.position.detach()
-        new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config)
+        new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config, normals)
         if self.config.ablation.initialisation == "random":
             new = randomly_oriented(new, self.table.random.of_torch)
         disks.append(new, view.id)

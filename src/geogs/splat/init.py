@@ -104,9 +104,12 @@ def initialise_disks(
     footprint: Float[Tensor, "n"],
     existing: Float[Tensor, "m 3"],
     config: DiskConfig,
+    seen: Float[Tensor, "n 3"] | None = None,
 ) -> DiskParameters:
     """Disks at ``points`` (world frame), lying in the planes of their neighbourhoods.
 
+    Where ``seen``, unit normals (world frame) that face the camera, is given and not zero, it
+    stands for the neighbourhood's, however slanted.
     ``footprint`` is the distance between neighbouring samples at each point's depth; the spacing
     is kept within [0.3, 1.5] of it so that a stray point makes neither a speck nor a blanket.
     Without ``bound_spacing`` it is what it is, as in the paper. Where planarity is under the
@@ -119,6 +122,8 @@ def initialise_disks(
     to_camera = camera_centre - points
     to_camera = to_camera / to_camera.norm(dim=-1, keepdim=True)
     normal = face_camera(plane.normal, to_camera)
+    if seen is not None:
+        normal = torch.where((seen != 0).any(-1, keepdim=True), seen, normal)
     tangent = plane.tangent - (plane.tangent * normal).sum(-1, keepdim=True) * normal
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     rotation = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)

@@ -29,6 +29,21 @@ def slanted(degrees: float) -> torch.Tensor:
     return torch.tensor([0.6 * math.sin(a), 0.8 * math.sin(a), math.cos(a)]).double()
 
 
+@pytest.mark.parametrize("degrees", [45, 80, 86, 89])
+def test_what_is_seen_edge_on_counts_less(degrees):
+    normal = slanted(degrees)
+    depth = plane_depth(normal, 6.0)
+    planes = PixelPlanes.of(depth, depth > 0, CAMERA)
+    weight = planes.table(torch.full_like(depth, 0.5))[:, 3].view_as(depth)
+    along_axis = (CAMERA.rays(torch.float64) @ normal).float()
+    reference = 0.5 * (along_axis / 0.1).square().clamp(0.1, 1)
+    shrunk = torch.nn.functional.max_pool2d(-(depth > 0)[None].float(), 7, 1, 3)[0] < -0.5
+    shrunk[:3], shrunk[-3:], shrunk[:, :3], shrunk[:, -3:] = False, False, False, False
+    assert shrunk.sum() > 500
+    assert weight[shrunk] == pytest.approx(reference[shrunk], rel=0.02)
+    assert (weight[depth <= 0] == 0).all()
+
+
 @pytest.mark.parametrize("degrees", [0, 45, 75, 84])
 def test_truncation_is_half_along_the_normal_at_least(degrees):
     normal = slanted(degrees)

@@ -21,6 +21,11 @@ _LEAST_INCIDENCE = 0.01
 """Nothing is taken for more slanted than that (89.4 degrees): it is a step that looks like one."""
 _MOST_SAMPLES = 64
 """Along the footprint of a pixel."""
+_GRAZING = 0.1
+"""Incidence (84 degrees) below which a depth counts less, by its square: of a road far ahead the
+upper ends of disks are seen, and all views before see it so."""
+_LEAST_WEIGHT = 0.1
+"""Part of its weight that it keeps."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +61,12 @@ class PixelPlanes:
         return PixelPlanes(inverse, right, down, slant, valid, camera)
 
     def table(self, weight: Float[Tensor, "h w"]) -> Float[Tensor, "p 4"]:
-        """Inverse depth, its slopes along u and v and the weight, by rows."""
-        weight = torch.where(self.valid, weight, 0.0)
+        """Inverse depth, its slopes along u and v and the weight, by rows.
+
+        The weight is less where the surface is seen edge-on.
+        """
+        facing = (self._incidence() / _GRAZING).square().clamp(_LEAST_WEIGHT, 1)
+        weight = torch.where(self.valid, weight * facing, 0.0)
         return torch.stack([self.inverse, self.right, self.down, weight], -1).flatten(0, 1)
 
     def grown(self, T_cw: Float[Tensor, "4 4"], contraction: Contraction) -> "PixelPlanes":
