@@ -118,3 +118,18 @@ def test_one_round_is_weighted_least_squares():
         plane = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
     expected = torch.from_numpy(-plane / np.linalg.norm(plane)).float()
     assert degrees(found[None], expected).max() < 0.2
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_says_the_same():
+    depth = plane_depth(ROAD, 1.5)
+    noise = torch.randn(depth.shape, generator=torch.Generator().manual_seed(2))
+    depth = depth * (1 + 0.003 * noise)
+    v, u = grid(depth)
+    weight = torch.rand(depth.shape, generator=torch.Generator().manual_seed(3))
+    expected = fitted_normals(depth, weight, CAMERA, (v, u), 4)
+    found = fitted_normals(depth.cuda(), weight.cuda(), CAMERA, (v.cuda(), u.cuda()), 4).cpu()
+    assert ((found != 0).any(1) == (expected != 0).any(1)).float().mean() > 0.99
+    both = (found != 0).any(1) & (expected != 0).any(1)
+    assert (found[both] - expected[both]).abs().quantile(0.99) < 1e-3

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs_synth.camera.flaws import Flaws
+from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
 from geogs_synth.camera.image_sensor import Sensor
 from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.room_motions import room_motion
@@ -150,6 +150,15 @@ def test_lens_is_opencv_s() -> None:
     np.testing.assert_array_equal(np.stack(LENS.rays, -1), CAMERA.rays(torch.float64)[..., :2])
     with pytest.raises(InputError, match="fold"):
         RadialCamera(CAMERA, -0.5, 0.0)
+
+
+@pytest.mark.parametrize("kind", ["phone", "kinect", "action"])
+def test_a_camera_held_upright_has_the_same_lens(kind: CameraKind) -> None:
+    flaws = camera_flaws(kind)
+    upright, across = centred_camera(72, 96), centred_camera(96, 72)
+    assert upright.fx == upright.fy == across.fx
+    turned, lens = (RadialCamera(c, flaws.k1, flaws.k2) for c in (upright, across))
+    np.testing.assert_allclose(np.stack(turned.rays), np.stack(lens.rays)[::-1].transpose(0, 2, 1))
 
 
 def test_distorted_views_miss_no_solid(raycaster: Raycaster) -> None:

@@ -17,7 +17,7 @@ from geogs_synth.scene.bodies import Body
 from geogs_synth.scene.textured_scene import Scene
 
 ROOM_FOCAL = 0.7
-"""Focal length over width of the camera in rooms: 71 degrees across."""
+"""Focal length over the longer side of the image in rooms: 71 degrees across."""
 STREET_FOCAL = 0.58
 """82 degrees across."""
 
@@ -37,7 +37,7 @@ class Location:
     height: int
     """Pixels of the images, where the user does not say."""
     focal: float
-    """Focal length over the width of the image."""
+    """Focal length over the longer side of the image: a phone held upright has the same lens."""
     depth_scale: float
     """Units of the depth images per metre."""
     voxel_cm: int
@@ -90,12 +90,12 @@ def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
 
 
 def centred_camera(width: int, height: int, focal: float = ROOM_FOCAL) -> Camera:
-    """A camera with its principal point in the middle; ``focal`` is its length over the width.
+    """A camera with its principal point in the middle; ``focal`` is its length over the longer side.
 
     Raises:
         InputError: the image would be too small or too large.
     """
     if not (16 <= width <= _MAX_SIZE and 16 <= height <= _MAX_SIZE):
         raise InputError(f"images must be 16 to {_MAX_SIZE} pixels a side, not {width}x{height}")
-    f = focal * width
+    f = focal * max(width, height)
     return Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
