@@ -90,7 +90,8 @@ def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
 
 
 def centred_camera(width: int, height: int, focal: float = ROOM_FOCAL) -> Camera:
-    """A camera with its principal point in the middle; ``focal`` is its length over the longer side.
+    """A camera with its principal point in the middle; ``focal`` is its length over the longer
+    side of the image.
 
     Raises:
         InputError: the image would be too small or too large.
