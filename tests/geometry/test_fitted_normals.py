@@ -98,8 +98,8 @@ def test_nothing_is_said_of_a_lonely_pixel():
     assert (fitted_normals(depth, torch.ones_like(depth), CAMERA, (v, u), 4) == 0).all()
 
 
-def test_one_round_is_weighted_least_squares():
-    """Against NumPy's solution of one window, with the weights of its last round."""
+def test_a_window_is_a_robust_fit_of_least_squares():
+    """Against NumPy's, of one window, gone on with until nothing changes."""
     depth = plane_depth(unit(0.2, -0.5, -1.0), 2.0)
     noise = torch.randn(depth.shape, generator=torch.Generator().manual_seed(1))
     depth = depth * (1 + 0.002 * noise)

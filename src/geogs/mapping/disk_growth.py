@@ -55,22 +55,21 @@ class DiskGrowth:
         )  # fmt: skip
         z = depth[v, u]
         T_wc = view.T_wc.float().to(depth.device)
-        normals = None
-        if config.fit_normals:
-            fitted = fitted_normals(depth, confidence, camera, (v, u), config.stride)
-            normals = fitted @ T_wc[:3, :3].T
         rays = camera.rays(device=depth.device)[v, u]
         points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
         if config.carve:
             others = [other for other in self.voters(view) if other.id != view.id]
             kept = self.depths.keep(points, others)
-            points, z, spacing = points[kept], z[kept], spacing[kept]
-            normals = None if normals is None else normals[kept]
+            v, u, points, z, spacing = (x[kept] for x in (v, u, points, z, spacing))
         if len(points) + len(disks) < NEIGHBOURS or len(points) == 0:
             return
         footprint = spacing * z / camera.fx
         existing = disks.position.detach()
-        new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config, normals)
+        seen = None
+        if config.fit_normals:
+            normals = fitted_normals(depth, confidence, camera, (v, u), config.stride)
+            seen = normals @ T_wc[:3, :3].T
+        new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config, seen)
         if self.config.ablation.initialisation == "random":
             new = randomly_oriented(new, self.table.random.of_torch)
         disks.append(new, view.id)

@@ -5,6 +5,7 @@ many times that from the surface. Both follow from how inverse depth goes on aro
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -65,7 +66,7 @@ class PixelPlanes:
 
         The weight is less where the surface is seen edge-on.
         """
-        facing = (self._incidence() / _GRAZING).square().clamp(_LEAST_WEIGHT, 1)
+        facing = (self._incidence / _GRAZING).square().clamp(_LEAST_WEIGHT, 1)
         weight = torch.where(self.valid, weight * facing, 0.0)
         return torch.stack([self.inverse, self.right, self.down, weight], -1).flatten(0, 1)
 
@@ -83,7 +84,7 @@ class PixelPlanes:
         ``shortest``, but wider where that would leave less than :data:`LEAST_BAND` of it along the
         normal.
         """
-        return (shortest * self.growth * (LEAST_BAND / self._incidence()).clamp(min=1)).flatten()
+        return (shortest * self.growth * (LEAST_BAND / self._incidence).clamp(min=1)).flatten()
 
     def footprints(self, spacing: float) -> Float[Tensor, "n 3"]:
         """Points of the camera's frame along the footprints of the pixels with a depth, ``spacing``
@@ -107,6 +108,7 @@ class PixelPlanes:
         x, y = (u[pixel] + du - camera.cx) / camera.fx, (v[pixel] + dv - camera.cy) / camera.fy
         return torch.stack([x * z, y * z, z], -1)
 
+    @cached_property
     def _incidence(self) -> Float[Tensor, "h w"]:
         """Distance from the plane over that along the axis: where 1 / z = a x + b y + c on the
         plane, (1 / z) / |(a, b, c)| on the ray (x, y, 1)."""
