@@ -68,6 +68,7 @@ LOSS = MappingConfig().loss
 
 def test_training_an_excerpt_is_training_the_map(monkeypatch):
     # Not by noise: where all is nearly quadratic, rounding is a larger part of what moves disks.
+    # Nor far: later steps repeat the rounding of earlier ones, times what these moved.
     loss = replace(LOSS, l1_huber=0.35, photo_texture=0.0)
     config = replace(MappingConfig(), disk=DiskConfig(max_scale=1.0), loss=loss)
     trained = []
@@ -77,7 +78,7 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
         trainer = CpuTrainer(disks, CAMERAS, config, 2.0)
         disks.append(some_disks(2000), 5)
         a, b = views()
-        trainer.train([[(a, [b])], [(b, [a])], [(a, []), (b, [a])]], [1.0, 0.5, 0.7])
+        trainer.train([[(a, [b])], [(b, [a])], [(a, []), (b, [a])]], [0.25, 0.12, 0.18])
         assert trainer.disks is trainer.optimizer.disks is disks
         trained.append(trainer)
         assert 0 < len(trainer._in_view([[(a, [])]])) < 0.7 * len(disks)

@@ -143,8 +143,9 @@ class MappingConfig(Settings, group="mapping"):
     pose_lr: Annotated[Weight, Only("run")] = 4e-4
     """Adam step of the pose tangents: radians, and u for translations."""
     max_spread: Weight = 0.01
-    """Surfaces take the mean depth of a ray where the median differs by less, else the median, and
-    then its average over the planes of the pixels around that differ no more; 0: the median."""
+    """Surfaces take the mean depth of a ray where the median differs by less (at a slant: along the
+    normal), else the median, and then its average over the planes of the pixels around that differ
+    no more; 0: the median."""
     disk: DiskConfig = field(default_factory=DiskConfig)
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)

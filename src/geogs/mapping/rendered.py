@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from geogs.config import MappingConfig
 from geogs.depth.depth_view import DenseDepth
@@ -23,6 +24,12 @@ from geogs.world.disks import DiskParameters
 
 _RADIUS = 3
 """Radius in pixels of the tangent planes that a depth is averaged over."""
+_SLANTED = 0.5
+"""Cosine of the angle between normal and ray (60 degrees) below which spread counts along the
+normal, where nothing around a pixel has a larger one: disks of a road that differ by a centimetre
+in height differ by a metre far ahead. At a silhouette what is seen at a slant is narrow."""
+_AROUND = 5
+"""Pixels across in which there is nothing."""
 
 
 class SurfaceMaps(NamedTuple):
@@ -110,19 +117,29 @@ def rendered_surface(
     """Disks seen from a pose inside a mask, with the weight of each depth for fusion."""
     output = render(disks, camera, T_cw)
     depth = output.shown_depth(rules.min_alpha)
+    length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    normal = torch.where(depth[..., None] > 0, output.normal / length, 0.0)
     # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
     # while the median is on one.
-    single = (output.median_depth - depth).abs() < rules.max_spread * depth
+    spread, facing = (output.median_depth - depth).abs(), _most_facing(normal, camera)
+    single = spread < rules.max_spread * depth
+    single |= (facing < _SLANTED) & (spread * facing < 2 * rules.max_spread * depth)
     depth = torch.where(single | (depth <= 0), depth, output.median_depth)
     weight = torch.where(single, 1.0, 0.5) * (depth > 0)
     if mask is not None:
         depth = torch.where(mask, depth, 0.0)
         weight = torch.where(mask, weight, 0.0)
-    length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    normal = torch.where(depth[..., None] > 0, output.normal / length, 0.0)
+        normal = torch.where(mask[..., None], normal, 0.0)
     if rules.max_spread > 0:
         depth = averaged_over_planes(depth, normal, camera, _RADIUS, 2 * rules.max_spread)
     return SurfaceMaps(depth, normal, weight)
+
+
+def _most_facing(normal: Float[Tensor, "h w 3"], camera: Camera) -> Float[Tensor, "h w"]:
+    """The largest cosine of the angle between normal and ray around each pixel."""
+    rays = camera.rays(normal.dtype, normal.device)
+    facing = (normal * rays).sum(-1).abs() / rays.norm(dim=-1)
+    return max_pool2d(facing[None, None], _AROUND, 1, _AROUND // 2)[0, 0]
 
 
 def shown_depth(maps: SurfaceMaps) -> DenseDepth:

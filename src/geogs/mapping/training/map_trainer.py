@@ -11,7 +11,7 @@ from geogs.splat.optimizer import LearningRates
 Batch = list[tuple[MapView, list[MapView]]]
 """The views of one step, each with the partners that check it by their images."""
 
-LR_QUATERNION, LR_SCALE, LR_OPACITY = 4e-3, 0.02, 0.05
+LR_QUATERNION, LR_SCALE, LR_OPACITY = 4e-3, 0.08, 0.1
 """Adam steps of quaternions, log scales and opacity logits, which have no unit of length."""
 HISTORY = 2
 """Older keyframes drawn at random into each window, as in the paper, so that none is forgotten."""
