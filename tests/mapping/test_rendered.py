@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.rendered import SurfaceMaps, SurfaceRules, rendered_surface
 from geogs.world.disks import DiskParameters
@@ -38,10 +39,10 @@ def uneven_road() -> DiskParameters:
     return disks(position, lean, 0.03 * position[:, 2], 0.7)
 
 
-def show(map_of: DiskParameters) -> SurfaceMaps:
+def show(map_of: DiskParameters, mask: Tensor | None = None) -> SurfaceMaps:
     """What the camera sees at the origin."""
     with torch.no_grad():
-        return rendered_surface(map_of, CAMERA, torch.eye(4, dtype=torch.float64), RULES, None)
+        return rendered_surface(map_of, CAMERA, torch.eye(4, dtype=torch.float64), RULES, mask)
 
 
 def test_an_uneven_road_is_one_surface_far_ahead():
@@ -56,14 +57,32 @@ def test_an_uneven_road_is_one_surface_far_ahead():
     assert float((off.abs() < 0.02).float().mean()) > 0.97
 
 
-def test_no_depth_lies_between_two_walls():
+def two_walls() -> DiskParameters:
+    """One to the left 2 ahead, and one that fills the image 4 ahead."""
     y, x = torch.meshgrid(torch.arange(-2, 2, 0.03), torch.arange(-4, 4, 0.03), indexing="ij")
     x, y = x.flatten(), y.flatten()
     near = torch.stack([x, y, torch.full_like(x, 2.0)], 1)[x < 0]
     far = torch.stack([2 * x, 2 * y, torch.full_like(x, 4.0)], 1)
     position = torch.cat([near, far])
-    maps = show(disks(position, torch.zeros(len(position)), 0.015 * position[:, 2], 0.9))
+    return disks(position, torch.zeros(len(position)), 0.015 * position[:, 2], 0.9)
+
+
+def test_no_depth_lies_between_two_walls():
+    maps = show(two_walls())
     between = (maps.depth > 2.06) & (maps.depth < 3.88)
     assert float(between.float().mean()) < 0.0005
     assert float((maps.depth < 2.06).float().mean()) > 0.4
     assert float((maps.depth > 3.88).float().mean()) > 0.4
+
+
+def test_one_view_makes_a_surface_but_for_its_ends():
+    x = torch.arange(CAMERA.width).expand(CAMERA.height, -1)
+    maps, least = show(two_walls(), x < 250), MeshConfig().min_weight
+    step = int(((maps.depth > 0) & (maps.depth < 3))[CAMERA.height // 2].sum())
+    assert 155 < step < 165
+    ends = ((x - step + 0.5).abs() < 2) | ((x < 250) & (x >= 248))
+    assert float((maps.weight[ends] >= least).float().mean()) < 0.01
+    assert float((4 * maps.weight[ends] >= least).float().mean()) > 0.99
+    inside = ((x - step + 0.5).abs() > 4) & (x < 247)
+    assert float((maps.weight[inside] >= least).float().mean()) > 0.99
+    assert float(maps.weight[x >= 250].abs().max()) == 0

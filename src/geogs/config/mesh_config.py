@@ -15,9 +15,9 @@ class MeshConfig(Settings, group="mesh"):
     limit if none is given."""
     truncation: Annotated[float, Range(2, 16)] = 4.0
     """Voxels in front of and behind a surface in which distances are averaged."""
-    min_weight: Positive = 1.5
-    """Sum of view weights that a voxel needs to count as seen; just behind a surface a view counts
-    less than in front, so 1.5 asks for two confident views."""
+    min_weight: Positive = 1.0
+    """Sum of view weights that a voxel needs to count as seen: that of one view which meets one
+    surface there, or of several near the end of a surface; just behind it a view counts less."""
     triangle_budget: Annotated[int, Range(100, 1_000_000_000), Basic()] = 1_500_000
     """Triangles that a chosen voxel size aims at, to about 20 %, before those that the surface does
     not need are merged."""

@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from geogs.config import MappingConfig
 from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth_maps import averaged_over_planes, normals_from_depth
 from geogs.geometry.given_pose import GivenPose, as_pose
+from geogs.geometry.jumps import depth_jumps, widened
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.map_frame import MapFrame
@@ -28,8 +28,11 @@ _SLANTED = 0.5
 """Cosine of the angle between normal and ray (60 degrees) below which spread counts along the
 normal, where nothing around a pixel has a larger one: disks of a road that differ by a centimetre
 in height are hit 20 cm apart 25 m ahead. At a silhouette what is seen at a slant is narrow."""
-_AROUND = 5
-"""Pixels across in which there is nothing."""
+_AT_ENDS = 0.6
+"""What a depth counts near the end of a surface, where disks reach over it: too little for one
+view to make a surface alone, as it does elsewhere."""
+_AROUND = 2
+"""Rows and columns that are near."""
 
 
 class SurfaceMaps(NamedTuple):
@@ -117,29 +120,28 @@ def rendered_surface(
     """Disks seen from a pose inside a mask, with the weight of each depth for fusion."""
     output = render(disks, camera, T_cw)
     depth = output.shown_depth(rules.min_alpha)
+    if mask is not None:
+        depth = torch.where(mask, depth, 0.0)
     length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     normal = torch.where(depth[..., None] > 0, output.normal / length, 0.0)
     # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
     # while the median is on one.
-    spread, facing = (output.median_depth - depth).abs(), _most_facing(normal, camera)
+    spread, facing = (output.median_depth - depth).abs(), _facing(normal, camera)
     single = spread < rules.max_spread * depth
-    single |= (facing < _SLANTED) & (spread * facing < 2 * rules.max_spread * depth)
+    slanted = ~widened(facing > _SLANTED, _AROUND)
+    single |= slanted & (spread * facing < 2 * rules.max_spread * depth)
     depth = torch.where(single | (depth <= 0), depth, output.median_depth)
-    weight = torch.where(single, 1.0, 0.5) * (depth > 0)
-    if mask is not None:
-        depth = torch.where(mask, depth, 0.0)
-        weight = torch.where(mask, weight, 0.0)
-        normal = torch.where(mask[..., None], normal, 0.0)
+    ends = depth_jumps(depth).around(_AROUND) | widened(depth <= 0, _AROUND)
+    weight = torch.where(single, 1.0, 0.5) * torch.where(ends, _AT_ENDS, 1.0) * (depth > 0)
     if rules.max_spread > 0:
         depth = averaged_over_planes(depth, normal, camera, _RADIUS, 2 * rules.max_spread)
     return SurfaceMaps(depth, normal, weight)
 
 
-def _most_facing(normal: Float[Tensor, "h w 3"], camera: Camera) -> Float[Tensor, "h w"]:
-    """The largest cosine of the angle between normal and ray around each pixel."""
+def _facing(normal: Float[Tensor, "h w 3"], camera: Camera) -> Float[Tensor, "h w"]:
+    """The cosine of the angle between normal and ray."""
     rays = camera.rays(normal.dtype, normal.device)
-    facing = (normal * rays).sum(-1).abs() / rays.norm(dim=-1)
-    return max_pool2d(facing[None, None], _AROUND, 1, _AROUND // 2)[0, 0]
+    return (normal * rays).sum(-1).abs() / rays.norm(dim=-1)
 
 
 def shown_depth(maps: SurfaceMaps) -> DenseDepth:

@@ -302,7 +302,7 @@ def test_nothing_to_extract_is_an_input_error():
         extract_mesh([view])
     one = sphere_views(1)
     with pytest.raises(InputError, match="min-weight"):
-        extract_mesh(one, MeshConfig(voxel=0.02))
+        extract_mesh(one, MeshConfig(voxel=0.02, min_weight=1.5))
 
 
 def two_parts() -> Mesh:

@@ -22,6 +22,8 @@ _EDGE = 128
 _TRIANGLES = 60_000
 _MAX_VIEWS = 60
 """Keyframes that are fused, evenly spread."""
+_TWO_VIEWS = 1.5
+"""Weight that a voxel needs: so coarse a depth makes no surface alone."""
 
 
 def write_preview(output: Path, slam: Slam) -> bool:
@@ -50,9 +52,9 @@ def preview(slam: Slam) -> Mesh | None:
     shrink = min(_EDGE / max(camera.width, camera.height), 1.0)
     small = camera.resized(round(shrink * camera.width), round(shrink * camera.height))
     views = OnDemand(list(keyframes)[::stride], lambda k: _view(k, camera, small))
-    config = slam.config.mesh
+    rough = replace(slam.config.mesh, voxel=None, triangle_budget=_TRIANGLES, min_weight=_TWO_VIEWS)
     try:
-        return extract_mesh(views, replace(config, voxel=None, triangle_budget=_TRIANGLES))
+        return extract_mesh(views, rough)
     except InputError:  # too little is known for a surface; of all of it the map may have more
         return None
 
