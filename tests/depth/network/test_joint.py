@@ -1,7 +1,6 @@
 """The joint depth engine against a loop over pixels, and both its engines."""
 
 import math
-from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from geogs.config import DepthConfig
 from geogs.depth.depth_engine import DepthTask
 from geogs.depth.depth_view import DenseDepth
 from geogs.depth.engine_choice import depth_engine
-from geogs.depth.network.joint import AGREE, DIFFER, REACH, VOTE, joined
+from geogs.depth.network.joint import AGREE, CHOICE, DIFFER, MEAN, REACH, joined
 from geogs.geometry.camera import Camera
 
 
@@ -30,26 +29,26 @@ def logit(c: float) -> float:
     return math.log(c / (1 - c))
 
 
-def precision(c: float) -> float:
-    """Square of the tolerance over the deviation of a normal error below it with chance c."""
-    return NormalDist().inv_cdf(0.5 + 0.5 * min(max(c, 0.02), 0.98)) ** 2
+def for_second(by: tuple[float, ...], vote: float, c: list[float]) -> float:
+    """What speaks for the second of two depths with these confidences."""
+    return by[0] * vote - by[1] * logit(c[0]) + by[2] * logit(c[1]) + by[3]
 
 
 def test_two_depths_are_joined_as_a_loop_does():
     first, second = random_depth(0, False), random_depth(1, True)
-    vote = 0.3 * torch.randn(9, 12, generator=torch.Generator().manual_seed(2))
+    vote = 0.1 * torch.randn(9, 12, generator=torch.Generator().manual_seed(2))
     found = joined(first, second, vote)
     agreeing = 0
     for y in range(9):
         for x in range(12):
             z = [float(d.depth[y, x]) for d in (first, second)]
             c = [float(d.confidence[y, x]) for d in (first, second)]
-            choice = VOTE[0] * float(vote[y, x]) + VOTE[1]
+            choice = for_second(CHOICE, float(vote[y, x]), c)
             winner = 1 if choice >= 0 else 0
             if abs(math.log(z[0] / z[1])) < REACH:
                 agreeing += 1
-                w = [precision(v) ** 2 for v in c]
-                depth = math.exp((w[0] * math.log(z[0]) + w[1] * math.log(z[1])) / sum(w))
+                w = 1 / (1 + math.exp(-for_second(MEAN, float(vote[y, x]), c)))
+                depth = math.exp((1 - w) * math.log(z[0]) + w * math.log(z[1]))
                 score = AGREE[0] * logit(max(c)) + AGREE[1] * logit(min(c)) + AGREE[2]
             else:
                 depth = z[winner]
