@@ -1,4 +1,4 @@
-"""The classical search and the network: their mean where they agree, else one by the images."""
+"""The classical search and the network: a mean where they agree, elsewhere the likelier one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +20,8 @@ and a logistic regression, on eight rooms and streets."""
 AGREE, DIFFER = (0.74, 0.53, 0.28), (0.35, 0.17, 0.41, -0.54)
 """Coefficients of the logit of the chance that the result is right to 2 %. Where both agree: of the
 larger and the smaller of their logits, and a constant; where not: of the logits of what was chosen
-and of the other, of the choice, and a constant. Both are logistic regressions."""
+and of the other, of the choice, and a constant. Logistic regressions as well, the first on eight
+keyframes of four rooms."""
 _BOUND = 0.02
 
 
