@@ -22,7 +22,8 @@ AGREE, DIFFER = (0.74, 0.53, 0.28), (0.35, 0.17, 0.41, -0.54)
 larger and the smaller of their logits, and a constant; where not: of the logits of what was chosen
 and of the other, of the choice, and a constant. Logistic regressions as well, the first on eight
 keyframes of four rooms."""
-_BOUND = 0.02
+BOUND = 0.02
+"""Distance of a confidence from 0 and 1 that its logit has at least."""
 
 
 class JointDepthEngine(AlternativeSearch):
@@ -61,7 +62,7 @@ def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) ->
     """
     logs = torch.stack([first.depth, second.depth]).log()
     confidence = torch.stack([first.confidence, second.confidence])
-    logit = confidence.clamp(_BOUND, 1 - _BOUND).logit()
+    logit = confidence.clamp(BOUND, 1 - BOUND).logit()
     weight, choice = (_for_second(by, vote, logit) for by in (MEAN, CHOICE))
     mean = torch.lerp(logs[0], logs[1], weight.sigmoid())
     agree, take = agreement(first, second), choice < 0
