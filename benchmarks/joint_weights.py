@@ -4,7 +4,8 @@
 
 Each SEQUENCE is a folder of geogs synth with exact depth and a camera that neither bends nor reads
 rows in turn (--flaws.noise, jpeg, exposure, gain-drift and vignetting are fine). It is run as
-geogs run does, and of each keyframe the depths of both engines are kept before they are joined. The
+geogs run does, without training the map, and of each keyframe the depths of both engines are kept
+before they are joined. The
 constants are printed that suit all sequences; then, of each, how many per cent of its pixels are
 within 0.5, 1, 2 and 5 % of the truth by the search, by the network, joined as it is now, and joined
 by constants fitted on the other sequences (of one alone, on itself).
@@ -61,21 +62,15 @@ class Pixels:
         """Some of them."""
         return Pixels(self.error[:, some], self.logit[:, some], self.vote[some])
 
-    def terms(self) -> Tensor:
-        """(n, 4) what the constants of the mean and of the choice are for."""
-        return torch.stack(
-            [self.vote, -self.logit[0], self.logit[1], torch.ones_like(self.vote)], 1
-        )
-
     def joined(self, mean: Constants, choice: Constants) -> Tensor:
         """(n) errors of the joined depth."""
         weight, is_second = self.speaks(mean).sigmoid(), self.speaks(choice) >= 0
         chosen = torch.where(is_second, self.error[1], self.error[0])
         return torch.where(self.same, torch.lerp(*self.error, weight), chosen)
 
-    def speaks(self, by: Constants) -> Tensor:
+    def speaks(self, by: Constants | Tensor) -> Tensor:
         """(n) the logit of what speaks for the network."""
-        return self.terms() @ torch.tensor(by, dtype=torch.float64)
+        return joint.speaks_for_second(by, self.vote, self.logit)
 
 
 def seen(sequence: Path, long_edge: int, device: str) -> Pixels:
@@ -118,14 +113,15 @@ def seen(sequence: Path, long_edge: int, device: str) -> Pixels:
 @contextmanager
 def _keeping(kept: dict[int, tuple[DenseDepth, DenseDepth, Tensor]]) -> Iterator[None]:
     """Meanwhile the engine's two depths and the vote are kept, by keyframe."""
-    of_engine, of_two, at = joint.JointDepthEngine._joined, joint.joined, [-1]
+    of_engine, of_two, id = joint.JointDepthEngine._joined, joint.joined, -1
 
     def of_task(engine: Any, task: DepthTask, *depths: DenseDepth) -> DenseDepth:
-        at[0] = task.view.id
+        nonlocal id
+        id = task.view.id
         return of_engine(engine, task, *depths)
 
     def join(first: DenseDepth, second: DenseDepth, vote: Tensor) -> DenseDepth:
-        kept[at[0]] = first, second, vote
+        kept[id] = first, second, vote
         return of_two(first, second, vote)
 
     try:
@@ -153,13 +149,12 @@ def least(count: int, loss: Callable[[Tensor], Tensor]) -> Constants:
 def fitted_mean(parts: Sequence[Pixels]) -> Constants:
     """By which depths of one surface are averaged; all sequences count alike."""
     agreeing = [p.of(p.same) for p in parts]
-    terms = [(p.error, p.terms()) for p in agreeing]
-    return least(
-        4,
-        lambda c: sum(
-            ((torch.lerp(*e, (t @ c).sigmoid()) / FINE) ** 2).log1p().mean() for e, t in terms
-        ),
-    )
+
+    def loss(c: Tensor) -> Tensor:
+        errors = (torch.lerp(*p.error, p.speaks(c).sigmoid()) for p in agreeing)
+        return sum(((error / FINE) ** 2).log1p().mean() for error in errors)
+
+    return least(4, loss)
 
 
 def fitted_choice(parts: Sequence[Pixels]) -> Constants:
@@ -168,8 +163,9 @@ def fitted_choice(parts: Sequence[Pixels]) -> Constants:
     for p in parts:
         differing = p.of(~p.same & (p.error.abs().amin(0) < joint.REACH))
         off = differing.error.abs()
-        terms.append((differing.terms(), (off[1] < off[0]).double()))
-    return least(4, lambda c: sum(binary_cross_entropy_with_logits(t @ c, y) for t, y in terms))
+        terms.append((differing, (off[1] < off[0]).double()))
+    entropy = binary_cross_entropy_with_logits
+    return least(4, lambda c: sum(entropy(p.speaks(c), y) for p, y in terms))
 
 
 def fitted_confidence(

@@ -131,7 +131,8 @@ def rendered_surface(
     slanted = ~widened(facing > _SLANTED, _AROUND)
     single |= slanted & (spread * facing < 2 * rules.max_spread * depth)
     depth = torch.where(single | (depth <= 0), depth, output.median_depth)
-    ends = depth_jumps(depth).around(_AROUND) | widened(depth <= 0, _AROUND)
+    jumps = depth_jumps(depth)
+    ends = widened(jumps.near | jumps.far | (depth <= 0), _AROUND)
     weight = torch.where(single, 1.0, 0.5) * torch.where(ends, _AT_ENDS, 1.0) * (depth > 0)
     if rules.max_spread > 0:
         depth = averaged_over_planes(depth, normal, camera, _RADIUS, 2 * rules.max_spread)

@@ -63,7 +63,7 @@ def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) ->
     logs = torch.stack([first.depth, second.depth]).log()
     confidence = torch.stack([first.confidence, second.confidence])
     logit = confidence.clamp(BOUND, 1 - BOUND).logit()
-    weight, choice = (_for_second(by, vote, logit) for by in (MEAN, CHOICE))
+    weight, choice = (speaks_for_second(by, vote, logit) for by in (MEAN, CHOICE))
     mean = torch.lerp(logs[0], logs[1], weight.sigmoid())
     agree, take = agreement(first, second), choice < 0
     depth = torch.where(agree, mean, torch.where(take, logs[0], logs[1])).exp()
@@ -74,8 +74,10 @@ def joined(first: DenseDepth, second: DenseDepth, vote: Float[Tensor, "h w"]) ->
     return replace(found, normal=second.normal)
 
 
-def _for_second(
-    by: tuple[float, float, float, float], vote: Float[Tensor, "h w"], logit: Float[Tensor, "2 h w"]
-) -> Float[Tensor, "h w"]:
-    """The logit of what speaks for the second of two depths."""
+def speaks_for_second(
+    by: tuple[float, float, float, float] | Float[Tensor, "4"],
+    vote: Float[Tensor, "*n"],
+    logit: Float[Tensor, "2 *n"],
+) -> Float[Tensor, "*n"]:
+    """The logit of what speaks for the second of two depths, of the logits of their confidences."""
     return by[0] * vote - by[1] * logit[0] + by[2] * logit[1] + by[3]
