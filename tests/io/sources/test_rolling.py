@@ -135,6 +135,10 @@ def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
     source = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=1, stop=13, stride=2))
     given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.followed_clips.read(0)]
     assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
+    short = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=2, stop=11))
+    monkeypatch.setattr(clips, "CLIP", 30)
+    given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in short.followed_clips.read(0)]
+    assert given == [[2, 3, 4, 5], [4, 5, 6, 7], [7, 8, 9, 10]]
     assert clips.clip_starts(0, 2, 3) == []
     assert clips.clip_starts(4, 5, 3) == [4, 6]
     assert clips.clip_starts(4, 4, 3) == [4]

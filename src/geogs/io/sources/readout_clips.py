@@ -4,7 +4,7 @@ from collections.abc import Callable, Generator
 
 from geogs.config import InputConfig
 from geogs.io.sources.reader import RawFrame, Reader, read_side_by_side
-from geogs.shutter.readout import CLIP, CLIPS, SPAN
+from geogs.shutter.readout import CLIP, CLIPS, LEAST_CLIPS, SPAN
 
 MINUTE = 60.0
 """Seconds of a video that are looked at for its readout."""
@@ -20,6 +20,8 @@ def read_clips(
     ends = [n for n in (config.stop, reader.info.length) if n is not None]
     clip = min(CLIP, max(1, round(SPAN * reader.info.fps)))
     count = min(ends) - config.start if ends else clip * CLIPS
+    # Of a short video clips are shorter, so that there are as many as it takes to believe them.
+    clip = min(clip, max(2 * (count // (LEAST_CLIPS + 1)), 1))
     if len(reader.paths) > 1:
         starts = clip_starts(config.start, count, clip)[first:]
         yield from read_side_by_side(
