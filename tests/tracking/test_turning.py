@@ -15,7 +15,7 @@ from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.start import start_up
-from geogs.tracking.start.initialise import FORGIVING, Attempt, initialise
+from geogs.tracking.start.initialise import FORGIVING, LAST_DEVIATION, Attempt, initialise
 from geogs.types import Frame, Trajectory
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
@@ -76,9 +76,12 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
     """A little parallax, asked for depths surer than that gives them."""
     attempts, adjustments = [], []
 
-    def tried(graph, config, flows):
+    def tried(graph, config, flows, most_open):
         adjustments.clear()
-        attempts.append((len(graph.keyframes), initialise(graph, config, flows)))
+        attempt = initialise(graph, config, flows, 1e-3)
+        if most_open == LAST_DEVIATION:  # before keyframes are given up
+            return attempt
+        attempts.append((len(graph.keyframes), attempt))
         if attempts[-1][1] is Attempt.FAR_OFF:
             assert len(adjustments) == FORGIVING  # no time is spent on the rest
         return attempts[-1][1]
@@ -90,14 +93,25 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
     adjust = FrameGraph.adjust
     monkeypatch.setattr(FrameGraph, "adjust", adjusted)
     monkeypatch.setattr(start_up, "initialise", tried)
-    monkeypatch.setattr("geogs.tracking.start.initialise.MAX_DEVIATION", 1e-3)
     path = [pose(0.08 * np.sin(0.2 * k), yaw=0.3 * np.sin(0.1 * k)) for k in range(30)]
     _, results = run(frames(path), replace(CONFIG, init_keyframes=8))
     assert results[-1].state is TrackState.INITIALIZING
     assert sum(attempt is Attempt.FAR_OFF for _, attempt in attempts) >= 3
-    for (before, attempt), (now, _) in pairwise(attempts[:-1]):
+    for (before, attempt), (now, _) in pairwise(attempts):
         assert now == before + 1 or attempt is Attempt.FAR_OFF or now < before
         assert now >= 1.25 * before or attempt is not Attempt.FAR_OFF or now < before
+
+
+def test_the_last_chance_is_taken_with_depths_that_are_more_open(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(start_up, "MAX_DEVIATION", 1e-3)
+    path = sideways(12)
+    segments, results = run(frames(path))
+    assert [r.state for r in results[:-1]] == [TrackState.INITIALIZING] * (len(results) - 1)
+    assert results[-1].state is TrackState.TRACKING
+    trajectory = segments.trajectory()
+    assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.3
 
 
 def test_a_start_does_not_believe_what_a_failed_one_held_for_moving(
@@ -106,13 +120,13 @@ def test_a_start_does_not_believe_what_a_failed_one_held_for_moving(
     """That was judged by wrong poses: four fifths of the cells, behind a truck on a street."""
     shares = []
 
-    def tried(graph, config, flows):
+    def tried(graph, config, flows, most_open):
         shares.append(0.0)
         if len(shares) == 1:
             for keyframe in graph.keyframes:
                 keyframe.moving = torch.ones(graph.keyframes.grid.size, dtype=torch.bool)
             return Attempt.FAILED
-        found = initialise(graph, config, flows)
+        found = initialise(graph, config, flows, most_open)
         judged = [k.moving for k in graph.keyframes]
         shares[-1] = max(0.0 if m is None else float(m.float().mean()) for m in judged)
         return found

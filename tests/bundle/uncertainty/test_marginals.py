@@ -17,6 +17,7 @@ from geogs.bundle.uncertainty.marginals import (
     ALIKE,
     COMMON_FLOW,
     COMMON_PLACE,
+    DEPTHS_ALIKE,
     Marginals,
     common_errors,
     marginals,
@@ -52,7 +53,7 @@ def test_the_block_inverse_is_that_of_the_whole():
     found = marginals(grid, problem, EXACT)
     got = found.pose.diagonal(dim1=-2, dim2=-1)
     torch.testing.assert_close(got, ALIKE * pose, rtol=1e-3, atol=1e-12)
-    expected = ALIKE**0.5 * depth.sqrt() / problem.inverse_depth
+    expected = DEPTHS_ALIKE**0.5 * depth.sqrt() / problem.inverse_depth
     torch.testing.assert_close(found.relative_depth.double(), expected, rtol=2e-3, atol=1e-12)
     assert float(found.pose[:2].abs().max()) == 0
 
@@ -112,7 +113,8 @@ def test_noise_spreads_poses_and_depths_as_foretold(sideways):
     ratio = spread.sum(0) / expected.sum(0)
     assert float(ratio[3:].min()) > 0.5
     assert float(ratio[3:].max()) < 2.0
-    square = torch.stack(depths).square().mean(0) / (foretold.relative_depth.square() / ALIKE)
+    expected = foretold.relative_depth.square() / DEPTHS_ALIKE
+    square = torch.stack(depths).square().mean(0) / expected
     assert 0.6 < float(square.median()) < 1.5
 
 

@@ -159,7 +159,7 @@ def test_a_rotation_seen_through_another_focal_length_is_no_parallax(focal: floa
     pixels = torch.from_numpy(rays[:, :2] / rays[:, 2:] + noise).float()[None]
     match = FlowMatch(pixels, 50 * grid.inside(pixels).float()[..., None].expand_as(pixels))
     view = two_view(CAMERA, match)
-    assert view is None or not has_moved_surely(grid, match, view.T_ji)
+    assert view is None or not has_moved_surely(grid, match, view.T_ji, abs(focal - 1))
 
 
 def test_a_step_beside_a_turn_is_parallax() -> None:
@@ -168,7 +168,7 @@ def test_a_step_beside_a_turn_is_parallax() -> None:
     match = FlowMatch(match.pixels, match.weight * 100)
     view = two_view(CAMERA, match)
     assert view is not None
-    assert has_moved_surely(SampleGrid(CAMERA), match, view.T_ji)
+    assert has_moved_surely(SampleGrid(CAMERA), match, view.T_ji, 0.05)
 
 
 def test_guesses_do_not_outvote_parallax() -> None:
@@ -179,4 +179,4 @@ def test_guesses_do_not_outvote_parallax() -> None:
     view = two_view(CAMERA, FlowMatch(match.pixels, weight))
     assert view is not None
     weight[:, torch.arange(weight.shape[1]) % 8 > 0] = 1 / 12**2
-    assert has_moved_surely(SampleGrid(CAMERA), FlowMatch(match.pixels, weight), view.T_ji)
+    assert has_moved_surely(SampleGrid(CAMERA), FlowMatch(match.pixels, weight), view.T_ji, 0.05)

@@ -28,6 +28,10 @@ ALIKE = 2.25
 much their sum says less than its weights do. Measured on rendered rooms at the start of a map,
 where the errors are 0.4 to 0.9 of what the weights foretell in the median, and up to 1.3 times that
 at their upper tenth."""
+DEPTHS_ALIKE = 0.56
+"""The same of what is said of depths, for the path as long as it is: errors of cells among the best
+known are 0.3 to 0.7 of what ``ALIKE`` foretells, and less what they have in common, in 20 rendered
+clips of one to two seconds (docs/uncertainty.md)."""
 BEST_KNOWN = 0.25
 """Part of a keyframe's cells that stands for its depths. Of bare walls matches tell nothing,
 however far the camera has moved; what stands before them is no worse known for it."""
@@ -126,7 +130,8 @@ def marginals(
     for source in part.sources(options):
         frame = source.frame
         if bool(problem.free_depth[frame]):
-            sigma = _depth_variance(source, covariance).sqrt()
+            variance = DEPTHS_ALIKE / ALIKE * _depth_variance(source, covariance)
+            sigma = variance.sqrt()
             relative[frame] = sigma / part.inverse_depth[frame].clamp(min=1e-12)
     return Marginals(covariance, relative, _normalised_residual(problem, part, options))
 

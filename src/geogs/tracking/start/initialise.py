@@ -40,12 +40,15 @@ from geogs.world.keyframes import Keyframe, KeyframeSet
 
 MIN_PARALLAX = 0.005
 """Motion that rotation does not explain, needed to try to start, of the long edge."""
-MODEL_ERROR = 0.01
+GIVEN_ERROR, MODEL_ERROR = 0.007, 0.01
 """What focal length, lens and rows may be off by turns a rotation into parallax: deviation of a
-match that the camera's model leaves, of how far it has moved."""
-MAX_DEVIATION = 0.2
+match that the camera's model leaves, of how far it has moved. With a lens that was given, and at
+most; a focal length that is off by its deviation adds a tenth of that."""
+MAX_DEVIATION, LAST_DEVIATION = 0.1, 0.2
 """The map is started when the depths of its first keyframes are known to this, in ``LEAST_KNOWN``
-of their cells: relative standard deviation by what matches and poses leave open."""
+of their cells: relative standard deviation by what matches and poses leave open. The second where
+nothing better will come of these keyframes: it is the next start that they would be given up for,
+or the end."""
 LEAST_KNOWN = 1.5 * MIN_KNOWN
 """Fraction of a keyframe's cells, half again as many as frames are followed by. Of plain walls
 nothing is known however far the camera has moved; they do not keep the rest from being used."""
@@ -73,14 +76,19 @@ class Attempt(Enum):
     """No one structure holds the keyframes together."""
 
 
-def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> Attempt:
+def initialise(
+    graph: FrameGraph,
+    config: TrackingConfig,
+    flows: Sequence[FlowMatch],
+    most_open: float,
+) -> Attempt:
     """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
 
     It fails if they show no parallax, or none that a rotation of the camera would not explain as
     well (:mod:`geogs.tracking.matching.two_view_rotation`), if matches and poses leave their depths
-    open (``MAX_DEVIATION``), if most of what is seen moves by them (``MOST_MOVING``), if no one
-    structure holds all keyframes (:mod:`geogs.tracking.graph.rigid_parts`), or if the images of two
-    that follow each other do not correlate where poses and depths put them (``MIN_NCC``).
+    open (to more than ``most_open``), if most of what is seen moves by them (``MOST_MOVING``), if
+    no one structure holds all keyframes (:mod:`geogs.tracking.graph.rigid_parts`), or if the images
+    of two that follow each other do not correlate where poses and depths put them (``MIN_NCC``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
@@ -89,38 +97,45 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     # Poses are guessed on the CPU.
     flows = [f.on_cpu() for f in flows]
     best = best_two_view(camera, flows, MIN_PARALLAX * camera.long_edge)
-    if best is None or not has_moved_surely(SampleGrid(camera), flows[best[0]], best[1].T_ji):
+    deviation = segment.table.focal_deviation
+    if best is None or not has_moved_surely(
+        SampleGrid(camera), flows[best[0]], best[1].T_ji, deviation
+    ):
         return Attempt.FAILED
     _place_all(graph, flows, best)
     if not _polish(graph, config.moving, range(FORGIVING)):
         return Attempt.FAILED
-    if _depth_deviation(graph) > FAR * MAX_DEVIATION:
+    if _depth_deviation(graph) > FAR * most_open:
         return Attempt.FAR_OFF
-    return polished(graph, config)
+    return polished(graph, config, most_open)
 
 
-def polished(graph: FrameGraph, config: TrackingConfig) -> Attempt:
+def polished(graph: FrameGraph, config: TrackingConfig, most_open: float) -> Attempt:
     """Adjust keyframes whose poses and depths are known roughly, and say whether to start so."""
     if not _polish(graph, config.moving, range(FORGIVING, ROUNDS)):
         return Attempt.FAILED
     segment, deviation = graph.keyframes, _depth_deviation(graph)
-    if deviation > FAR * MAX_DEVIATION:
+    if deviation > FAR * most_open:
         return Attempt.FAR_OFF
     if not largest_part(segment, graph.edges).issuperset(segment.ids):
         return Attempt.APART
-    if deviation > MAX_DEVIATION or dynamic_fraction(segment) > MOST_MOVING:
+    if deviation > most_open or dynamic_fraction(segment) > MOST_MOVING:
         return Attempt.FAILED
     return Attempt.STARTED if _passes_photometric_check(graph) else Attempt.FAILED
 
 
-def has_moved_surely(grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]) -> bool:
+def has_moved_surely(
+    grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"], focal_deviation: float
+) -> bool:
     """Whether a flow (one edge, on the CPU) speaks for a relative pose, not for a rotation alone,
-    with matches as unsure as the camera's model leaves them.
+    with matches as unsure as the camera's model leaves them, of which the focal length is known to
+    a relative ``focal_deviation``; 0 where somebody said it.
 
     Guesses have no say: of a bare wall they agree with either, and each speaks for the simpler one.
     """
     sure, moved = match.only_sure(), (match.pixels - grid.pixels).norm(dim=-1, keepdim=True)
-    weight = sure.weight / (1 + sure.weight * (MODEL_ERROR * moved).square())
+    error = min(GIVEN_ERROR + 0.1 * focal_deviation, MODEL_ERROR)
+    weight = sure.weight / (1 + sure.weight * (error * moved).square())
     unsure = replace(sure, weight=weight)
     rotated = fit_rotation(grid, unsure)
     return rotated is None or has_moved(grid, unsure, rotated, T_ji)

@@ -16,7 +16,13 @@ from geogs.tracking.matching.flow_chain import MIN_MATCHED, follow_flow
 from geogs.tracking.matching.two_view_rotation import two_view_rotation
 from geogs.tracking.start.chained_flows import ChainedFlows
 from geogs.tracking.start.early_frames import place_between_keyframes
-from geogs.tracking.start.initialise import Attempt, initialise, polished
+from geogs.tracking.start.initialise import (
+    LAST_DEVIATION,
+    MAX_DEVIATION,
+    Attempt,
+    initialise,
+    polished,
+)
 from geogs.types import FlowMatch, Frame
 from geogs.world.frames import RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -74,11 +80,16 @@ class StartUp:
 
     def finish(self) -> bool:
         """Start with what there is; False if that cannot be."""
+        return self._start(LAST_DEVIATION)
+
+    def _start(self, most_open: float) -> bool:
+        """Start with what there is, if its depths are not more open than this."""
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
-        attempt = initialise(self.map.graph, self.config, self._flows.measure())
+        flows = self._flows.measure()
+        attempt = initialise(self.map.graph, self.config, flows, most_open)
         if attempt is Attempt.APART:
-            attempt = self._start_with_part()
+            attempt = self._start_with_part(most_open)
         if attempt is Attempt.FAR_OFF:
             self._progress.min_keyframes = math.ceil((1 + MORE) * len(self.keyframes))
         if attempt is not Attempt.STARTED:
@@ -103,7 +114,7 @@ class StartUp:
             "move the camera sideways while recording."
         )
 
-    def _start_with_part(self) -> Attempt:
+    def _start_with_part(self, most_open: float) -> Attempt:
         """Start with those keyframes that one structure holds, which gives up the others."""
         graph, keyframes = self.map.graph, self.keyframes
         part = largest_part(keyframes, graph.edges)
@@ -112,7 +123,7 @@ class StartUp:
         self.map.forget([k for k in keyframes.ids if k not in part])
         for keyframe in keyframes:
             keyframe.moving = None  # it was held for moving by poses of the others
-        return polished(graph, self.config)
+        return polished(graph, self.config, most_open)
 
     def _start_metric(
         self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
@@ -145,14 +156,12 @@ class StartUp:
         self.map.complete(keyframe, rotations)
         if measure is not None:
             self.map.recorder.measure_rotation(measure)
-        ids, wanted = self.keyframes.ids, self.config.init_keyframes
-        count = len(ids)
+        count, wanted = len(self.keyframes), self.config.init_keyframes
         if count < max(wanted, MIN_KEYFRAMES):
             return ()
         if count >= self._progress.min_keyframes:
-            self.finish()
-            given_up = tuple(k for k in ids if k not in self.keyframes)
-            if self.map.segment.status.has_map or given_up:
+            given_up = self._try_to_start(MAX_DEVIATION)
+            if given_up is not None:
                 return given_up
         # More keyframes may bring parallax. With twice as many every other one is left out; where
         # the last no longer sees what the first saw, the first half is given up.
@@ -161,7 +170,15 @@ class StartUp:
         overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
         if overlap >= MIN_OVERLAP:
             return self._thin_out()
-        return self._forget(self.keyframes.ids[: count // 2])
+        given_up = self._try_to_start(LAST_DEVIATION)
+        return self._forget(self.keyframes.ids[: count // 2]) if given_up is None else given_up
+
+    def _try_to_start(self, most_open: float) -> tuple[int, ...] | None:
+        """The ids of keyframes that were given up to start; None where it comes to nothing."""
+        ids = self.keyframes.ids
+        self._start(most_open)
+        given_up = tuple(k for k in ids if k not in self.keyframes)
+        return given_up if self.map.segment.status.has_map or given_up else None
 
     def _miss(
         self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
