@@ -114,6 +114,20 @@ def test_the_last_chance_is_taken_with_depths_that_are_more_open(
     assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.3
 
 
+def test_a_video_of_few_keyframes_is_started_with_frames_between_them():
+    path = [pose(-0.5 + 0.006 * k, 0.004 * np.sin(0.9 * k)) for k in range(12)]
+    for started in (path, path[:3]):
+        segments, results = run(frames(started))
+        assert [r.state for r in results[:-1]] == [TrackState.INITIALIZING] * len(started)
+        assert (results[-1].state is TrackState.TRACKING) == (started is path)
+        if started is path:
+            trajectory = segments.trajectory()
+            assert trajectory.states == ["tracked"] * len(path)
+            assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.3
+        else:
+            assert segments.table.why_not.startswith("The camera hardly moves")
+
+
 def test_a_start_does_not_believe_what_a_failed_one_held_for_moving(
     monkeypatch: pytest.MonkeyPatch,
 ):

@@ -68,8 +68,8 @@ class SegmentMap:
             self.recorder.keyframe_forgotten(self.keyframes.remove(id))
         return tuple(ids)
 
-    def restore(self, record: FrameRecord, id: int, T_cw: Float[Tensor, "4 4"]) -> Keyframe:
-        """Make the frame of a keyframe that was given up a keyframe again, by the id it had."""
+    def restore(self, record: FrameRecord, id: int | None, T_cw: Float[Tensor, "4 4"]) -> Keyframe:
+        """Make a frame that waits a keyframe: again, by the id that it had; else the latest."""
         assert record.image is not None, "a frame that does not wait has no image"
         encoded = self.recorder.encoded(record)
         keyframe = self.keyframes.add(

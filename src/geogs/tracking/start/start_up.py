@@ -48,6 +48,8 @@ class StartUp:
         """On the CPU, where rotations are measured."""
         self._flows = ChainedFlows(map.graph)
         self._progress = map.segment.start
+        self._hardly_moved = False
+        """Whether the images moved too little for as many keyframes as a start takes."""
 
     def take(
         self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation] = ()
@@ -80,6 +82,9 @@ class StartUp:
 
     def finish(self) -> bool:
         """Start with what there is; False if that cannot be."""
+        self._hardly_moved = 0 < len(self.keyframes) < MIN_KEYFRAMES
+        if self._hardly_moved:
+            self._choose_among_all()
         return self._start(LAST_DEVIATION)
 
     def _start(self, most_open: float) -> bool:
@@ -102,17 +107,26 @@ class StartUp:
 
     def why_not(self) -> str:
         """What to tell somebody whose video could not be started with."""
-        if not len(self.keyframes):
-            return "No frame has enough texture to be tracked; check exposure and focus."
-        if len(self.keyframes) < MIN_KEYFRAMES:
+        if self._hardly_moved:
             return (
                 "The camera hardly moves (no parallax), so nothing can be reconstructed; "
                 "record a longer video in which the camera changes its place."
             )
+        if not len(self.keyframes):
+            return "No frame has enough texture to be tracked; check exposure and focus."
         return (
             "The images show no parallax (the camera only turns, or the scene is too far away); "
             "move the camera sideways while recording."
         )
+
+    def _choose_among_all(self) -> None:
+        """Make keyframes of frames that are evenly spaced in time."""
+        self._forget(self.keyframes.ids)
+        frames = self.map.recorder.unplaced()
+        last, count = len(frames) - 1, min(len(frames), self.config.init_keyframes)
+        for n in range(count if count >= MIN_KEYFRAMES else 0):
+            eye = torch.eye(4, dtype=torch.float64)
+            self.map.restore(frames[n * last // (count - 1)], None, eye)
 
     def _start_with_part(self, most_open: float) -> Attempt:
         """Start with those keyframes that one structure holds, which gives up the others."""
