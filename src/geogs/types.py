@@ -271,7 +271,7 @@ class Uncertainty(ShortRepr):
     """Orientation, radians."""
     depth: Annotated[Float[np.ndarray, "n"], UNBOUNDED]
     """Depths, relative, where the trajectory is as long as the true one: those of the best known
-    quarter of what the frame sees, as bare walls say nothing."""
+    15 % of what the frame sees, as bare walls say nothing."""
     focal: AtLeast0 = 0.0
     """Focal length, relative: the width of things over their depth."""
     misfit: AtLeast0 = 0.0

@@ -204,12 +204,12 @@ def test_bare_walls_leave_what_stands_before_them_known():
         weight[:, torch.arange(grid.size) % 10 >= tenths] = 0
         return marginals(grid, replace(problem, weight=weight), EXACT)
 
-    found = seen(3)
+    found = seen(2)
     assert bool((found.depth_deviation < 5 * every).all())
     rows = [sorted(row.tolist()) for row in found.relative_depth]
-    by_hand = [row[math.ceil(0.25 * (len(row) - 1))] for row in rows]
+    by_hand = [row[math.ceil(0.15 * (len(row) - 1))] for row in rows]
     assert found.depth_deviation.tolist() == pytest.approx(by_hand)
-    assert not seen(2).depth_deviation.isfinite().any()
+    assert not seen(1).depth_deviation.isfinite().any()
 
 
 def test_some_cells_stand_for_all():

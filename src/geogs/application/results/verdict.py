@@ -53,7 +53,7 @@ class Verdict:
     rotation_deg: float
     """Median deviation of its orientation."""
     depth: float
-    """Median relative deviation of depths, of the best known quarter of what each keyframe sees."""
+    """Median relative deviation of depths, of the best known 15 % of what each keyframe sees."""
     focal: float = 0.0
     """Relative deviation of the focal length."""
     focal_change: float = 0.0

@@ -24,7 +24,6 @@ from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
 from geogs.tracking.graph.proximity import RADIUS
 from geogs.tracking.graph.rigid_parts import largest_part
-from geogs.tracking.locate.frame_locator import MIN_KNOWN
 from geogs.tracking.matching.photometric_check import (
     MIN_NCC,
     PhotometricCheck,
@@ -45,13 +44,9 @@ GIVEN_ERROR, MODEL_ERROR = 0.007, 0.01
 match that the camera's model leaves, of how far it has moved. With a lens that was given, and at
 most; a focal length that is off by its deviation adds a tenth of that."""
 MAX_DEVIATION, LAST_DEVIATION = 0.1, 0.2
-"""The map is started when the depths of its first keyframes are known to this, in ``LEAST_KNOWN``
-of their cells: relative standard deviation by what matches and poses leave open. The second where
-nothing better will come of these keyframes: it is the next start that they would be given up for,
-or the end."""
-LEAST_KNOWN = 1.5 * MIN_KNOWN
-"""Fraction of a keyframe's cells, half again as many as frames are followed by. Of plain walls
-nothing is known however far the camera has moved; they do not keep the rest from being used."""
+"""The map is started when the best known depths of its first keyframes are known to this: relative
+standard deviation by what matches and poses leave open. The second where nothing better will come
+of these keyframes: they are about to be given up for others, or the video ends."""
 LEAST_SEEN = 0.4
 """Fraction of the first keyframe's depths that a keyframe must see to be placed on them."""
 ROUNDS, FORGIVING = 6, 2
@@ -59,8 +54,6 @@ ROUNDS, FORGIVING = 6, 2
 later ones find them more open yet."""
 FAR = 1.5
 """Times the allowed deviation of depths beyond which one more keyframe is not going to help."""
-
-
 MOST_MOVING = 0.5
 """Fraction of all cells that may be held for moving: of more, the poses are those of what moves."""
 
@@ -210,14 +203,12 @@ def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
 
 
 def _depth_deviation(graph: FrameGraph) -> float:
-    """Relative deviation of the best known depths, the poses being as open as they are.
-
-    That of the ``LEAST_KNOWN`` of a keyframe's cells which are known best: the median of all.
-    """
+    """Relative deviation of the best known depths, the poses being as open as they are: the median
+    of the keyframes'."""
     ids = graph.keyframes.ids
     problem, _ = graph.problem(list(graph.edges), ids[1:], ids)
     found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=HUBER))
-    return float(found.relative_depth.quantile(LEAST_KNOWN, -1, interpolation="higher").median())
+    return float(found.depth_deviation.median())
 
 
 def _passes_photometric_check(graph: FrameGraph) -> bool:
