@@ -137,7 +137,7 @@ class _AdjustedClips:
     @property
     def explained(self) -> float:
         """How much of what the clips measured fits, each clip being worth one at most."""
-        return sum(1 - part.cost for part in self.equations)
+        return sum((1 - part.cost for part in self.equations), 0.0)
 
 
 @dataclass(frozen=True)

@@ -92,15 +92,16 @@ class LocalMapping:
         anchor: int,
         rotations: Sequence[RelativeRotation],
         culls: bool = True,
-    ) -> tuple[int, ...]:
-        """Link a new keyframe to its neighbours and adjust them; returns the ids of those culled.
+    ) -> None:
+        """Link a new keyframe to its neighbours and adjust them.
 
-        ``anchor`` is the keyframe at which it was located; without ``culls`` none goes.
+        ``anchor`` is the keyframe at which it was located; without ``culls`` none is culled.
         """
         self.map.complete(keyframe, rotations)
         self._link(keyframe, anchor)
         self.map.odometry.update_scale()
-        return self._cull() if culls else ()
+        if culls:
+            self._cull()
 
     def _link(self, keyframe: Keyframe, anchor: int) -> None:
         """Link the latest keyframe to its neighbours and adjust them."""
@@ -159,16 +160,14 @@ class LocalMapping:
         self.map.priors.adjust(depths)
         self.graph.release(moving)
 
-    def _cull(self) -> tuple[int, ...]:
+    def _cull(self) -> None:
         """Remove the keyframe before the last if it adds little (DROID-SLAM's keyframe test)."""
         ids = self.keyframes.ids
         if len(ids) <= MIN_KEYFRAMES or ids[-2] in self.segment.final:
-            return ()
+            return
         before, id = ids[-3], ids[-2]
         if [self.keyframes[k].measured is not None for k in ids[-3:]] == [False, True, False]:
-            return ()  # the only one around whose depth was measured
+            return  # the only one around whose depth was measured
         distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
-        if float(distance) >= CULL_DISTANCE * self._long_edge:
-            return ()
-        self.map.cull(id, before)
-        return (id,)
+        if float(distance) < CULL_DISTANCE * self._long_edge:
+            self.map.cull(id, before)

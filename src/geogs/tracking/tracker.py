@@ -43,8 +43,6 @@ class TrackResult:
     """Ids that from now on are never removed, earliest first."""
     active: tuple[int, ...] = ()
     """Ids whose poses the local adjustment still moves, earliest first."""
-    removed: tuple[int, ...] = ()
-    """Ids that were culled."""
     finalized_elsewhere: tuple[int, ...] = ()
     """Ids that became final in a segment that is not the main map."""
     is_new_main: bool = False
@@ -225,12 +223,11 @@ class Tracker:
         """Do what the new keyframe takes beyond its pose: neighbours, depth, local adjustment."""
         new, self._unfinished = self._unfinished, None
         assert new is not None, "no keyframe waits to be completed"
-        removed = self.local.update(
-            new.keyframe, new.motion.keyframe, new.rotations, culls=not new.is_last
-        )
+        culls = not new.is_last
+        self.local.update(new.keyframe, new.motion.keyframe, new.rotations, culls)
         fresh = self.map.finalise(self.keyframes.ids[:-1])
         state, active = self.segment.status.state, self.local.active
-        return TrackResult(state, fresh, active, removed)
+        return TrackResult(state, fresh, active)
 
     # --- steps of a frame ----------------------------------------------------------------------
 
@@ -249,14 +246,13 @@ class Tracker:
         if not len(keyframes):
             followed = self._orientation.follow(status.orientation, frame, encoded)
             rotations = [] if followed is None else [followed.rotation]
-        given_up = self._start_up.take(frame, encoded, rotations)
+        self._start_up.take(frame, encoded, rotations)
         if not status.has_map:
-            return TrackResult(status.state, removed=given_up)
+            return TrackResult(status.state)
         self._begin()
         self._orientation.located(status.orientation, frame, encoded)
         fresh = self.map.finalise(keyframes.ids[:-1])
-        given_up = tuple(k for k in given_up if k not in keyframes)
-        return TrackResult(status.state, fresh, self.local.active, given_up)
+        return TrackResult(status.state, fresh, self.local.active)
 
     def _begin(self) -> None:
         """The map has just been started."""

@@ -61,12 +61,11 @@ class SegmentMap:
         self.graph.remove_keyframe(id)
         self.recorder.keyframe_removed(self.keyframes.remove(id), substitute)
 
-    def forget(self, ids: Sequence[int]) -> tuple[int, ...]:
-        """Give up keyframes, whose frames then have no pose; returns their ids."""
+    def forget(self, ids: Sequence[int]) -> None:
+        """Give up keyframes, whose frames then have no pose."""
         for id in ids:
             self.graph.remove_keyframe(id)
             self.recorder.keyframe_forgotten(self.keyframes.remove(id))
-        return tuple(ids)
 
     def restore(self, record: FrameRecord, id: int | None, T_cw: Float[Tensor, "4 4"]) -> Keyframe:
         """Make a frame that waits a keyframe: again, by the id that it had; else the latest."""

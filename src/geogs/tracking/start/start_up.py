@@ -51,34 +51,31 @@ class StartUp:
         self._hardly_moved = False
         """Whether the images moved too little for as many keyframes as a start takes."""
 
-    def take(
-        self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation] = ()
-    ) -> tuple[int, ...]:
+    def take(self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation] = ()) -> None:
         """Take the next frame, of which rotations relative to others may be known already.
 
-        The segment's state says whether the map has been started. Returns the ids of keyframes
-        that were given up.
+        The segment's state says whether the map has been started.
         """
-        if frame.depth is not None:
-            given_up = self._start_metric(frame, encoded, rotations)
-            if given_up is not None:
-                return given_up
+        if frame.depth is not None and self._start_metric(frame, encoded, rotations):
+            return
         if not len(self.keyframes):
-            return self._gather(frame, encoded, rotations)
+            self._gather(frame, encoded, rotations)
+            return
         last = list(self.keyframes)[-1]
         match = follow_flow(
             self.keyframes.grid, self.map.operator, self._progress.flow, last.encoded, encoded
         )
         if match.matched < MIN_MATCHED:
-            return self._miss(frame, encoded, rotations)
+            self._miss(frame, encoded, rotations)
+            return
         self._progress.misses = 0
         measure = partial(_rotation, last.frame_index, self._grid, match.there.on_cpu())
         if self._choice.calls_for(match.flow, match.matched):
-            return self._gather(frame, encoded, rotations, measure)
+            self._gather(frame, encoded, rotations, measure)
+            return
         eye = torch.eye(4, dtype=torch.float64)
         self.map.recorder.add(frame, encoded, last.id, eye, match.there, rotations)
         self.map.recorder.measure_rotation(measure)
-        return ()
 
     def finish(self) -> bool:
         """Start with what there is; False if that cannot be."""
@@ -141,21 +138,18 @@ class StartUp:
 
     def _start_metric(
         self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
-    ) -> tuple[int, ...] | None:
-        """Start the map at once from what a depth sensor saw; None where that is too little.
-
-        Returns the ids of the keyframes that were given up.
-        """
+    ) -> bool:
+        """Start the map at once from what a depth sensor saw; False where that is too little."""
         earlier = self.keyframes.ids
         keyframe = self.map.add(frame, encoded)
         if not self.map.sensor.start(keyframe, frame.depth, MIN_KNOWN):
             self.keyframes.remove(keyframe.id)
-            return None
-        given_up = self._forget(earlier)
+            return False
+        self._forget(earlier)
         self.map.complete(keyframe, rotations)
         self.map.segment.is_metric = True
         self.map.segment.status.state = TrackState.TRACKING
-        return given_up
+        return True
 
     def _gather(
         self,
@@ -163,7 +157,7 @@ class StartUp:
         encoded: Any,
         rotations: Sequence[RelativeRotation],
         measure: Callable[[], RelativeRotation | None] | None = None,
-    ) -> tuple[int, ...]:
+    ) -> None:
         """Add a keyframe to those the map will be started from, and start it with enough."""
         keyframe = self.map.add(frame, encoded)
         self._progress.flow.reset()
@@ -172,31 +166,24 @@ class StartUp:
             self.map.recorder.measure_rotation(measure)
         count, wanted = len(self.keyframes), self.config.init_keyframes
         if count < max(wanted, MIN_KEYFRAMES):
-            return ()
+            return
         if count >= self._progress.min_keyframes:
-            given_up = self._try_to_start(MAX_DEVIATION)
-            if given_up is not None:
-                return given_up
+            has_started = self._start(MAX_DEVIATION)
+            if has_started or len(self.keyframes) < count:
+                return
         # More keyframes may bring parallax. With twice as many every other one is left out; where
         # the last no longer sees what the first saw, the first half is given up.
         if count < 2 * wanted:
-            return ()
+            return
         overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
         if overlap >= MIN_OVERLAP:
-            return self._thin_out()
-        given_up = self._try_to_start(LAST_DEVIATION)
-        return self._forget(self.keyframes.ids[: count // 2]) if given_up is None else given_up
+            self._thin_out()
+            return
+        has_started = self._start(LAST_DEVIATION)
+        if not has_started and len(self.keyframes) == count:
+            self._forget(self.keyframes.ids[: count // 2])
 
-    def _try_to_start(self, most_open: float) -> tuple[int, ...] | None:
-        """The ids of keyframes that were given up to start; None where it comes to nothing."""
-        ids = self.keyframes.ids
-        self._start(most_open)
-        given_up = tuple(k for k in ids if k not in self.keyframes)
-        return given_up if self.map.segment.status.has_map or given_up else None
-
-    def _miss(
-        self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
-    ) -> tuple[int, ...]:
+    def _miss(self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]) -> None:
         """The view changed at once: wait for it to come back, start with what there is, or anew."""
         self._progress.misses += 1
         is_waiting = self._progress.misses < MAX_MISSES
@@ -204,24 +191,22 @@ class StartUp:
             self._progress.misses = 0
         if is_waiting or self.finish():
             self.map.recorder.add_untracked(frame.index, frame.timestamp, rotations)
-            return ()
-        given_up = self._forget(self.keyframes.ids)
+            return
+        self._forget(self.keyframes.ids)
         self._gather(frame, encoded, rotations)
-        return given_up
 
-    def _thin_out(self) -> tuple[int, ...]:
+    def _thin_out(self) -> None:
         """Make every other keyframe an ordinary frame; the first and the last stay."""
         ids = self.keyframes.ids
         self._progress.min_keyframes = 0
         for before, id in zip(ids[:-1:2], ids[1:-1:2], strict=False):
             self.map.cull(id, before)
-        return tuple(ids[1:-1:2])
 
-    def _forget(self, ids: Sequence[int]) -> tuple[int, ...]:
+    def _forget(self, ids: Sequence[int]) -> None:
         """Drop the earliest keyframes of a start that failed."""
         self._progress.flow.reset()
         self._progress.min_keyframes = 0
-        return self.map.forget(ids)
+        self.map.forget(ids)
 
 
 def _rotation(earlier: int, grid: SampleGrid, match: FlowMatch) -> RelativeRotation | None:
