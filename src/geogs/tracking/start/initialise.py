@@ -41,8 +41,8 @@ MIN_PARALLAX = 0.005
 """Motion that rotation does not explain, needed to try to start, of the long edge."""
 GIVEN_ERROR, MODEL_ERROR = 0.007, 0.01
 """What focal length, lens and rows may be off by turns a rotation into parallax: deviation of a
-match that the camera's model leaves, of how far it has moved. With a lens that was given, and at
-most; a focal length that is off by its deviation adds a tenth of that."""
+match that the camera's model leaves, of how far it has moved. The first of a lens that was given; a
+tenth of the deviation of a focal length is added, up to the second."""
 MAX_DEVIATION, LAST_DEVIATION = 0.1, 0.2
 """The map is started when the best known depths of its first keyframes are known to this: relative
 standard deviation by what matches and poses leave open. The second where nothing better will come
