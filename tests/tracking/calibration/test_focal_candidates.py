@@ -8,7 +8,7 @@ import torch
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
-from geogs.tracking.calibration.focal_candidates import candidates, try_candidate
+from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -55,3 +55,17 @@ def test_a_barrel_is_found():
 def test_of_a_known_distortion_only_pinholes_are_tried():
     assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False))
     assert {lens.camera.fx for lens in candidates(GUESS, radial=False)} > {GUESS.fx}
+
+
+def test_of_two_minima_the_lens_that_bends_as_lenses_do_counts():
+    """Costs and lenses as of a Kinect that turns at 120 degrees/s, whose fx is 224."""
+
+    def start(fx: float, k1: float, k2: float, cost: float) -> Start:  # one keyframe, one cell
+        lens = RadialLens(Camera(fx, fx, 159.5, 119.5, 320, 240), k1, k2)
+        return Start(lens, torch.eye(4)[None], torch.ones(1), torch.ones(1), cost)
+
+    wrong, right = start(274.1, 0.315, -0.586, 0.4788), start(233.6, 0.144, -0.255, 0.4941)
+    assert right.unlikely < wrong.unlikely
+    assert right.unlikely == pytest.approx(0.4941 + 0.002 * (1.44**2 + 1.275**2))
+    barrel, pinhole = start(224.0, -0.25, 0.06, 0.47), start(240.0, 0.0, 0.0, 0.52)
+    assert barrel.unlikely < pinhole.unlikely  # what fits clearly better is not outvoted

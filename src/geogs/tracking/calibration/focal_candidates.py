@@ -17,6 +17,7 @@ from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
+from geogs.geometry.distortion import USUAL_BEND
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.two_view import best_two_view, without
 from geogs.types import FlowMatch
@@ -26,6 +27,9 @@ FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
 """Degrees along the longer side, besides that of the guess."""
 BARREL, OF_BARREL = (-0.2, 0.03), 70.0
 """k1 and k2 of a wide camera's lens, and a field of view of one."""
+BEND_COST = 0.002
+"""Cost of a lens that bends by a usual deviation, as matches err alike: they are 20,000, and count
+here like 250 that err by themselves."""
 _STAGES = (30.0, 10), (10.0, 10), (3.0, 30)
 """Huber's limit, and steps at most. Those of the last are many, as from a pinhole to the lens leads
 a long valley; whoever stops in it may take the wrong one for the best."""
@@ -41,6 +45,13 @@ class Start:
     """On the cells of the first keyframe."""
     information: Float[Tensor, "p"]
     cost: float
+
+    @property
+    def unlikely(self) -> float:
+        """The cost with what is known of any lens: of two minima that explain a turn about as well
+        it tells the one that bends as lenses do."""
+        bends = zip((self.lens.k1, self.lens.k2), USUAL_BEND, strict=True)
+        return self.cost + BEND_COST * sum((k / usual) ** 2 for k, usual in bends)
 
 
 def candidates(camera: Camera, radial: bool) -> list[RadialLens]:
