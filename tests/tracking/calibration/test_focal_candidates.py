@@ -65,7 +65,7 @@ def test_of_two_minima_the_lens_that_bends_as_lenses_do_counts():
         return Start(lens, torch.eye(4)[None], torch.ones(1), torch.ones(1), cost)
 
     wrong, right = start(274.1, 0.315, -0.586, 0.4788), start(233.6, 0.144, -0.255, 0.4941)
-    assert right.unlikely < wrong.unlikely
-    assert right.unlikely == pytest.approx(0.4941 + 0.002 * (1.44**2 + 1.275**2))
+    assert right.penalised < wrong.penalised
+    assert right.penalised == pytest.approx(0.4941 + 0.002 * (1.44**2 + 1.275**2))
     barrel, pinhole = start(224.0, -0.25, 0.06, 0.47), start(240.0, 0.0, 0.0, 0.52)
-    assert barrel.unlikely < pinhole.unlikely  # what fits clearly better is not outvoted
+    assert barrel.penalised < pinhole.penalised  # what fits clearly better is not outvoted

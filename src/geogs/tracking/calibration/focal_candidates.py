@@ -47,7 +47,7 @@ class Start:
     cost: float
 
     @property
-    def unlikely(self) -> float:
+    def penalised(self) -> float:
         """The cost with what is known of any lens: of two minima that explain a turn about as well
         it tells the one that bends as lenses do."""
         bends = zip((self.lens.k1, self.lens.k2), USUAL_BEND, strict=True)

@@ -112,5 +112,5 @@ class Stretch:
         found = [s for s in starts if s is not None]
         if not found:
             return Degeneracy.TURNING
-        best = min(found, key=lambda s: s.unlikely)
+        best = min(found, key=lambda s: s.penalised)
         return best if best.cost <= MAX_COST else Degeneracy.UNEXPLAINED
