@@ -3,7 +3,8 @@
 Flow needs no focal length, so it is measured once. Every candidate places the keyframes by the
 essential matrix and PnP and is adjusted, the focal length with the rest, at last the distortion,
 too: of a lens that bends, pinholes of different focal lengths are all about as wrong, and from none
-of them the adjustment may come to a barrel, which is tried for itself. The least cost wins.
+of them the adjustment may come to a barrel, which is tried for itself. The least cost wins, with
+what a bend of the lens costs by itself.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +29,8 @@ FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
 BARREL, OF_BARREL = (-0.2, 0.03), 70.0
 """k1 and k2 of a wide camera's lens, and a field of view of one."""
 BEND_COST = 0.002
-"""Cost of a lens that bends by a usual deviation, as matches err alike: they are 20,000, and count
-here like 250 that err by themselves."""
+"""Cost that is added for a lens that bends by one usual deviation. Matches err alike, so that costs
+a few per cent apart tell little: from half of this on the wrong minimum of a turn does not win."""
 _STAGES = (30.0, 10), (10.0, 10), (3.0, 30)
 """Huber's limit, and steps at most. Those of the last are many, as from a pinhole to the lens leads
 a long valley; whoever stops in it may take the wrong one for the best."""
