@@ -9,12 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.application.calibrate import lens_sentence, refined, self_calibrated
+from geogs.application.calibrate import (
+    lens_sentence,
+    refined,
+    self_calibrated,
+    with_shutter_found,
+)
 from geogs.application.interrupt import Interruption
 from geogs.config import CalibrationConfig, Config, InputConfig
+from geogs.geometry.distortion import distorted_pixels
 from geogs.io.sources.calibration import GUESS, Calibration
+from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.shutter import readout
+from geogs.shutter.readout import FoundReadout
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.self_calibration import SelfCalibration
@@ -122,19 +131,80 @@ def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
         self_calibrated(source, Config())
 
 
-def test_the_focal_length_is_asked_of_rectified_rows(video, monkeypatch):
-    seen = []
+class Telling:
+    """A video that tells one lens after the other, each relative to the one that its images were
+    straightened by; then nothing."""
 
-    def calibrate(frames, camera, radial, device, report, *masks):
-        seen.append(max(float(frame.rows.offset.float().abs().max()) for frame in frames))
-        return SelfCalibration(camera.with_focal(0.8 * camera.fx), None, 0.01, None, 12, 14)
+    def __init__(self, *lenses: tuple[float, float, float]) -> None:
+        self.lenses = iter(lenses)
+        self.rows: list[float] = []
+        """Pixels by which rows were rectified at most, each time."""
+        self.near: list[bool] = []
+        """Whether it was said that the lens is about right."""
 
-    monkeypatch.setattr(self_calibration, "self_calibrate", calibrate)
-    before = open_source(video, InputConfig(readout=0.03))
-    after = self_calibrated(before, Config()).calibration
-    assert len(seen) == 1
-    assert seen[0] > 1  # pixels
-    assert after.fx == pytest.approx(0.8 * before.calibration.fx)
+    def __call__(self, frames, camera, radial, device, report, mask, black, is_near):
+        self.rows.append(max(float(f.rows.offset.abs().max()) if f.rows else 0.0 for f in frames))
+        self.near.append(is_near)
+        factor, k1, k2 = next(self.lenses, (0.0, 0.0, 0.0))
+        if not factor:
+            return SelfCalibration(camera, failure="it is a test")
+        found = camera.with_focal(factor * camera.fx)
+        return SelfCalibration(found, (k1, k2), 0.01, (0.01, 0.01), 12, 14)
+
+
+def asked(video: Path, monkeypatch, lens: Telling, **given) -> tuple[Source, Calibration]:
+    """A video that tells so, calibrated, and what was assumed of it before."""
+    monkeypatch.setattr(self_calibration, "self_calibrate", lens)
+    before = open_source(video, InputConfig(**given))
+    return self_calibrated(before, Config()), before.calibration
+
+
+def test_the_lens_is_asked_of_rows_rectified_by_it_until_it_stays(video, monkeypatch):
+    lens = Telling((0.8, -0.2, 0.05), (1.05, 0.04, -0.02), (1.005, 0.0, 0.0))
+    found, before = asked(video, monkeypatch, lens, readout=0.03)
+    after = found.calibration
+    assert lens.near == [False, True, True]
+    assert lens.rows[0] > 1
+    assert abs(lens.rows[1] / lens.rows[0] - 1) > 0.05  # a lens that bends sees another turn
+    assert after.fx == pytest.approx(0.8 * 1.05 * 1.005 * before.fx)
+    assert after.focal_deviation == pytest.approx(0.01)
+    # A ray that the last images show at x was seen by the first lens where all three put it.
+    ray = np.array([[0.3, 0.2], [-0.5, 0.1], [0.0, -0.4]])
+    seen = distorted_pixels(ray, after.camera(), after.distortion)
+    for factor, k1, k2 in ((1.05 * 1.005, 0.04, -0.02), (1.0, -0.2, 0.05)):
+        square = np.square(ray).sum(1, keepdims=True)
+        ray = factor * ray * (1 + k1 * square + k2 * square**2)
+    camera = before.camera().with_focal(0.8 * before.fx)
+    np.testing.assert_allclose(seen, distorted_pixels(ray, camera, ()), atol=0.1)
+
+
+def test_the_lens_of_a_global_shutter_is_asked_for_once(video, monkeypatch):
+    lens = Telling((0.8, -0.2, 0.05))
+    found, _ = asked(video, monkeypatch, lens, readout=0.0)
+    assert lens.near == [False]
+    assert found.calibration.distortion == pytest.approx((-0.2, 0.05, 0, 0), abs=1e-9)
+    looked_for = []
+    monkeypatch.setattr(
+        readout, "find_readout", lambda *_: looked_for.append(0) or FoundReadout(0.0, 0.0, 0.001, 3)
+    )
+    found, _ = asked(video, monkeypatch, Telling((0.8, -0.2, 0.05)))
+    assert len(looked_for) == 2  # by the guess, and by the lens
+    assert with_shutter_found(found) is found
+
+
+def test_of_a_lens_that_its_images_do_not_bear_out_any_is_asked(video, monkeypatch):
+    lens = Telling((0.8, -0.2, 0.05), (0.0, 0.0, 0.0), (1.1, 0.0, 0.0), (1.0, 0.0, 0.0))
+    found, before = asked(video, monkeypatch, lens, readout=0.03)
+    assert lens.near == [False, True, False, True]
+    assert found.calibration.fx == pytest.approx(0.88 * before.fx)
+
+
+def test_what_is_told_once_is_kept_where_nothing_is_told_afterwards(video, monkeypatch):
+    lens = Telling((0.8, -0.2, 0.05))
+    found, before = asked(video, monkeypatch, lens, readout=0.03)
+    assert lens.near == [False, True, False]
+    assert found.calibration.fx == pytest.approx(0.8 * before.fx)
+    assert found.calibration.refinement.failure is None
 
 
 def test_what_was_found_at_working_size_is_carried_to_the_source():

@@ -13,6 +13,7 @@ import torch
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
 from geogs.config import Config
+from geogs.geometry.distortion import with_bend
 from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.frame_source import Source
 from geogs.shutter.shutter import Shutter
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
 
 F = TypeVar("F")
 Report = Callable[[float], None]
+LENS_ROUNDS = 3
+"""Times that a lens is asked for, at most, each time with rows rectified by the one before."""
+SETTLED = 2.0
+"""Deviations that a lens moves by, at most, from one round to the last one."""
+_FIRST = 0.6
+"""Part of what is left that a round takes, as shown."""
 
 
 def without_overlay(source: Source, progress: RunProgress | None = None) -> Source:
@@ -66,31 +73,87 @@ def self_calibrated(
                 "--intrinsics fx,fy,cx,cy for a better result."
             )
         return source
-    radial = config.calibration.radial and not source.calibration.is_distorted
-    rectified = _with_rows_rectified(source, progress, stop)
-    found = None if rectified is None else _found(
-        "calibration", progress, stop, partial(_self_calibration, rectified, radial, device)
-    )  # fmt: skip
+    found = _by_rectified_rows(source, config.calibration.radial, device, progress, stop)
     if found is None:
         progress.write(
             f"Calibration stopped; going on with {source.intrinsics_origin}. "
             "Press Ctrl-C again to end."
         )
         return source
-    calibration = refined(source.calibration, source.camera.fx, found)
-    progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
-    return source.with_calibration(calibration)
+    progress.write(_calibration_sentence(found.calibration, source.intrinsics_origin))
+    return found
+
+
+def _by_rectified_rows(
+    source: Source, radial: bool, device: str | torch.device, progress: RunProgress, stop: Stop
+) -> Source | None:
+    """The source with what it tells of its lens; none where a request to stop came before.
+
+    A turn that stretches what is seen row by row looks like another lens, so the lens is asked for
+    on rectified rows. But rows are rectified by a lens, and by a guess they are so only in part,
+    and their readout is known to a sixth or so: hence both again, near what was found, until the
+    lens stays. What the images do not tell then is as before.
+    """
+    radial = radial and not source.calibration.is_distorted
+    calibrated, rolled = source, False
+    for n in range(LENS_ROUNDS):
+        known = calibrated if n else None
+        rectified = _with_rows_rectified(calibrated, progress, stop, n)
+        if rectified is None:
+            return known
+        rolls = rectified.shutter.readout != 0
+        if n and not (rolls or rolled):
+            return rectified
+        images = rectified if rolls else calibrated
+        ask = partial(_self_calibration, images, radial, device, n > 0)
+        found = _found("calibration", progress, stop, ask, n)
+        if found is None or (n and found.failure is not None):
+            return known
+        before, found = calibrated.calibration, _of_stored(found, calibrated, source)
+        after = refined(source.calibration, source.camera.fx, found)
+        calibrated, rolled = source.with_calibration(after), rolls
+        if found.failure is not None or _is_settled(before, after, found):
+            break
+    return calibrated
+
+
+def _is_settled(before: Calibration, after: Calibration, found: "SelfCalibration") -> bool:
+    """Whether a lens is about the one before, by the deviations of what was found."""
+    bends = (lens.distortion or (0.0, 0.0) for lens in (before, after))
+    bent = zip(*bends, found.deviations or (0.0, 0.0), strict=False)
+    return abs(math.log(after.fx / before.fx)) <= SETTLED * found.deviation and all(
+        abs(new - old) <= SETTLED * deviation for old, new, deviation in bent
+    )
+
+
+def _of_stored(found: "SelfCalibration", straight: Source, source: Source) -> "SelfCalibration":
+    """What was found on the images of ``straight``, for those of the source as they are stored."""
+    before, bend = straight.calibration, found.distortion
+    factor = found.camera.fx / straight.camera.fx
+    camera, (k1, k2, *_) = with_bend(
+        before.camera(), before.distortion, before.lens, bend or (0.0, 0.0), factor
+    )
+    factor = camera.fx / source.calibration.fx
+    return replace(
+        found, camera=source.camera.with_focal(factor * source.camera.fx),
+        distortion=None if bend is None else (k1, k2),
+    )  # fmt: skip
 
 
 def _self_calibration(
-    source: Source, radial: bool, device: str | torch.device, report: Report
+    source: Source, radial: bool, device: str | torch.device, is_near: bool, report: Report
 ) -> "SelfCalibration":
+    """What the images tell; where they do not bear out a lens that is said to be near, of any."""
     from geogs.tracking.calibration.self_calibration import self_calibrate
 
     with closing(source.linked_frames()) as frames:
-        return self_calibrate(
-            frames, source.camera, radial, device, report, source.mask, source.black_is_masked
-        )
+        found = self_calibrate(
+            frames, source.camera, radial, device, report, source.mask, source.black_is_masked,
+            is_near,
+        )  # fmt: skip
+    if found.failure is None or not is_near:
+        return found
+    return _self_calibration(source, radial, device, False, report)
 
 
 def refined(
@@ -182,27 +245,26 @@ def with_shutter_found(
             "Press Ctrl-C again to end."
         )
         return source
-    if not found.is_believed:
-        return source.with_shutter(Shutter(0.0, _evidence(found), found.left_open))
-    progress.write(
-        f"Rolling shutter: {1000 * found.readout:.1f} ms from the first to the last row "
-        f"({_evidence(found)}); rows are rectified."
-    )
-    origin = f"found in the video: {_evidence(found)}"
-    return source.with_shutter(Shutter(found.readout, origin, found.left_open))
+    if found.is_believed:
+        progress.write(
+            f"Rolling shutter: {1000 * found.readout:.1f} ms from the first to the last row "
+            f"({_evidence(found)}); rows are rectified."
+        )
+    return source.with_shutter(_shutter(found))
 
 
-def _with_rows_rectified(source: Source, progress: RunProgress, stop: Stop) -> Source | None:
-    """The source as its focal length is asked for: a turn that stretches what is seen row by row
-    looks like another lens. By its guess, the readout is known to a sixth or so; none after a
-    request to stop."""
+def _with_rows_rectified(
+    source: Source, progress: RunProgress, stop: Stop, n: int
+) -> Source | None:
+    """The source with its rows rectified by its lens as it is known before round ``n``; none after
+    a request to stop."""
     if not source.is_shutter_open:
         return source
     found = _found(
         "calibration", progress, stop,
-        lambda report: _readout(source, lambda fraction: report(0.0)),
+        lambda report: _readout(source, lambda fraction: report(0.0)), n,
     )  # fmt: skip
-    return None if found is None else source.with_shutter(Shutter(found.readout))
+    return None if found is None else source.with_shutter(_shutter(found))
 
 
 def _readout(source: Source, report: Report) -> "FoundReadout":
@@ -215,6 +277,13 @@ def _readout(source: Source, report: Report) -> "FoundReadout":
     return find_readout(source.followed_clips, source.rolling_camera, report, lens)
 
 
+def _shutter(found: "FoundReadout") -> Shutter:
+    """The shutter that was found, global where none is believed."""
+    said = _evidence(found)
+    origin = f"found in the video: {said}" if found.is_believed else said
+    return Shutter(found.readout, origin, found.left_open)
+
+
 def _evidence(found: "FoundReadout") -> str:
     """Why the readout is believed, or why a global shutter is."""
     if not math.isfinite(found.error):
@@ -223,10 +292,14 @@ def _evidence(found: "FoundReadout") -> str:
     return f"{found.clips} clips say {best:.1f} ms, standard error {error:.1f} ms"
 
 
-def _found(stage: str, progress: RunProgress, stop: Stop, find: Callable[[Report], F]) -> F | None:
-    """What is found; none after a request to stop."""
+def _found(
+    stage: str, progress: RunProgress, stop: Stop, find: Callable[[Report], F], n: int | None = None
+) -> F | None:
+    """What is found, in round ``n`` where there are several; none after a request to stop."""
 
     def report(fraction: float) -> None:
+        if n is not None:
+            fraction = 1 - (1 - _FIRST) ** n * (1 - _FIRST * fraction)
         progress.stage(stage, fraction)
         stop.check()
 

@@ -42,7 +42,7 @@ def swung(views: int, degrees: float) -> list[FlowMatch]:
 
 def test_a_barrel_is_found():
     flows = swung(8, 20.0)
-    tried = candidates(GUESS, radial=True)
+    tried = candidates(GUESS, radial=True, is_near=False)
     starts = [try_candidate(lens, flows, 3.0, radial=True) for lens in tried]
     for lens, start in zip(tried, starts, strict=True):
         if start is not None:
@@ -53,8 +53,12 @@ def test_a_barrel_is_found():
 
 
 def test_of_a_known_distortion_only_pinholes_are_tried():
-    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False))
-    assert {lens.camera.fx for lens in candidates(GUESS, radial=False)} > {GUESS.fx}
+    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False, is_near=False))
+    assert {lens.camera.fx for lens in candidates(GUESS, radial=False, is_near=False)} > {GUESS.fx}
+
+
+def test_near_what_was_found_no_other_is_tried():
+    assert candidates(GUESS, radial=True, is_near=True) == [RadialLens(GUESS)]
 
 
 def test_of_two_minima_the_lens_that_bends_as_lenses_do_counts():

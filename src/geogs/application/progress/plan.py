@@ -86,7 +86,7 @@ class RunPlan:
         matched = worked_on if fine or longer <= SMALL_IMAGE else worked_on / 4
         rendered = worked_on * min(self.config.mapping.render_long_edge / longer, 1.0) ** 2
         return RunCosts(
-            calibration=3.0 + 6.0 * worked_on,
+            calibration=3.0 + 9.0 * worked_on,
             shutter=0.7 * worked_on,
             frame=0.025 * worked_on,
             start=2.2 * worked_on,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.shared import SharedResult, solve_shared, usual_residual
+from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View
@@ -24,6 +24,9 @@ _STALE = 0.3
 """Pixels of median motion of the reprojection after which a pair is matched again."""
 _TOGETHER = 16
 """Pairs that are matched in one go."""
+_OPTIONS, _LEAST_DECREASE = replace(OPTIONS, iterations=60), 1e-6
+"""Of a turning camera focal length, bend and depths lie in one flat valley, along which each step
+gains little: whoever stops early stops where he began."""
 
 
 @dataclass
@@ -138,7 +141,7 @@ class GrowingBundle:
         """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
         block = LensBlock(self.lens, self.grid.pixels.cpu(), radial=radial)
         problem = self.problem()
-        result = solve_shared(problem, block)
+        result = solve_shared(problem, block, _OPTIONS, _LEAST_DECREASE)
         if not result.finite:
             return False
         self.result, self.lens = result, result.block.lens

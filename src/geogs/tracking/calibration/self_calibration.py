@@ -55,14 +55,15 @@ def self_calibrate(
     report: Report = lambda fraction: None,
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
+    is_near: bool = False,
 ) -> SelfCalibration:
     """Estimate the focal length, k1 and k2 if ``radial``, of the camera that took ``frames``.
 
     ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
-    is only one of several to start from. Flow is measured by the operator without a network.
-    Stretch after stretch of the video is asked until one tells. ``report`` is called with the
-    fraction done; what it raises passes through. Outside a ``mask`` nothing is matched, nor what is
-    quite black where ``black_is_masked``.
+    is only one of several to start from, unless it is known to be about right (``is_near``). Flow
+    is measured by the operator without a network. Stretch after stretch of the video is asked until
+    one tells. ``report`` is called with the fraction done; what it raises passes through. Outside a
+    ``mask`` nothing is matched, nor what is quite black where ``black_is_masked``.
     """
     small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
     size = small.width, small.height
@@ -74,7 +75,8 @@ def self_calibrate(
     gatherer = ViewGatherer(images, grid, operator)
     failures: list[str] = []
     while len(failures) < STRETCHES and not (failures and gatherer.is_over):
-        found = Stretch(grid, operator, gatherer, radial, _part_of(report, len(failures))).ask()
+        part = _part_of(report, len(failures))
+        found = Stretch(grid, operator, gatherer, radial, is_near, part).ask()
         if isinstance(found, str):
             failures.append(found)
             continue

@@ -39,10 +39,12 @@ class Stretch:
         operator: FlowOperator,
         gatherer: ViewGatherer,
         radial: bool,
+        is_near: bool,
         report: Report,
     ) -> None:
-        """``radial``: whether k1 and k2 are found, too."""
-        self.grid, self.operator, self.radial = grid, operator, radial
+        """``radial``: whether k1 and k2 are found, too; ``is_near``: whether the grid's camera is
+        known to be about right, so that no other is tried."""
+        self.grid, self.operator, self.radial, self.is_near = grid, operator, radial, is_near
         self._gatherer, self._report = gatherer, report
         self._views: list[View] = []
         self._done = 0.0
@@ -107,7 +109,7 @@ class Stretch:
         # One after the other: beside each other their many small operations wait for Python.
         starts = (
             try_candidate(lens, flows, self._min_parallax, self.radial)
-            for lens in candidates(camera, self.radial)
+            for lens in candidates(camera, self.radial, self.is_near)
         )
         found = [s for s in starts if s is not None]
         if not found:
