@@ -24,7 +24,7 @@ _STALE = 0.3
 """Pixels of median motion of the reprojection after which a pair is matched again."""
 _TOGETHER = 16
 """Pairs that are matched in one go."""
-_OPTIONS, _LEAST_DECREASE = replace(OPTIONS, iterations=60), 1e-6
+PATIENT, LEAST_DECREASE = replace(OPTIONS, iterations=60), 1e-6
 """Of a turning camera focal length, bend and depths lie in one flat valley, along which each step
 gains little: whoever stops early stops where he began."""
 
@@ -141,7 +141,7 @@ class GrowingBundle:
         """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
         block = LensBlock(self.lens, self.grid.pixels.cpu(), radial=radial)
         problem = self.problem()
-        result = solve_shared(problem, block, _OPTIONS, _LEAST_DECREASE)
+        result = solve_shared(problem, block, PATIENT, LEAST_DECREASE)
         if not result.finite:
             return False
         self.result, self.lens = result, result.block.lens
