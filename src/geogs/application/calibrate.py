@@ -63,7 +63,7 @@ def self_calibrated(
     """The source with its focal length refined, if that is a guess or nominal and may be refined.
 
     Where the video does not tell, or after a request to stop, the guess stays and ``progress``
-    says so.
+    says so. Where rows do not roll by the lens that was found, the shutter is known, too.
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
     if not (config.calibration.refine and source.is_calibration_open):
