@@ -29,8 +29,6 @@ LENS_ROUNDS = 3
 """Times that a lens is asked for, at most, each time with rows rectified by the one before."""
 SETTLED = 2.0
 """Deviations that a lens moves by, at most, from one round to the last one."""
-_FIRST = 0.6
-"""Part of what is left that a round takes, as shown."""
 
 
 def without_overlay(source: Source, progress: RunProgress | None = None) -> Source:
@@ -105,8 +103,8 @@ def _by_rectified_rows(
         if n and not (rolls or rolled):
             return rectified
         images = rectified if rolls else calibrated
-        ask = partial(_self_calibration, images, radial, device, n > 0)
-        found = _found("calibration", progress, stop, ask, n)
+        ask = partial(_self_calibration, images, radial, device, n)
+        found = _found("calibration", progress, stop, ask)
         if found is None or (n and found.failure is not None):
             return known
         before, found = calibrated.calibration, _of_stored(found, calibrated, source)
@@ -133,27 +131,29 @@ def _of_stored(found: "SelfCalibration", straight: Source, source: Source) -> "S
     camera, (k1, k2, *_) = with_bend(
         before.camera(), before.distortion, before.lens, bend or (0.0, 0.0), factor
     )
-    factor = camera.fx / source.calibration.fx
+    working = source.camera.fx * camera.fx / source.calibration.fx
     return replace(
-        found, camera=source.camera.with_focal(factor * source.camera.fx),
+        found, camera=source.camera.with_focal(working),
         distortion=None if bend is None else (k1, k2),
     )  # fmt: skip
 
 
 def _self_calibration(
-    source: Source, radial: bool, device: str | torch.device, is_near: bool, report: Report
+    source: Source, radial: bool, device: str | torch.device, n: int, report: Report
 ) -> "SelfCalibration":
-    """What the images tell; where they do not bear out a lens that is said to be near, of any."""
-    from geogs.tracking.calibration.self_calibration import self_calibrate
+    """What the images tell in round ``n``: after the first one of a lens near the one before, and
+    where they do not bear that out, of any."""
+    from geogs.tracking.calibration.self_calibration import part_of, self_calibrate
 
-    with closing(source.linked_frames()) as frames:
-        found = self_calibrate(
-            frames, source.camera, radial, device, report, source.mask, source.black_is_masked,
-            is_near,
-        )  # fmt: skip
-    if found.failure is None or not is_near:
-        return found
-    return _self_calibration(source, radial, device, False, report)
+    def told(is_near: bool) -> "SelfCalibration":
+        with closing(source.linked_frames()) as frames:
+            return self_calibrate(
+                frames, source.camera, radial, device, part_of(report, n), source.mask,
+                source.black_is_masked, is_near,
+            )  # fmt: skip
+
+    found = told(n > 0)
+    return told(False) if n > 0 and found.failure is not None else found
 
 
 def refined(
@@ -258,11 +258,13 @@ def _with_rows_rectified(
 ) -> Source | None:
     """The source with its rows rectified by its lens as it is known before round ``n``; none after
     a request to stop."""
+    from geogs.tracking.calibration.self_calibration import part_of
+
     if not source.is_shutter_open:
         return source
     found = _found(
         "calibration", progress, stop,
-        lambda report: _readout(source, lambda fraction: report(0.0)), n,
+        lambda report: _readout(source, lambda fraction: part_of(report, n)(0.0)),
     )  # fmt: skip
     return None if found is None else source.with_shutter(_shutter(found))
 
@@ -292,14 +294,10 @@ def _evidence(found: "FoundReadout") -> str:
     return f"{found.clips} clips say {best:.1f} ms, standard error {error:.1f} ms"
 
 
-def _found(
-    stage: str, progress: RunProgress, stop: Stop, find: Callable[[Report], F], n: int | None = None
-) -> F | None:
-    """What is found, in round ``n`` where there are several; none after a request to stop."""
+def _found(stage: str, progress: RunProgress, stop: Stop, find: Callable[[Report], F]) -> F | None:
+    """What is found; none after a request to stop."""
 
     def report(fraction: float) -> None:
-        if n is not None:
-            fraction = 1 - (1 - _FIRST) ** n * (1 - _FIRST * fraction)
         progress.stage(stage, fraction)
         stop.check()
 

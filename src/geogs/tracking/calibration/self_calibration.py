@@ -75,7 +75,7 @@ def self_calibrate(
     gatherer = ViewGatherer(images, grid, operator)
     failures: list[str] = []
     while len(failures) < STRETCHES and not (failures and gatherer.is_over):
-        part = _part_of(report, len(failures))
+        part = part_of(report, len(failures))
         found = Stretch(grid, operator, gatherer, radial, is_near, part).ask()
         if isinstance(found, str):
             failures.append(found)
@@ -93,6 +93,6 @@ def self_calibrate(
     return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
 
 
-def _part_of(report: Report, n: int) -> Report:
-    """Report the n-th stretch as half of what is left, as nobody knows whether there is another."""
+def part_of(report: Report, n: int) -> Report:
+    """Report the n-th part as half of what is left, as nobody knows whether there is another."""
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
