@@ -81,7 +81,12 @@ def _name(settings: BenchOptions) -> str:
 
 def listing() -> str:
     """Which benchmarks there are, what data each needs and where that comes from."""
-    lines = []
+    lines = [
+        "board",
+        "  The whole on one page: commands on fixed sequences, three seeds each, beside a record",
+        "  needs: nothing; data sets below a folder make more rows",
+        "  from:  geogs synth",
+    ]
     for benchmark in BENCHMARKS.values():
         lines += [benchmark.name, f"  {benchmark.title}", f"  needs: {benchmark.needs}"]
         lines += [f"  from:  {benchmark.source}"]

@@ -23,7 +23,7 @@ class BenchOptions(Settings):
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/bench-NAME if none is given."""
     scenes: str = ""
-    """Only these scenes, by their names with commas between."""
+    """Only these scenes, or rows of the board, by their names with commas between."""
     variants: str = ""
     """Only these variants of an ablation, with commas between."""
     known_poses: bool = False
@@ -46,6 +46,8 @@ class BenchOptions(Settings):
     """Any option of geogs run or geogs reconstruct (--set mapping.iterations=12); repeatable."""
     result: Path | None = None
     """Edges: score this result of the one sequence DATA, and run nothing."""
+    against: Path | None = None
+    """Board: a record of earlier, beside which to say what is worse and better than noise."""
     fresh: bool = False
     """Run everything again."""
     rescore: bool = False

@@ -24,11 +24,33 @@ def main(argv: Sequence[str]) -> int:
     if options.name == "list":
         print(listing())
         return 0
+    if options.name == "board":
+        return _board(options)
     done = bench(options, lambda text: print(text, file=sys.stderr, flush=True))
     for table in _tables(done):
         Console().print(table)
     print(f"Results are in {done.output}/ (results.md, results.json, report/index.html)")
     return 2 if not done.records or any(record.error for record in done.records) else 0
+
+
+def _board(options: BenchOptions) -> int:
+    """Run the board; 2 where a command failed, 1 where something is worse than noise, else 0."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from geogs_bench.board.board import board
+    from geogs_bench.board.board_table import cells, header
+
+    done, changes = board(options, lambda text: print(text, file=sys.stderr, flush=True))
+    table = Table(*header(), title="The board")
+    for row in done.rows:
+        table.add_row(*cells(row))
+    Console().print(table)
+    for line in changes:
+        print(line)
+    if any(row.failures for row in done.rows):
+        return 2
+    return 1 if any(change.is_worse for change in changes) else 0
 
 
 def _tables(done: "BenchResult") -> "list[Table]":

@@ -1,0 +1,1 @@
+"""The board: whole commands on fixed footage, one row each, beside what they reached before."""

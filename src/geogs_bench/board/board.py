@@ -1,0 +1,217 @@
+"""Runs the rows of the board and writes what they reached."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+from geogs.documents import read_json
+from geogs.errors import GeogsError, InputError
+from geogs.gpu.installation import require_device
+from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.threads import available_cores
+from geogs_bench.bench_options import BenchOptions
+from geogs_bench.board import footage as sequences
+from geogs_bench.board.board_record import (
+    BoardRecord,
+    Outcome,
+    RowRecord,
+    read_board,
+    write_board,
+)
+from geogs_bench.board.board_table import markdown
+from geogs_bench.board.commands import environment, run_geogs
+from geogs_bench.board.comparison import Difference, compare
+from geogs_bench.board.reference import reference_seconds
+from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
+from geogs_bench.board.scores import with_scores
+from geogs_bench.machine import machine_name, program_version
+from geogs_bench.results.record import read_dataclass, write_json
+
+RECORD = "board.json"
+_OUTCOME = "outcome.json"
+_OPTIONS = ("name", "data", "output", "scenes", "device", "against", "fresh")
+_CORES_FOR_ONE = 4
+"""Cores for each command beside a GPU; a command without one gets a core."""
+
+
+@dataclass
+class Board:
+    """The rows that were asked for, on a device, into a folder."""
+
+    output: Path
+    device: str
+    data: Path | None
+    chosen: tuple[Row, ...]
+    on_gpu: bool
+    fresh: bool
+    say: Callable[[str], None]
+    commit: str = field(default_factory=program_version)
+    unit: float = field(default_factory=reference_seconds)
+
+    def run(self) -> BoardRecord:
+        """Run what has not been run at this commit, and write the record.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        self._begin = time.perf_counter()
+        self._lock = threading.Lock()
+        self._done = 0
+        places = self._places()
+        found = {row.name: row for row in self.chosen if row.footage in places}
+        jobs = [(row, seed) for row in found.values() for seed in SEEDS]
+        self._jobs = len(jobs)
+        outcomes: dict[tuple[str, int], Outcome] = {}
+        alone = [job for job in jobs if job[0].runs_alone]
+        with ThreadPoolExecutor(self.side_by_side) as pool:
+            try:
+                beside = [job for job in jobs if not job[0].runs_alone]
+                made = pool.map(lambda job: self._outcome(*job, places[job[0].footage]), beside)
+                outcomes |= {(r.name, s): o for (r, s), o in zip(beside, made, strict=True)}
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        for row, seed in alone:
+            outcomes[row.name, seed] = self._outcome(row, seed, places[row.footage])
+        measured = tuple(
+            RowRecord(
+                row.name,
+                f"geogs {row.command}",
+                row.runs_alone,
+                tuple(outcomes[row.name, seed] for seed in SEEDS),
+            )
+            for row in found.values()
+        )
+        record = BoardRecord(
+            self.commit,
+            machine_name(),
+            self.device,
+            round(self.unit, 4),
+            self.side_by_side,
+            round((time.perf_counter() - self._begin) / 60, 1),
+            measured,
+        )
+        write_board(self.output / RECORD, record)
+        return record
+
+    @property
+    def side_by_side(self) -> int:
+        """Commands at a time, of those that do not run alone."""
+        return max(1, available_cores() // (_CORES_FOR_ONE if self.on_gpu else 1))
+
+    def _places(self) -> dict[str, sequences.FootagePlace]:
+        """The sequences of all rows; those that the user does not have are said."""
+        wanted = {row.footage for row in self.chosen}
+        found = {}
+        for footage in FOOTAGE:
+            if footage.name in wanted:
+                root = prepare_output_folder(self.output / "footage")
+                found[footage.name] = sequences.render(footage, root, self.on_gpu, self.say)
+        for kept in KEPT:
+            if kept.name in wanted:
+                place = sequences.find(kept, self.data, self.on_gpu)
+                if place is None:
+                    self.say(f"left out: {kept.name}, as there is no {kept.folder}")
+                else:
+                    found[kept.name] = place
+        return found
+
+    def _outcome(self, row: Row, seed: int, place: sequences.FootagePlace) -> Outcome:
+        """Run a command and measure its result; what was measured before is read."""
+        folder = self.output / row.name / f"seed-{seed}"
+        before = None if self.fresh else self._measured_before(folder)
+        if before is not None:
+            return self._report(row, seed, before)
+        prepare_output_folder(folder)
+        command = [*row.command.format(**place.words).split(), *place.options.split()]
+        command += ["-o", str(folder / "result"), "--device", self.device, "--seed", str(seed)]
+        if seed and row.command.startswith("run"):
+            command += ["--start", str(seed)]
+        spent = run_geogs(command, folder / "log.txt", environment(row.has_empty_cache, folder))
+        outcome = Outcome(
+            cost=spent.processor_seconds / self.unit,
+            seconds=spent.seconds,
+            memory=spent.memory_bytes / 1e6,
+        )
+        if spent.code:
+            outcome = replace(outcome, error=spent.last_line or f"exit code {spent.code}")
+        else:
+            start = seed if "--start" in command else 0
+            outcome = self._scored(outcome, folder / "result", place, start)
+        write_json(folder / _OUTCOME, outcome)
+        write_text(folder / "commit.txt", self.commit)
+        return self._report(row, seed, outcome)
+
+    def _scored(
+        self, outcome: Outcome, folder: Path, place: sequences.FootagePlace, start: int
+    ) -> Outcome:
+        with self._lock:  # evaluations use all cores, one is enough at a time
+            try:
+                return with_scores(outcome, folder, place.folder, place.frames - start)
+            except GeogsError as error:
+                return replace(outcome, error=str(error))
+
+    def _measured_before(self, folder: Path) -> Outcome | None:
+        """The outcome of an earlier call at the same commit, if nothing was changed since."""
+        mark = folder / "commit.txt"
+        if self.commit.endswith("+") or not mark.is_file() or mark.read_text() != self.commit:
+            return None
+        return read_dataclass(Outcome, read_json(folder / _OUTCOME))
+
+    def _report(self, row: Row, seed: int, outcome: Outcome) -> Outcome:
+        with self._lock:
+            self._done += 1
+            passed = (time.perf_counter() - self._begin) / 60
+            left = passed / self._done * (self._jobs - self._done)
+            said = f"failed: {outcome.error}" if outcome.error else f"{outcome.seconds:.0f} s"
+            self.say(
+                f"[{self._done}/{self._jobs}] {row.name}, seed {seed}: {said}; "
+                f"about {left:.0f} min left"
+            )
+        return outcome
+
+
+def board(
+    options: BenchOptions, say: Callable[[str], None]
+) -> tuple[BoardRecord, list[Difference]]:
+    """Run the board as the options ask; what has changed since the record they name.
+
+    Raises:
+        InputError: an option is wrong, or the record cannot be read; found before anything is run.
+        OutputError: the folder cannot be written.
+    """
+    device = require_device(options.device)
+    on_gpu = device.type == "cuda"
+    _refuse_others(options)
+    before = None if options.against is None else read_board(options.against)
+    output = options.output or Path("out") / "bench-board"
+    chosen = _chosen(options.scenes, rows(on_gpu))
+    prepare_output_folder(output)
+    data = options.data and options.data.expanduser()
+    done = Board(output, str(device), data, chosen, on_gpu, options.fresh, say).run()
+    changes = [] if before is None else compare(before, done)
+    write_text(output / "board.md", markdown(done, changes))
+    return done, changes
+
+
+def _refuse_others(options: BenchOptions) -> None:
+    """Raises InputError where an option is given that the board has no use for."""
+    usual = BenchOptions(options.name)
+    for known in fields(BenchOptions):
+        if known.name not in _OPTIONS and getattr(options, known.name) != getattr(
+            usual, known.name
+        ):
+            raise InputError(f"--{known.name.replace('_', '-')} is not for the board.")
+
+
+def _chosen(names: str, known: Sequence[Row]) -> tuple[Row, ...]:
+    """The rows of these names, all if none is named."""
+    wanted = [name.strip() for name in names.split(",") if name.strip()]
+    if strangers := [name for name in wanted if name not in {row.name for row in known}]:
+        raise InputError(
+            f"the board has no row {strangers[0]}; choose of {', '.join(r.name for r in known)}."
+        )
+    return tuple(row for row in known if not wanted or row.name in wanted)

@@ -1,0 +1,125 @@
+"""A board beside an earlier one: what is worse, and what is better, by more than its noise."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from geogs_bench.board.board_record import BoardRecord, RowRecord
+
+_T = 4.6
+"""Student's t for four degrees of freedom (three seeds before, three now), at which a difference
+that is none is called one in one of a hundred comparisons."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A column of the board."""
+
+    name: str
+    """Of the attribute of an outcome."""
+    title: str
+    digits: int
+    better: Literal["more", "less", "neither"]
+    least: float = 0.0
+    """Differences below this do not count, however small the noise."""
+    least_ratio: float = 0.0
+    """The same as a fraction of the value before."""
+
+
+FIGURES = (
+    Figure("placed", "placed %", 0, "more", least=1.0),
+    Figure("ate", "ATE cm", 3, "less", least_ratio=0.05),
+    Figure("error_per_sigma", "error/σ", 2, "neither"),
+    Figure("reliable", "reliable", 2, "neither"),
+    Figure("misjudged", "misjudged", 2, "less", least=0.3),
+    Figure("accuracy", "Acc cm", 2, "less", least_ratio=0.02),
+    Figure("completeness", "Comp.Rat %", 1, "more", least=0.2),
+    Figure("f_score", "F %", 1, "more", least=0.2),
+    Figure("online_accuracy", "online Acc", 2, "less", least_ratio=0.02),
+    Figure("online_completeness", "online Comp.Rat", 1, "more", least=0.2),
+    Figure("online_f_score", "online F", 1, "more", least=0.2),
+    Figure("cost", "cost", 1, "less", least_ratio=0.05),
+    Figure("seconds", "s", 1, "less", least_ratio=0.1),
+    Figure("memory", "MB", 0, "less", least_ratio=0.05),
+    Figure("disks", "disks", 0, "neither"),
+    Figure("triangles", "triangles", 0, "neither"),
+)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A figure of a row that has changed by more than its noise."""
+
+    row: str
+    figure: Figure
+    before: float
+    now: float
+    noise: float
+    """What the difference had to exceed."""
+    is_worse: bool
+
+    def __str__(self) -> str:
+        digits = self.figure.digits
+        word = "worse" if self.is_worse else "better"
+        return (
+            f"{word}: {self.row}, {self.figure.title}: {self.before:.{digits}f} -> "
+            f"{self.now:.{digits}f} (noise {self.noise:.{max(digits, 1)}f})"
+        )
+
+
+def compare(before: BoardRecord, now: BoardRecord) -> list[Difference]:
+    """What has changed by more than its noise, what is worse first."""
+    found = [
+        difference
+        for row in now.rows
+        if (earlier := before.row(row.name)) is not None
+        for difference in _differences(earlier, row, _has_same_clock(before, now, row))
+    ]
+    return sorted(found, key=lambda difference: not difference.is_worse)
+
+
+def _has_same_clock(before: BoardRecord, now: BoardRecord, row: RowRecord) -> bool:
+    """Whether seconds on the wall can be compared."""
+    is_alike = before.side_by_side == now.side_by_side or row.runs_alone
+    return before.machine == now.machine and before.device == now.device and is_alike
+
+
+def _differences(before: RowRecord, now: RowRecord, same_clock: bool) -> Iterator[Difference]:
+    if len(now.failures) > len(before.failures):
+        failures = Figure("failures", "commands that failed", 0, "less")
+        yield Difference(
+            now.name, failures, len(before.failures), len(now.failures), 0.0, is_worse=True
+        )
+    for figure in FIGURES:
+        if figure.better == "neither" or (figure.name == "seconds" and not same_clock):
+            continue
+        difference = _difference(
+            now.name, figure, before.values(figure.name), now.values(figure.name)
+        )
+        if difference is not None:
+            yield difference
+
+
+def _difference(
+    row: str, figure: Figure, before: Sequence[float], now: Sequence[float]
+) -> Difference | None:
+    """By Student's t test, and more than the figure's least difference."""
+    if not before or not now:
+        return None
+    was = float(np.mean(before))
+    is_now = float(np.mean(now))
+    spread = math.sqrt((_squares(before) + _squares(now)) / max(len(before) + len(now) - 2, 1))
+    noise = _T * spread * math.sqrt(1 / len(before) + 1 / len(now))
+    noise = max(noise, figure.least, figure.least_ratio * abs(was))
+    if abs(is_now - was) <= noise:
+        return None
+    is_more = is_now > was
+    return Difference(row, figure, was, is_now, noise, is_more != (figure.better == "more"))
+
+
+def _squares(values: Sequence[float]) -> float:
+    """Sum of squared differences from the mean."""
+    return float(np.square(np.asarray(values) - np.mean(values)).sum())

@@ -1,0 +1,120 @@
+"""What the commands of the board see: synthetic sequences of fixed seeds, and data sets."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from geogs.evaluation.true_scene import read_true_scene
+from geogs.io.writers.atomic import write_text
+from geogs.threads import available_cores
+from geogs_synth.camera.flaws import CameraKind, camera_flaws
+from geogs_synth.motion.motion_kinds import MotionKind
+from geogs_synth.sequence.replica_files import write_sequence
+
+_MARK = "footage.txt"
+"""Written last, so that a sequence which was cut off, or is another by now, is made again."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Frames of a sequence, and their pixels."""
+
+    frames: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A sequence of ``geogs synth``."""
+
+    name: str
+    motion: MotionKind
+    camera: CameraKind
+    seed: int
+    on_cpu: Size
+    on_gpu: Size
+    gap: tuple[float, float] = (0.0, 0.0)
+    """Fractions of the frames between which there are none: the camera was paused."""
+
+
+@dataclass(frozen=True)
+class KeptFootage:
+    """A sequence of a data set, below the folder that the user gives."""
+
+    name: str
+    folder: str
+    on_cpu: str
+    """Options that make it small enough for two cores."""
+    on_gpu: str = ""
+
+
+@dataclass(frozen=True)
+class FootagePlace:
+    """Where a sequence lies."""
+
+    folder: Path
+    frames: int
+    options: str = ""
+    """What commands are given on it."""
+
+    @property
+    def words(self) -> dict[str, str]:
+        """What stands for the names in a command's template."""
+        return {
+            "folder": str(self.folder),
+            "video": str(self.folder / "video.mp4"),
+            "camera": str(self.folder / "cam_params.json"),
+        }
+
+
+def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None]) -> FootagePlace:
+    """Write a sequence below ``root`` unless it is there.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    size = footage.on_gpu if on_gpu else footage.on_cpu
+    folder, made_of = root / footage.name, repr(replace(footage, on_cpu=size, on_gpu=size))
+    missing = [i for i in range(size.frames) if _is_missing(i / size.frames, footage)]
+    place = FootagePlace(folder, size.frames - len(missing))
+    if (folder / _MARK).is_file() and (folder / _MARK).read_text() == made_of:
+        return place
+    say(f"rendering {footage.name}")
+    write_sequence(
+        folder, size.frames, size.width, size.height, footage.seed,
+        motion=footage.motion, flaws=camera_flaws(footage.camera),
+        depth=False, video=True, threads=available_cores(),
+    )  # fmt: skip
+    _cut(folder, missing)
+    write_text(folder / _MARK, made_of)
+    return place
+
+
+def find(footage: KeptFootage, root: Path | None, on_gpu: bool) -> FootagePlace | None:
+    """A sequence of a data set below ``root``; none where it is not there."""
+    folder = None if root is None else root / footage.folder
+    if folder is None or not folder.is_dir():
+        return None
+    options = footage.on_gpu if on_gpu else footage.on_cpu
+    frames = len(read_true_scene(folder).trajectory.timestamps)
+    words = options.split()
+    if "--stop" in words:
+        frames = min(frames, int(words[words.index("--stop") + 1]))
+    return FootagePlace(folder, frames, options)
+
+
+def _is_missing(moment: float, footage: Footage) -> bool:
+    begin, end = footage.gap
+    return begin <= moment < end
+
+
+def _cut(folder: Path, missing: list[int]) -> None:
+    """Take frames out of a sequence that lists its images with their times."""
+    names = {f"frame{index:06d}.jpg" for index in missing}
+    for name in names:
+        (folder / "results" / name).unlink()
+    if names:
+        lines = (folder / "rgb.txt").read_text().splitlines(keepends=True)
+        kept = (line for line in lines if Path(line.split()[-1]).name not in names)
+        write_text(folder / "rgb.txt", "".join(kept))

@@ -1,0 +1,35 @@
+"""A fixed computation, by whose time those of commands are divided."""
+
+import time
+
+import cv2
+import numpy as np
+
+ROUNDS = 3
+
+
+def reference_seconds() -> float:
+    """Seconds of the processor that it takes, the least of a few rounds.
+
+    A mix of sorting, products of matrices, functions of arrays and filters of images, none of it
+    ours; so neither the speed of a machine nor what else it does matters much for ratios to it.
+    """
+    return min(_once() for _ in range(ROUNDS))
+
+
+def _once() -> float:
+    random = np.random.default_rng(0)
+    numbers = random.random(2_000_000, np.float32)
+    matrices = random.random((64, 160, 160), np.float32)
+    picture = random.integers(0, 256, (960, 1280, 3), np.uint8)
+    rows = numbers[: 640 * 480].reshape(480, 640) * 900
+    columns = numbers[-640 * 480 :].reshape(480, 640) * 900
+    start = time.thread_time()
+    for _ in range(2):
+        order = np.argsort(numbers, kind="stable")
+        np.exp(-numbers[order]).cumsum()
+        (matrices @ matrices.transpose(0, 2, 1)).sum()
+        for _ in range(4):
+            cv2.GaussianBlur(picture, (9, 9), 2.0)
+            cv2.remap(picture, rows, columns, cv2.INTER_LINEAR)
+    return time.thread_time() - start

@@ -1,0 +1,92 @@
+"""The rows of the board: which commands are run on which footage."""
+
+from dataclasses import dataclass
+
+from geogs_bench.board.footage import Footage, KeptFootage, Size
+
+SEEDS = (0, 1, 2)
+"""Each command is run once by each: with this seed, and on images from that number on, so that
+tracking and mapping both come out a little different."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A command on a sequence."""
+
+    name: str
+    """Also that of its folder."""
+    footage: str
+    command: str
+    """As a user types it, without the output and the device; ``{folder}``, ``{video}`` and
+    ``{camera}`` stand for the files of the sequence."""
+    runs_alone: bool = False
+    """Whether nothing else is run beside it, as its result depends on how long things take."""
+    has_empty_cache: bool = False
+    """Whether it finds nothing compiled."""
+
+
+_QUARTER = Size(48, 192, 144)
+_FULL = Size(200, 480, 360)
+
+FOOTAGE = (
+    Footage("handheld-kinect", "handheld", "kinect", 31, _QUARTER, _FULL),
+    Footage("turning-60", "turning-60", "clean", 32, _QUARTER, _FULL),
+    Footage("walking-phone", "walking", "phone", 33, _QUARTER, _FULL),
+    Footage("street", "driving", "clean", 34, Size(48, 320, 97), Size(120, 800, 242)),
+    Footage("corridor", "corridor", "kinect", 35, _QUARTER, _FULL),
+    Footage("weak-link", "handheld-5hz", "phone", 36, Size(44, 192, 144), Size(80, 480, 360),
+            gap=(0.5, 0.6)),
+    Footage("dining", "dining", "clean", 37, _QUARTER, Size(400, 600, 340)),
+    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(44, 192, 144), Size(44, 192, 144)),
+)  # fmt: skip
+"""Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
+
+KEPT = (
+    KeptFootage("staircase", "rooms/staircase", "--stop 48 --long-edge 192", ""),
+    KeptFootage("living-room-light", "rooms/living-room-2-light", "--stop 48 --long-edge 192"),
+    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 192"),
+    KeptFootage("fountain", "real/fountain", "--long-edge 192"),
+)
+"""Sequences that the user may have."""
+
+_SITUATIONS = (
+    Row("kinect", "handheld-kinect", "run {folder}"),
+    Row("turning-60", "turning-60", "run {folder}"),
+    Row("walking", "walking-phone", "run {folder}"),
+    Row("street", "street", "run {folder}"),
+    Row("corridor", "corridor", "run {folder}"),
+    Row("weak-link", "weak-link", "run {folder}"),
+    Row("dining", "dining", "run {folder}"),
+    Row("no-lens", "walking-phone", "run {video}"),
+)
+_WAYS = (
+    Row("fast", "dining", "run {folder} --preset fast"),
+    Row("accurate", "dining", "run {folder} --preset accurate"),
+    Row("paper", "dining", "run {folder} --preset paper"),
+    Row("own", "dining", "run {folder} --tracking.operator own"),
+    Row("online-results", "dining", "run {folder} --online-results"),
+    Row("offline", "dining", "run {folder} --offline"),
+    Row("posed", "dining", "reconstruct {folder}"),
+    Row("posed-paper", "dining", "reconstruct {folder} --preset paper"),
+)
+_TIMED = (
+    Row("posed-10s", "dining", "reconstruct {folder} --budget 10s", runs_alone=True),
+    Row("posed-20s", "dining", "reconstruct {folder} --budget 20s", runs_alone=True),
+    Row("first-command", "handheld-kinect", "run {folder}", runs_alone=True, has_empty_cache=True),
+)
+_LIVE_ON_CPU = Row(
+    "live-5hz", "slow-stream", "run play:{video} --intrinsics {camera}", runs_alone=True
+)
+_LIVE_ON_GPU = Row("live-30hz", "dining", "run play:{video} --intrinsics {camera}", runs_alone=True)
+_KEPT = (
+    Row("staircase", "staircase", "run {folder}"),
+    Row("changing-light", "living-room-light", "run {folder}"),
+    Row("kitchen", "kitchen", "run {folder}"),
+    Row("fountain", "fountain", "reconstruct {folder}"),
+)
+
+
+def rows(on_gpu: bool) -> tuple[Row, ...]:
+    """All rows; those that run alone come last."""
+    live = _LIVE_ON_GPU if on_gpu else _LIVE_ON_CPU
+    return (*_SITUATIONS, *_WAYS, *_KEPT, *_TIMED, live)
