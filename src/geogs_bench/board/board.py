@@ -1,5 +1,6 @@
 """Runs the rows of the board and writes what they reached."""
 
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -32,9 +33,19 @@ from geogs_bench.results.record import read_dataclass, write_json
 
 RECORD = "board.json"
 _OUTCOME = "outcome.json"
+_COMMIT = "commit.txt"
 _OPTIONS = ("name", "data", "output", "scenes", "device", "against", "fresh")
 _CORES_FOR_ONE = 4
 """Cores for each command beside a GPU; a command without one gets a core."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A command by one seed."""
+
+    row: Row
+    seed: int
+    place: sequences.FootagePlace
 
 
 @dataclass
@@ -50,6 +61,10 @@ class Board:
     say: Callable[[str], None]
     commit: str = field(default_factory=program_version)
     unit: float = field(default_factory=reference_seconds)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _begin: float = 0.0
+    _jobs: int = 0
+    _done: int = 0
 
     def run(self) -> BoardRecord:
         """Run what has not been run at this commit, and write the record.
@@ -58,32 +73,28 @@ class Board:
             OutputError: the folder cannot be written.
         """
         self._begin = time.perf_counter()
-        self._lock = threading.Lock()
-        self._done = 0
         places = self._places()
-        found = {row.name: row for row in self.chosen if row.footage in places}
-        jobs = [(row, seed) for row in found.values() for seed in SEEDS]
+        found = [row for row in self.chosen if row.footage in places]
+        jobs = [_Job(row, seed, places[row.footage]) for row in found for seed in SEEDS]
         self._jobs = len(jobs)
-        outcomes: dict[tuple[str, int], Outcome] = {}
-        alone = [job for job in jobs if job[0].runs_alone]
+        beside = [job for job in jobs if not job.row.runs_alone]
+        alone = [job for job in jobs if job.row.runs_alone]
+        outcomes: dict[_Job, Outcome] = {}
         with ThreadPoolExecutor(self.side_by_side) as pool:
             try:
-                beside = [job for job in jobs if not job[0].runs_alone]
-                made = pool.map(lambda job: self._outcome(*job, places[job[0].footage]), beside)
-                outcomes |= {(r.name, s): o for (r, s), o in zip(beside, made, strict=True)}
+                outcomes |= zip(beside, pool.map(self._outcome, beside), strict=True)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        for row, seed in alone:
-            outcomes[row.name, seed] = self._outcome(row, seed, places[row.footage])
+        outcomes |= zip(alone, map(self._outcome, alone), strict=True)
         measured = tuple(
             RowRecord(
                 row.name,
                 f"geogs {row.command}",
                 row.runs_alone,
-                tuple(outcomes[row.name, seed] for seed in SEEDS),
+                tuple(outcomes[_Job(row, seed, places[row.footage])] for seed in SEEDS),
             )
-            for row in found.values()
+            for row in found
         )
         record = BoardRecord(
             self.commit,
@@ -119,59 +130,60 @@ class Board:
                     found[kept.name] = place
         return found
 
-    def _outcome(self, row: Row, seed: int, place: sequences.FootagePlace) -> Outcome:
+    def _outcome(self, job: _Job) -> Outcome:
         """Run a command and measure its result; what was measured before is read."""
-        folder = self.output / row.name / f"seed-{seed}"
-        before = None if self.fresh else self._measured_before(folder)
-        if before is not None:
-            return self._report(row, seed, before)
-        prepare_output_folder(folder)
+        folder = self.output / job.row.name / f"seed-{job.seed}"
+        outcome = None if self.fresh else self._measured_before(folder)
+        if outcome is None:
+            prepare_output_folder(folder)
+            outcome = self._measured(job, folder)
+            write_json(folder / _OUTCOME, outcome)
+            write_text(folder / _COMMIT, self.commit)
+        self._report(job, outcome)
+        return outcome
+
+    def _measured(self, job: _Job, folder: Path) -> Outcome:
+        """Run a command, and compare its result with the truth."""
+        row, place = job.row, job.place
+        start = job.seed if row.command.startswith("run") else 0
+        result = folder / "result"
         command = [*row.command.format(**place.words).split(), *place.options.split()]
-        command += ["-o", str(folder / "result"), "--device", self.device, "--seed", str(seed)]
-        if seed and row.command.startswith("run"):
-            command += ["--start", str(seed)]
-        spent = run_geogs(command, folder / "log.txt", environment(row.has_empty_cache, folder))
+        command += ["-o", str(result), "--device", self.device, "--seed", str(job.seed)]
+        command += ["--start", str(start)] if start else []
+        with tempfile.TemporaryDirectory() as scratch:
+            spent = run_geogs(
+                command, folder / "log.txt", environment(row.has_empty_cache, Path(scratch))
+            )
         outcome = Outcome(
             cost=spent.processor_seconds / self.unit,
             seconds=spent.seconds,
             memory=spent.memory_bytes / 1e6,
         )
         if spent.code:
-            outcome = replace(outcome, error=spent.last_line or f"exit code {spent.code}")
-        else:
-            start = seed if "--start" in command else 0
-            outcome = self._scored(outcome, folder / "result", place, start)
-        write_json(folder / _OUTCOME, outcome)
-        write_text(folder / "commit.txt", self.commit)
-        return self._report(row, seed, outcome)
-
-    def _scored(
-        self, outcome: Outcome, folder: Path, place: sequences.FootagePlace, start: int
-    ) -> Outcome:
-        with self._lock:  # evaluations use all cores, one is enough at a time
+            return replace(outcome, error=spent.last_line or f"exit code {spent.code}")
+        with self._lock:  # an evaluation uses all cores
             try:
-                return with_scores(outcome, folder, place.folder, place.frames - start)
+                return with_scores(outcome, result, place.folder, place.frames - start)
             except GeogsError as error:
                 return replace(outcome, error=str(error))
 
     def _measured_before(self, folder: Path) -> Outcome | None:
         """The outcome of an earlier call at the same commit, if nothing was changed since."""
-        mark = folder / "commit.txt"
+        mark = folder / _COMMIT
         if self.commit.endswith("+") or not mark.is_file() or mark.read_text() != self.commit:
             return None
         return read_dataclass(Outcome, read_json(folder / _OUTCOME))
 
-    def _report(self, row: Row, seed: int, outcome: Outcome) -> Outcome:
+    def _report(self, job: _Job, outcome: Outcome) -> None:
         with self._lock:
             self._done += 1
             passed = (time.perf_counter() - self._begin) / 60
             left = passed / self._done * (self._jobs - self._done)
             said = f"failed: {outcome.error}" if outcome.error else f"{outcome.seconds:.0f} s"
             self.say(
-                f"[{self._done}/{self._jobs}] {row.name}, seed {seed}: {said}; "
+                f"[{self._done}/{self._jobs}] {job.row.name}, seed {job.seed}: {said}; "
                 f"about {left:.0f} min left"
             )
-        return outcome
 
 
 def board(

@@ -25,18 +25,14 @@ def markdown(board: BoardRecord, changes: Sequence[Difference]) -> str:
         "# The board",
         "",
         f"geogs {board.commit}; {board.machine}; {board.device}; {board.side_by_side} commands "
-        f"at a time; {board.minutes:.0f} minutes. Means over three seeds ± their standard deviation; "
-        "cost: seconds of the processor over those of a fixed computation.",
+        f"at a time; {board.minutes:.0f} minutes. Means over three seeds ± their standard "
+        "deviation; cost: seconds of the processor over those of a fixed computation.",
         "",
         f"| {' | '.join(header())} |",
         f"|---|{'---:|' * len(FIGURES)}",
         *(f"| {' | '.join(cells(row))} |" for row in board.rows),
         "",
-        *(
-            f"- {row.name}: {reason}"
-            for row in board.rows
-            for reason in dict.fromkeys(row.failures)
-        ),
+        *failures,
         *(f"- {change}" for change in changes),
     ]
     return "\n".join(lines).rstrip() + "\n"
