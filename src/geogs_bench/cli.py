@@ -35,19 +35,11 @@ def main(argv: Sequence[str]) -> int:
 
 def _board(options: BenchOptions) -> int:
     """Run the board; 2 where a command failed, 1 where something is worse than noise, else 0."""
-    from rich.console import Console
-    from rich.table import Table
-
     from geogs_bench.board.board import board
-    from geogs_bench.board.board_table import cells, header
+    from geogs_bench.board.board_table import markdown
 
     done, changes = board(options, lambda text: print(text, file=sys.stderr, flush=True))
-    table = Table(*header(), title="The board")
-    for row in done.rows:
-        table.add_row(*cells(row))
-    Console().print(table)
-    for line in changes:
-        print(line)
+    print(markdown(done, changes), end="")
     if any(row.failures for row in done.rows):
         return 2
     return 1 if any(change.is_worse for change in changes) else 0

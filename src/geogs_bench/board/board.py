@@ -59,8 +59,9 @@ class Board:
     on_gpu: bool
     fresh: bool
     say: Callable[[str], None]
-    commit: str = field(default_factory=program_version)
-    unit: float = field(default_factory=reference_seconds)
+    commit: str
+    unit: float
+    """Seconds of the fixed computation."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _begin: float = 0.0
     _jobs: int = 0
@@ -102,10 +103,10 @@ class Board:
             self.device,
             round(self.unit, 4),
             self.side_by_side,
-            round((time.perf_counter() - self._begin) / 60, 1),
             measured,
         )
         write_board(self.output / RECORD, record)
+        self.say(f"{(time.perf_counter() - self._begin) / 60:.1f} minutes in all")
         return record
 
     @property
@@ -203,7 +204,17 @@ def board(
     chosen = _chosen(options.scenes, rows(on_gpu))
     prepare_output_folder(output)
     data = options.data and options.data.expanduser()
-    done = Board(output, str(device), data, chosen, on_gpu, options.fresh, say).run()
+    done = Board(
+        output,
+        str(device),
+        data,
+        chosen,
+        on_gpu,
+        options.fresh,
+        say,
+        program_version(),
+        reference_seconds(),
+    ).run()
     changes = [] if before is None else compare(before, done)
     write_text(output / "board.md", markdown(done, changes))
     return done, changes

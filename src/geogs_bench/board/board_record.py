@@ -75,8 +75,6 @@ class BoardRecord:
     """Of the processor, for the fixed computation."""
     side_by_side: int
     """Commands that ran at a time, but for the rows that run alone."""
-    minutes: float
-    """For all rows."""
     rows: tuple[RowRecord, ...]
 
     def row(self, name: str) -> RowRecord | None:

@@ -88,11 +88,11 @@ def _has_same_clock(before: BoardRecord, now: BoardRecord, row: RowRecord) -> bo
 
 
 def _differences(before: RowRecord, now: RowRecord, same_clock: bool) -> Iterator[Difference]:
-    if len(now.failures) > len(before.failures):
+    failed_before = float(len(before.failures))
+    failed_now = float(len(now.failures))
+    if failed_now > failed_before:
         failures = Figure("failures", "commands that failed", 0, "less")
-        yield Difference(
-            now.name, failures, len(before.failures), len(now.failures), 0.0, is_worse=True
-        )
+        yield Difference(now.name, failures, failed_before, failed_now, 0.0, is_worse=True)
     for figure in FIGURES:
         if figure.better == "neither" or (figure.name == "seconds" and not same_clock):
             continue

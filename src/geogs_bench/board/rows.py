@@ -25,27 +25,27 @@ class Row:
     """Whether it finds nothing compiled."""
 
 
-_QUARTER = Size(48, 192, 144)
+_SMALL = Size(40, 160, 120)
 _FULL = Size(200, 480, 360)
 
 FOOTAGE = (
-    Footage("handheld-kinect", "handheld", "kinect", 31, _QUARTER, _FULL),
-    Footage("turning-60", "turning-60", "clean", 32, _QUARTER, _FULL),
-    Footage("walking-phone", "walking", "phone", 33, _QUARTER, _FULL),
-    Footage("street", "driving", "clean", 34, Size(48, 320, 97), Size(120, 800, 242)),
-    Footage("corridor", "corridor", "kinect", 35, _QUARTER, _FULL),
-    Footage("weak-link", "handheld-5hz", "phone", 36, Size(44, 192, 144), Size(80, 480, 360),
+    Footage("handheld-kinect", "handheld", "kinect", 31, _SMALL, _FULL),
+    Footage("turning-60", "turning-60", "clean", 32, _SMALL, _FULL),
+    Footage("walking-phone", "walking", "phone", 33, _SMALL, _FULL),
+    Footage("street", "driving", "clean", 34, Size(40, 320, 97), Size(120, 800, 242)),
+    Footage("corridor", "corridor", "kinect", 35, _SMALL, _FULL),
+    Footage("weak-link", "handheld-5hz", "phone", 36, Size(40, 160, 120), Size(80, 480, 360),
             gap=(0.5, 0.6)),
-    Footage("dining", "dining", "clean", 37, _QUARTER, Size(400, 600, 340)),
-    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(44, 192, 144), Size(44, 192, 144)),
+    Footage("dining", "dining", "clean", 37, _SMALL, Size(400, 600, 340)),
+    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(40, 160, 120), Size(40, 160, 120)),
 )  # fmt: skip
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
 
 KEPT = (
-    KeptFootage("staircase", "rooms/staircase", "--stop 48 --long-edge 192", ""),
-    KeptFootage("living-room-light", "rooms/living-room-2-light", "--stop 48 --long-edge 192"),
-    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 192"),
-    KeptFootage("fountain", "real/fountain", "--long-edge 192"),
+    KeptFootage("staircase", "rooms/staircase", "--stop 40 --long-edge 160", ""),
+    KeptFootage("living-room-light", "rooms/living-room-2-light", "--stop 40 --long-edge 160"),
+    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160"),
+    KeptFootage("fountain", "real/fountain", "--long-edge 160"),
 )
 """Sequences that the user may have."""
 
