@@ -4,7 +4,7 @@
 # make test-all set up, lint, type-check, test everything
 # make pytest   the tests of `make test` alone, by WORKERS (2) processes
 # make fuzz     set up, damage files and options at random, FUZZ (1000) times each
-# make bench-guard  fail where a stage of a run costs 1.3 times what benchmarks/guard.json says; a minute or two
+# make board    run the board (rows of DATA, a folder of data sets, too), say what is worse than the record by more than noise
 # make format   set up, sort imports, mend what the linter can, format
 # make lock     set up, write requirements.lock anew: after a change of constraints.txt or dependencies
 # make docs     build the site of docs/ in site/; the rest is not set up for it
@@ -31,7 +31,7 @@ SITE    := .venv-docs
 RELEASE := .venv-release
 TRIED   := out/wheel-environment
 
-.PHONY: demo quick test test-all pytest fuzz bench-guard lint kernels format setup lock docs workflows tag binaries dist try-wheel sbom clean
+.PHONY: demo quick test test-all pytest fuzz board lint kernels format setup lock docs workflows tag binaries dist try-wheel sbom clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
@@ -63,8 +63,8 @@ kernels: $(STAMP)
 fuzz: $(STAMP)
 	GEOGS_FUZZ=$(FUZZ) $(PYTEST) tests/fuzz tests/cli/test_option_values.py
 
-bench-guard: kernels
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/guard.py
+board: kernels
+	OMP_NUM_THREADS=1 $(BIN)/geogs bench board $(DATA) -o out/board --against benchmarks/board-$(if $(shell command -v nvidia-smi),gpu,cpu).json
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
