@@ -82,10 +82,17 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
         return place
     say(f"rendering {footage.name}")
     write_sequence(
-        folder, size.frames, size.width, size.height, footage.seed,
-        motion=footage.motion, flaws=camera_flaws(footage.camera),
-        depth=False, video=True, threads=available_cores(),
-    )  # fmt: skip
+        folder,
+        size.frames,
+        size.width,
+        size.height,
+        footage.seed,
+        motion=footage.motion,
+        flaws=camera_flaws(footage.camera),
+        depth=False,
+        video=True,
+        threads=available_cores(),
+    )
     _cut(folder, missing)
     write_text(folder / _MARK, made_of)
     return place

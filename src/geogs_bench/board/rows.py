@@ -34,18 +34,27 @@ FOOTAGE = (
     Footage("walking-phone", "walking", "phone", 33, _SMALL, _FULL),
     Footage("street", "driving", "clean", 34, Size(40, 320, 97), Size(120, 800, 242)),
     Footage("corridor", "corridor", "kinect", 35, _SMALL, _FULL),
-    Footage("weak-link", "handheld-5hz", "phone", 36, Size(40, 160, 120), Size(80, 480, 360),
-            gap=(0.5, 0.6)),
+    Footage(
+        "weak-link",
+        "handheld-5hz",
+        "phone",
+        36,
+        Size(40, 160, 120),
+        Size(80, 480, 360),
+        gap=(0.5, 0.6),
+    ),
     Footage("dining", "dining", "clean", 37, _SMALL, Size(400, 600, 340)),
     Footage("slow-stream", "handheld-5hz", "clean", 38, Size(40, 160, 120), Size(40, 160, 120)),
-)  # fmt: skip
+)
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
 
 KEPT = (
-    KeptFootage("staircase", "rooms/staircase", "--stop 40 --long-edge 160", ""),
-    KeptFootage("living-room-light", "rooms/living-room-2-light", "--stop 40 --long-edge 160"),
-    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160"),
-    KeptFootage("fountain", "real/fountain", "--long-edge 160"),
+    KeptFootage("staircase", "rooms/staircase", "--stop 40 --long-edge 160", "--stop 200"),
+    KeptFootage(
+        "living-room-light", "rooms/living-room-2-light", "--stop 40 --long-edge 160", "--stop 200"
+    ),
+    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160", "--stop 200"),
+    KeptFootage("horse", "objects/horse", "--long-edge 160", "--long-edge 800"),
 )
 """Sequences that the user may have."""
 
@@ -82,7 +91,7 @@ _KEPT = (
     Row("staircase", "staircase", "run {folder}"),
     Row("changing-light", "living-room-light", "run {folder}"),
     Row("kitchen", "kitchen", "run {folder}"),
-    Row("fountain", "fountain", "reconstruct {folder}"),
+    Row("horse", "horse", "reconstruct {folder}"),
 )
 
 
