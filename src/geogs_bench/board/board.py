@@ -3,8 +3,9 @@
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -14,7 +15,6 @@ from geogs.gpu.installation import require_device
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.threads import available_cores
 from geogs_bench.bench_options import BenchOptions
-from geogs_bench.board import footage as sequences
 from geogs_bench.board.board_record import (
     BoardRecord,
     Outcome,
@@ -25,6 +25,7 @@ from geogs_bench.board.board_record import (
 from geogs_bench.board.board_table import markdown
 from geogs_bench.board.commands import environment, run_geogs
 from geogs_bench.board.comparison import Difference, compare
+from geogs_bench.board.footage import FootagePlace, find, render
 from geogs_bench.board.reference import reference_seconds
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
 from geogs_bench.board.scores import with_scores
@@ -35,7 +36,7 @@ RECORD = "board.json"
 _OUTCOME = "outcome.json"
 _COMMIT = "commit.txt"
 _OPTIONS = ("name", "data", "output", "scenes", "device", "against", "fresh")
-_CORES_FOR_ONE = 4
+_CORES_FOR_ONE = 2
 """Cores for each command beside a GPU; a command without one gets a core."""
 
 
@@ -45,7 +46,6 @@ class _Job:
 
     row: Row
     seed: int
-    place: sequences.FootagePlace
 
 
 @dataclass
@@ -65,6 +65,7 @@ class Board:
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _begin: float = 0.0
     _jobs: int = 0
+    _places: dict[str, "Future[FootagePlace]"] = field(default_factory=dict)
     _done: int = 0
 
     def run(self) -> BoardRecord:
@@ -74,28 +75,28 @@ class Board:
             OutputError: the folder cannot be written.
         """
         self._begin = time.perf_counter()
-        places = self._places()
-        found = [row for row in self.chosen if row.footage in places]
-        jobs = [_Job(row, seed, places[row.footage]) for row in found for seed in SEEDS]
-        self._jobs = len(jobs)
-        beside = [job for job in jobs if not job.row.runs_alone]
-        alone = [job for job in jobs if job.row.runs_alone]
-        outcomes: dict[_Job, Outcome] = {}
-        with ThreadPoolExecutor(self.side_by_side) as pool:
+        with ThreadPoolExecutor(self.side_by_side) as pool, self._rendering() as places:
+            jobs = [
+                _Job(row, seed) for row in self.chosen if row.footage in places for seed in SEEDS
+            ]
+            self._jobs = len(jobs)
+            self._places = places
+            beside = [job for job in jobs if not job.row.runs_alone]
             try:
-                outcomes |= zip(beside, pool.map(self._outcome, beside), strict=True)
+                outcomes = dict(zip(beside, pool.map(self._outcome, beside), strict=True))
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-        outcomes |= zip(alone, map(self._outcome, alone), strict=True)
+            outcomes |= {job: self._outcome(job) for job in jobs if job.row.runs_alone}
         measured = tuple(
             RowRecord(
                 row.name,
                 f"geogs {row.command}",
                 row.runs_alone,
-                tuple(outcomes[_Job(row, seed, places[row.footage])] for seed in SEEDS),
+                tuple(outcomes[_Job(row, seed)] for seed in SEEDS),
             )
-            for row in found
+            for row in self.chosen
+            if row.footage in places
         )
         record = BoardRecord(
             self.commit,
@@ -114,22 +115,23 @@ class Board:
         """Commands at a time, of those that do not run alone."""
         return max(1, available_cores() // (_CORES_FOR_ONE if self.on_gpu else 1))
 
-    def _places(self) -> dict[str, sequences.FootagePlace]:
-        """The sequences of all rows; those that the user does not have are said."""
+    @contextmanager
+    def _rendering(self) -> Iterator[dict[str, "Future[FootagePlace]"]]:
+        """The sequences of all rows, some still being made; what the user does not have is said."""
         wanted = {row.footage for row in self.chosen}
-        found = {}
-        for footage in FOOTAGE:
-            if footage.name in wanted:
-                root = prepare_output_folder(self.output / "footage")
-                found[footage.name] = sequences.render(footage, root, self.on_gpu, self.say)
-        for kept in KEPT:
-            if kept.name in wanted:
-                place = sequences.find(kept, self.data, self.on_gpu)
+        found: dict[str, Future[FootagePlace]] = {}
+        with ThreadPoolExecutor(self.side_by_side) as pool:
+            for kept in (kept for kept in KEPT if kept.name in wanted):
+                place = find(kept, self.data, self.on_gpu)
                 if place is None:
                     self.say(f"left out: {kept.name}, as there is no {kept.folder}")
                 else:
-                    found[kept.name] = place
-        return found
+                    found[kept.name] = Future()
+                    found[kept.name].set_result(place)
+            root = prepare_output_folder(self.output / "footage")
+            for footage in (footage for footage in FOOTAGE if footage.name in wanted):
+                found[footage.name] = pool.submit(render, footage, root, self.on_gpu, self.say)
+            yield found
 
     def _outcome(self, job: _Job) -> Outcome:
         """Run a command and measure its result; what was measured before is read."""
@@ -145,16 +147,18 @@ class Board:
 
     def _measured(self, job: _Job, folder: Path) -> Outcome:
         """Run a command, and compare its result with the truth."""
-        row, place = job.row, job.place
+        row = job.row
+        place = self._places[row.footage].result()
         start = job.seed if row.command.startswith("run") else 0
         result = folder / "result"
-        command = [*row.command.format(**place.words).split(), *place.options.split()]
+        # Word by word, as there may be spaces in a path.
+        command = [word.format(**place.words) for word in row.command.split()]
+        command += place.options.split()
         command += ["-o", str(result), "--device", self.device, "--seed", str(job.seed)]
         command += ["--start", str(start)] if start else []
         with tempfile.TemporaryDirectory() as scratch:
-            spent = run_geogs(
-                command, folder / "log.txt", environment(row.has_empty_cache, Path(scratch))
-            )
+            caches = Path(scratch) if row.has_empty_cache else None
+            spent = run_geogs(command, folder / "log.txt", environment(caches))
         outcome = Outcome(
             cost=spent.processor_seconds / self.unit,
             seconds=spent.seconds,

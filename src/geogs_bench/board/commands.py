@@ -51,10 +51,10 @@ def run_geogs(arguments: Sequence[str], log: Path, environment: Mapping[str, str
     )
 
 
-def environment(with_empty_cache: bool, scratch: Path) -> dict[str, str]:
-    """The environment of a command; with new folders for what it compiles if asked for."""
+def environment(caches: Path | None = None) -> dict[str, str]:
+    """The environment of a command; with new folders below ``caches`` for what it compiles, if
+    that is given."""
     found = dict(os.environ)
-    if with_empty_cache:
-        for name in ("NUMBA_CACHE_DIR", "GEOGS_CACHE"):
-            found[name] = tempfile.mkdtemp(prefix=f"{name.lower()}-", dir=scratch)
+    for name in () if caches is None else ("NUMBA_CACHE_DIR", "GEOGS_CACHE"):
+        found[name] = tempfile.mkdtemp(prefix=f"{name.lower()}-", dir=caches)
     return found

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from geogs.errors import OutputError
 from geogs.evaluation.true_scene import read_true_scene
 from geogs.io.writers.atomic import write_text
-from geogs.threads import available_cores
-from geogs_synth.camera.flaws import CameraKind, camera_flaws
+from geogs_bench.board.commands import environment, run_geogs
+from geogs_synth.camera.flaws import CameraKind
 from geogs_synth.motion.motion_kinds import MotionKind
-from geogs_synth.sequence.replica_files import write_sequence
 
 _MARK = "footage.txt"
 """Written last, so that a sequence which was cut off, or is another by now, is made again."""
@@ -69,7 +69,7 @@ class FootagePlace:
 
 
 def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None]) -> FootagePlace:
-    """Write a sequence below ``root`` unless it is there.
+    """Write a sequence below ``root`` by a command of its own, unless it is there.
 
     Raises:
         OutputError: it cannot be written.
@@ -81,18 +81,19 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
     if (folder / _MARK).is_file() and (folder / _MARK).read_text() == made_of:
         return place
     say(f"rendering {footage.name}")
-    write_sequence(
-        folder,
-        size.frames,
-        size.width,
-        size.height,
-        footage.seed,
-        motion=footage.motion,
-        flaws=camera_flaws(footage.camera),
-        depth=False,
-        video=True,
-        threads=available_cores(),
-    )
+    options = {
+        "motion": footage.motion,
+        "camera": footage.camera,
+        "frames": size.frames,
+        "width": size.width,
+        "height": size.height,
+        "seed": footage.seed,
+    }
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    command = ["synth", str(folder), *words, "--video", "--no-depth"]
+    spent = run_geogs(command, root / f"{footage.name}.log", environment())
+    if spent.code:
+        raise OutputError(f"{footage.name} cannot be rendered: {spent.last_line}")
     _cut(folder, missing)
     write_text(folder / _MARK, made_of)
     return place

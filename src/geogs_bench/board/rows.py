@@ -26,7 +26,7 @@ class Row:
 
 
 _SMALL = Size(40, 160, 120)
-_FULL = Size(200, 480, 360)
+_FULL = Size(150, 400, 300)
 
 FOOTAGE = (
     Footage("handheld-kinect", "handheld", "kinect", 31, _SMALL, _FULL),
@@ -69,33 +69,29 @@ _SITUATIONS = (
     Row("no-lens", "walking-phone", "run {video}"),
 )
 _WAYS = (
-    Row("fast", "dining", "run {folder} --preset fast"),
-    Row("accurate", "dining", "run {folder} --preset accurate"),
     Row("paper", "dining", "run {folder} --preset paper"),
-    Row("own", "dining", "run {folder} --tracking.operator own"),
     Row("online-results", "dining", "run {folder} --online-results"),
-    Row("offline", "dining", "run {folder} --offline"),
-    Row("posed", "dining", "reconstruct {folder}"),
-    Row("posed-paper", "dining", "reconstruct {folder} --preset paper"),
+    Row("fast", "handheld-kinect", "run {folder} --preset fast"),
+    Row("accurate", "handheld-kinect", "run {folder} --preset accurate"),
+    Row("own", "handheld-kinect", "run {folder} --tracking.operator own"),
+    Row("offline", "handheld-kinect", "run {folder} --offline"),
+    Row("posed", "handheld-kinect", "reconstruct {folder}"),
+    Row("posed-paper", "handheld-kinect", "reconstruct {folder} --preset paper"),
+    Row("first-command", "handheld-kinect", "run {folder}", has_empty_cache=True),
 )
-_TIMED = (
-    Row("posed-10s", "dining", "reconstruct {folder} --budget 10s", runs_alone=True),
-    Row("posed-20s", "dining", "reconstruct {folder} --budget 20s", runs_alone=True),
-    Row("first-command", "handheld-kinect", "run {folder}", runs_alone=True, has_empty_cache=True),
-)
-_LIVE_ON_CPU = Row(
-    "live-5hz", "slow-stream", "run play:{video} --intrinsics {camera}", runs_alone=True
-)
-_LIVE_ON_GPU = Row("live-30hz", "dining", "run play:{video} --intrinsics {camera}", runs_alone=True)
 _KEPT = (
     Row("staircase", "staircase", "run {folder}"),
     Row("changing-light", "living-room-light", "run {folder}"),
     Row("kitchen", "kitchen", "run {folder}"),
     Row("horse", "horse", "reconstruct {folder}"),
 )
+_BUDGET = Row("posed-20s", "handheld-kinect", "reconstruct {folder} --budget 20s", runs_alone=True)
+_LIVE = "run play:{video} --intrinsics {camera}"
+_LIVE_ON_CPU = Row("live-5hz", "slow-stream", _LIVE, runs_alone=True)
+_LIVE_ON_GPU = Row("live-30hz", "handheld-kinect", _LIVE, runs_alone=True)
 
 
 def rows(on_gpu: bool) -> tuple[Row, ...]:
     """All rows; those that run alone come last."""
     live = _LIVE_ON_GPU if on_gpu else _LIVE_ON_CPU
-    return (*_SITUATIONS, *_WAYS, *_KEPT, *_TIMED, live)
+    return (*_WAYS, *_SITUATIONS, *_KEPT, _BUDGET, live)
