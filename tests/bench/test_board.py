@@ -19,9 +19,9 @@ from geogs_bench.board.board_record import (
     write_board,
 )
 from geogs_bench.board.board_table import markdown
-from geogs_bench.board.commands import environment, run_geogs
+from geogs_bench.board.commands import run_geogs
 from geogs_bench.board.comparison import FIGURES, compare
-from geogs_bench.board.footage import Footage, KeptFootage, Size, find, render
+from geogs_bench.board.footage import Footage, FootagePlace, KeptFootage, Size, find, render
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
 
 TINY = Size(10, 96, 72)
@@ -88,21 +88,32 @@ def test_a_data_set_that_is_not_there_is_none(tmp_path):
 
 def test_what_a_command_took_is_that_of_its_process(tmp_path):
     log = tmp_path / "log.txt"
-    spent = run_geogs(["--version"], log, environment())
+    held = bytearray(600_000_000)  # memory of this process is none of the command's
+    held[::4096] = b"x" * len(held[::4096])
+    spent, last_line = run_geogs(["--version"], log)
+    del held
     assert spent.code == 0
-    assert spent.last_line.startswith("geogs ")
+    assert last_line.startswith("geogs ")
     assert 0 < spent.processor_seconds < 20
-    assert 5e6 < spent.memory_bytes < 2e9
+    assert 5e6 < spent.memory_bytes < 4e8
     assert log.read_text().startswith("$ geogs --version\n")
-    failed = run_geogs(["run", "/nowhere"], log, environment())
+    failed, last_line = run_geogs(["run", "/nowhere"], log)
     assert failed.code == 2
-    assert "/nowhere" in failed.last_line
+    assert "/nowhere" in last_line
 
 
-def test_an_empty_cache_is_a_new_folder_for_each_command(tmp_path):
-    first, second = (environment(tmp_path)["NUMBA_CACHE_DIR"] for _ in range(2))
-    assert first != second
-    assert list(Path(first).iterdir()) == []
+def test_an_empty_cache_is_a_folder_of_its_own(tmp_path):
+    run_geogs(["--version"], tmp_path / "log.txt", tmp_path)
+    names = sorted(
+        folder.name.rsplit("-", 1)[0] for folder in tmp_path.iterdir() if folder.is_dir()
+    )
+    assert names == ["geogs_cache", "numba_cache_dir"]
+
+
+@pytest.mark.parametrize(("stride", "start", "used"), [(1, 0, 40), (3, 0, 14), (3, 2, 13)])
+def test_frames_that_are_used(stride, start, used):
+    options = f"--stride {stride}" if stride > 1 else ""
+    assert FootagePlace(Path(), 40, options).used(start) == used
 
 
 def test_what_is_worse_and_better_exceeds_the_noise():

@@ -23,7 +23,7 @@ from geogs_bench.board.board_record import (
     write_board,
 )
 from geogs_bench.board.board_table import markdown
-from geogs_bench.board.commands import environment, run_geogs
+from geogs_bench.board.commands import run_geogs
 from geogs_bench.board.comparison import Difference, compare
 from geogs_bench.board.footage import FootagePlace, find, render
 from geogs_bench.board.reference import reference_seconds
@@ -158,17 +158,17 @@ class Board:
         command += ["--start", str(start)] if start else []
         with tempfile.TemporaryDirectory() as scratch:
             caches = Path(scratch) if row.has_empty_cache else None
-            spent = run_geogs(command, folder / "log.txt", environment(caches))
+            spent, last_line = run_geogs(command, folder / "log.txt", caches)
         outcome = Outcome(
             cost=spent.processor_seconds / self.unit,
             seconds=spent.seconds,
             memory=spent.memory_bytes / 1e6,
         )
         if spent.code:
-            return replace(outcome, error=spent.last_line or f"exit code {spent.code}")
+            return replace(outcome, error=last_line or f"exit code {spent.code}")
         with self._lock:  # an evaluation uses all cores
             try:
-                return with_scores(outcome, result, place.folder, place.frames - start)
+                return with_scores(outcome, result, place.folder, place.used(start))
             except GeogsError as error:
                 return replace(outcome, error=str(error))
 

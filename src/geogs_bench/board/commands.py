@@ -1,12 +1,17 @@
-"""A command as a user types it, in a process of its own, and what it took."""
+"""A command as a user types it, in a process of its own, and what it took.
 
+Run as a script it is the process between: what is said of the memory of a child counts that of the
+process that made it, so that has to be small.
+"""
+
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 
@@ -21,40 +26,48 @@ class Spent:
     """Of all its threads, and of the processes that it started and waited for."""
     memory_bytes: int
     """The most that it, or one of these, had in memory."""
-    last_line: str
-    """Of what it said."""
 
 
-def run_geogs(arguments: Sequence[str], log: Path, environment: Mapping[str, str]) -> Spent:
-    """Run ``geogs`` with some arguments to its end; ``log`` gets what it says."""
+def run_geogs(arguments: Sequence[str], log: Path, caches: Path | None = None) -> tuple[Spent, str]:
+    """Run ``geogs`` with some arguments to its end; what it took, and the last line that it said.
+
+    Args:
+        arguments: of the command.
+        log: gets what it says.
+        caches: where it finds new folders for what it compiles; the usual ones if none is given.
+    """
     command = [sys.executable, "-m", "geogs.cli.main", *arguments]
-    start = time.perf_counter()
-    with log.open("w") as said:
-        said.write(f"$ geogs {' '.join(arguments)}\n")
-        said.flush()
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, env=environment
-        )
-        # Popen.wait would take the process away without saying what it used.
-        _, status, usage = os.wait4(process.pid, 0)
-    seconds = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)
-    lines = log.read_text(errors="replace").split("\n")
-    said_last = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    unit = 1 if sys.platform == "darwin" else 1024
-    return Spent(
-        process.returncode,
-        seconds,
-        usage.ru_utime + usage.ru_stime,
-        usage.ru_maxrss * unit,
-        said_last[:300],
-    )
-
-
-def environment(caches: Path | None = None) -> dict[str, str]:
-    """The environment of a command; with new folders below ``caches`` for what it compiles, if
-    that is given."""
     found = dict(os.environ)
     for name in () if caches is None else ("NUMBA_CACHE_DIR", "GEOGS_CACHE"):
         found[name] = tempfile.mkdtemp(prefix=f"{name.lower()}-", dir=caches)
-    return found
+    with log.open("w") as said:
+        said.write(f"$ geogs {' '.join(arguments)}\n")
+        said.flush()
+        done = subprocess.run(
+            [sys.executable, "-I", __file__, *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            env=found,
+            check=True,
+        )
+    lines = log.read_text(errors="replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return Spent(**json.loads(done.stdout)), last[:300]
+
+
+def measured(command: Sequence[str]) -> Spent:
+    """Run a command to its end; what it says goes to the standard error."""
+    start = time.perf_counter()
+    process = subprocess.Popen(command, stdout=sys.stderr)
+    # Popen.wait would take the process away without saying what it used.
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    process.returncode = os.waitstatus_to_exitcode(status)
+    unit = 1 if sys.platform == "darwin" else 1024
+    spent = usage.ru_utime + usage.ru_stime
+    return Spent(process.returncode, seconds, spent, usage.ru_maxrss * unit)
+
+
+if __name__ == "__main__":
+    print(json.dumps(asdict(measured(sys.argv[1:]))))

@@ -7,7 +7,7 @@ from pathlib import Path
 from geogs.errors import OutputError
 from geogs.evaluation.true_scene import read_true_scene
 from geogs.io.writers.atomic import write_text
-from geogs_bench.board.commands import environment, run_geogs
+from geogs_bench.board.commands import run_geogs
 from geogs_synth.camera.flaws import CameraKind
 from geogs_synth.motion.motion_kinds import MotionKind
 
@@ -22,6 +22,8 @@ class Size:
     frames: int
     width: int
     height: int
+    stride: int = 1
+    """Every so many-th is used."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,15 @@ class FootagePlace:
 
     folder: Path
     frames: int
+    """That are there."""
     options: str = ""
     """What commands are given on it."""
+
+    def used(self, start: int) -> int:
+        """Frames that a command sees which begins with that one."""
+        words = self.options.split()
+        stride = int(words[words.index("--stride") + 1]) if "--stride" in words else 1
+        return len(range(start, self.frames, stride))
 
     @property
     def words(self) -> dict[str, str]:
@@ -77,7 +86,8 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
     size = footage.on_gpu if on_gpu else footage.on_cpu
     folder, made_of = root / footage.name, repr(replace(footage, on_cpu=size, on_gpu=size))
     missing = [i for i in range(size.frames) if _is_missing(i / size.frames, footage)]
-    place = FootagePlace(folder, size.frames - len(missing))
+    used = f"--stride {size.stride}" if size.stride > 1 else ""
+    place = FootagePlace(folder, size.frames - len(missing), used)
     if (folder / _MARK).is_file() and (folder / _MARK).read_text() == made_of:
         return place
     say(f"rendering {footage.name}")
@@ -91,9 +101,9 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
     }
     words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     command = ["synth", str(folder), *words, "--video", "--no-depth"]
-    spent = run_geogs(command, root / f"{footage.name}.log", environment())
+    spent, last_line = run_geogs(command, root / f"{footage.name}.log")
     if spent.code:
-        raise OutputError(f"{footage.name} cannot be rendered: {spent.last_line}")
+        raise OutputError(f"{footage.name} cannot be rendered: {last_line}")
     _cut(folder, missing)
     write_text(folder / _MARK, made_of)
     return place

@@ -43,7 +43,7 @@ FOOTAGE = (
         Size(80, 480, 360),
         gap=(0.5, 0.6),
     ),
-    Footage("dining", "dining", "clean", 37, _SMALL, Size(400, 600, 340)),
+    Footage("dining", "dining", "clean", 37, Size(120, 160, 120, stride=3), Size(400, 600, 340)),
     Footage("slow-stream", "handheld-5hz", "clean", 38, Size(40, 160, 120), Size(40, 160, 120)),
 )
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
