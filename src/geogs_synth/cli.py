@@ -10,6 +10,7 @@ from geogs.config import Seed
 from geogs.config.setting import Positional, Range, Settings
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
 from geogs_synth.motion.motion_kinds import MotionKind
+from geogs_synth.scene.light_changes import LampKind
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class SynthOptions(Settings):
     """Single flaws, over those of the camera."""
     moving: Annotated[float, Range(0, 0.5)] = 0.0
     """Fraction of the image that people cover who cross the view; 0 lets nothing move."""
+    lamps: LampKind = "steady"
+    """Switched: each third of the sequence shows the room in another light."""
     depth: bool = True
     """Write depth images too."""
     depth_sensor: bool = False
@@ -71,6 +74,7 @@ def main(argv: Sequence[str]) -> int:
             motion=options.motion,
             flaws=options.flaws,
             moving=options.moving,
+            lamps=options.lamps,
             depth=options.depth,
             depth_sensor=DepthSensor() if options.depth_sensor else None,
             image_format=options.image_format,

@@ -11,6 +11,7 @@ from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.places.walkers import crossing_walkers
 from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.light_changes import LightChanges, switched_by_thirds
 from geogs_synth.scene.textured_scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.shooting import Shooting
@@ -47,6 +48,43 @@ def test_rolling_rows_are_those_of_their_own_poses(raycaster: Raycaster) -> None
     ends = [raycaster.render(lens, path(times[k : k + 1])[0]).depth for k in (0, 71)]
     assert np.abs(view.depth - ends[0]).mean() > 0.01
     assert np.abs(view.depth - ends[1]).mean() > 0.01
+
+
+def test_lamps_are_switched_by_thirds_and_change_the_light_alone(raycaster: Raycaster) -> None:
+    """Light is a sum over the lamps, so one that is on alone tells what it gives."""
+    lamps = len(raycaster.scene.lights)
+    T_wc = room_motion("handheld", raycaster.scene).path(np.zeros(1))[0]
+    changes = switched_by_thirds(lamps, 9.0)
+    steady = raycaster.render(CAMERA, T_wc)
+    switched = raycaster.with_lights(changes)
+    first = switched.render(CAMERA, T_wc, 2.9)
+    np.testing.assert_array_equal(first.image, steady.image)
+
+    def light(gains: np.ndarray) -> np.ndarray:
+        alone = LightChanges(np.zeros(0), gains[None])
+        return (raycaster.with_lights(alone).render(CAMERA, T_wc).shade / 255.0) ** 2
+
+    dark, each = light(np.zeros(lamps)), [light(row) for row in np.eye(lamps)]
+    for time, gains in ((3.0, changes.gains[1]), (6.1, changes.gains[2])):
+        view = switched.render(CAMERA, T_wc, time)
+        expected = dark + sum(g * (e - dark) for g, e in zip(gains, each, strict=True))
+        mild = expected < 0.9  # brighter pixels are clipped
+        off = np.abs((view.shade / 255.0) ** 2 - expected)[mild]
+        assert mild.mean() > 0.5
+        assert np.median(off) < 1e-4
+        assert np.abs(view.image.astype(float) - steady.image).mean() > 5
+        np.testing.assert_array_equal(view.depth, steady.depth)
+
+
+def test_rows_of_a_rolling_shutter_see_the_light_of_their_own_time(raycaster: Raycaster) -> None:
+    path = room_motion("handheld", raycaster.scene).path
+    times = 1.0 + (np.arange(72) / 71 - 0.5) * 0.03
+    poses = np.repeat(path(np.ones(1)), 72, 0)
+    switched = raycaster.with_lights(switched_by_thirds(len(raycaster.scene.lights), 3.0))
+    view = switched.render_rolling(LENS, poses, times)
+    for time, rows in ((0.9, slice(0, 36)), (1.1, slice(36, 72))):
+        still = switched.render(LENS, poses[0], time)
+        np.testing.assert_array_equal(view.image[rows], still.image[rows])
 
 
 def test_row_times_follow_the_convention(raycaster: Raycaster) -> None:

@@ -17,6 +17,7 @@ from geogs_synth.raycast.placement import PlacedScene
 from geogs_synth.raycast.visibility_kernels import visibility_slices
 from geogs_synth.scene.bodies import Body
 from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.light_changes import LightChanges
 from geogs_synth.scene.textured_scene import Scene, Texture, joined
 
 _LEVELS = 8
@@ -93,7 +94,8 @@ class Raycaster:
         self.scene = scene
         self._pool = ThreadPoolExecutor(threads)
         self._threads = threads
-        self._lighting = self._compute_lighting()
+        self._lightings = (self._compute_lighting(),)
+        self._switched_at = np.zeros(0)
         self._use(())
 
     def with_bodies(self, bodies: Sequence[Body]) -> "Raycaster":
@@ -101,6 +103,19 @@ class Raycaster:
         other = copy.copy(self)
         other._use(bodies)
         return other
+
+    def with_lights(self, changes: LightChanges) -> "Raycaster":
+        """The same scene whose lights change with the time; what was prepared is shared."""
+        other = copy.copy(self)
+        steady = self._lightings[0]
+        other._lightings = tuple(
+            steady._replace(colour=steady.colour * gains[:, None]) for gains in changes.gains
+        )
+        other._switched_at = changes.times
+        return other
+
+    def _lighting_at(self, time: float) -> Lighting:
+        return self._lightings[int(np.searchsorted(self._switched_at, time, side="right"))]
 
     def bodies(self) -> Iterator[tuple[int, Body]]:
         """Each body with the index of its first solid in a view."""
@@ -125,19 +140,20 @@ class Raycaster:
         """What a camera with pose camera-to-world ``T_wc`` sees, all rows at once.
 
         Depth, normal and solid are those of the ray through the pixel's centre; the colour is the
-        mean over the pixel. ``time`` in seconds places the bodies.
+        mean over the pixel. ``time`` in seconds places the bodies and tells the light.
         """
         lens = RadialCamera.of(camera)
         placed = self._place(T_wc[None], np.array([time]))
         solids, bounds = placed.solids(0), placed.bounds(lens)[0]
         traced, (xs, ys) = _Traced.empty(lens.camera.height, lens.camera.width), lens.rays
+        lighting = self._lighting_at(time)
 
         def cast(first: int, last: int) -> None:
             cast_rows(solids, bounds, xs, ys, first, last, *traced.hits)
 
         def shade(first: int, last: int) -> None:
             shade_rows(
-                solids, self._textures, self._lighting, T_wc, lens.pixel, xs, ys, first, last,
+                solids, self._textures, lighting, T_wc, lens.pixel, xs, ys, first, last,
                 *traced.hits, traced.image, traced.normal,
             )  # fmt: skip
 
@@ -171,8 +187,9 @@ class Raycaster:
                 rays = xs[low:high], ys[low:high]
                 solids = placed.solids(row - first)
                 cast_rows(solids, near, *rays, 0, high - low, *around.hits)
+                lighting = self._lighting_at(times[row])
                 shade_rows(
-                    solids, self._textures, self._lighting, T_wc[row], lens.pixel, *rays,
+                    solids, self._textures, lighting, T_wc[row], lens.pixel, *rays,
                     row - low, row - low + 1, *around.hits, around.image, around.normal,
                 )  # fmt: skip
                 traced.take(row, around, row - low)

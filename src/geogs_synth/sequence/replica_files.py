@@ -25,6 +25,7 @@ from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.motion_kinds import MotionKind
 from geogs_synth.motion.room_motions import Motion
 from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.light_changes import LampKind, switched_by_thirds
 from geogs_synth.sequence.location import Location, make_location
 from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
 from geogs_synth.sequence.shooting import Shooting, Shot
@@ -45,6 +46,7 @@ def write_sequence(
     motion: MotionKind = "handheld",
     flaws: Flaws | None = None,
     moving: float = 0.0,
+    lamps: LampKind = "steady",
     depth: bool = True,
     depth_sensor: DepthSensor | None = None,
     image_format: str = "jpg",
@@ -63,7 +65,8 @@ def write_sequence(
     middle row at mid-exposure, whatever the flaws; a ``depth_sensor`` adds its own. With
     ``moving``, things that cover about this fraction of the image cross the view: they are in the
     images and the depths, but in neither the mesh nor the points, and ``results/moving%06d.png`` is
-    white where the depth is theirs.
+    white where the depth is theirs. Where the ``lamps`` are switched, each third of the sequence
+    shows the scene in another light.
     ``raycaster`` of the same scene, where there is one, saves its making. ``on_frame`` is called
     after each frame.
 
@@ -84,11 +87,14 @@ def write_sequence(
     lens = RadialCamera(location.camera(width, height), flaws.k1, flaws.k2)
     folder = prepare_output_folder(folder)
     results = prepare_output_folder(folder / "results")
-    _write_camera(folder / "cam_params.json", location, lens, flaws, moving)
+    _write_camera(folder / "cam_params.json", location, lens, flaws, moving, lamps)
     _write_trajectory(folder, location.motion, frames, image_format)
     write_mesh(folder / "mesh.ply", *scene_mesh(location.scene))
     bodies = location.bodies(lens.camera, frames / rate, moving) if moving else []
     raycaster = (raycaster or Raycaster(location.scene, threads)).with_bodies(bodies)
+    if lamps == "switched":
+        lights = len(location.scene.lights)
+        raycaster = raycaster.with_lights(switched_by_thirds(lights, frames / rate))
     shooting = Shooting(raycaster, lens, location.motion.path, flaws, rate, seed)
     quality = _JPEG_QUALITY if flaws.jpeg is None else flaws.jpeg
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
@@ -147,7 +153,12 @@ def _encode(path: Path, camera: Camera, rate: float, shots: Iterator[Shot]) -> I
 
 
 def _write_camera(
-    path: Path, location: Location, lens: RadialCamera, flaws: Flaws, moving: float
+    path: Path,
+    location: Location,
+    lens: RadialCamera,
+    flaws: Flaws,
+    moving: float,
+    lamps: LampKind,
 ) -> None:
     """Writes the intrinsics, with the distortion, for programs; the rest is for evaluation."""
     c = lens.camera
@@ -162,10 +173,10 @@ def _write_camera(
         "convention": "OpenCV axes, pixel centres at integer coordinates, depth = z",
         "scene": location.name,
     }
-    if flaws != Flaws() or moving or location.kind != "handheld":
+    if flaws != Flaws() or moving or lamps != "steady" or location.kind != "handheld":
         parameters |= {
             "motion": location.kind, "fps": location.motion.rate, "readout": flaws.readout,
-            "flaws": asdict(flaws), "moving": moving,
+            "flaws": asdict(flaws), "moving": moving, "lamps": lamps,
         }  # fmt: skip
     write_text(path, json.dumps(parameters, indent=1) + "\n")
 
