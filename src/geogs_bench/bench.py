@@ -6,28 +6,28 @@ from pathlib import Path
 
 from geogs.errors import InputError
 from geogs_bench.bench_options import BenchOptions
-from geogs_bench.benchmark import Benchmark
-from geogs_bench.catalogue.registry import BENCHMARKS, EDGES, find_benchmark
+from geogs_bench.benchmark import Benchmark, Suite
+from geogs_bench.catalogue.data_sets import EDGES
+from geogs_bench.catalogue.paper_tables import SUITES
+from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
 from geogs_bench.data.benchmark_scene import Option
 from geogs_bench.data.motion_cells import render_cells
 from geogs_bench.harness import Harness, score_given
 from geogs_bench.plan import Selection, find_scenes, make_jobs
-from geogs_bench.results.record import Record
 from geogs_bench.runners.runner import Runner
-
-_FRAMES, _WIDTH, _HEIGHT = 280, 640, 480
-"""Frames, in which the path comes back to its start, and their size."""
+from geogs_bench.runners.task import Task
+from geogs_bench.suite import run_parts, suite_parts
+from geogs_bench.tables.benchmark_report import Chapter
 
 
 @dataclass(frozen=True)
 class BenchResult:
-    """The records of a benchmark and where they are."""
+    """The records of a benchmark, or of each of a suite, and where they are."""
 
-    benchmark: Benchmark
     output: Path
     """Folder of the results."""
-    records: list[Record]
-    """All in the folder, earlier calls' included."""
+    chapters: list[Chapter]
+    """All records in the folder, earlier calls' included."""
 
 
 def bench(settings: BenchOptions, say: Callable[[str], None]) -> BenchResult:
@@ -37,18 +37,36 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> BenchResult:
         InputError: the data, a setting or a name is wrong; found before anything is run.
         OutputError: the folder cannot be written.
     """
-    benchmark = find_benchmark(_name(settings))
+    name = _name(settings)
+    output = settings.output or Path("out") / f"bench-{name}"
+
+    def harness(benchmark: Benchmark, folder: Path) -> Harness:
+        return Harness(benchmark, folder, Runner(), say, settings.fresh, settings.rescore)
+
+    if name in SUITES:
+        suite, selection = SUITES[name], _selection(settings)
+        for command in {table.benchmark.command for table in suite.tables}:
+            Runner().settings(Task(command, Path(), output, selection.options))
+        parts = suite_parts(suite, _data_of(settings, suite), output, selection, say)
+        return BenchResult(output, run_parts(suite.title, parts, output, harness))
+    benchmark = find_benchmark(name)
     if settings.result is not None:
         return _given(settings, benchmark, settings.result)
-    selection = _selection(settings, benchmark)
-    output = settings.output or Path("out") / f"bench-{benchmark.name}"
+    selection = _selection(settings)
     data = settings.data or _made_data(benchmark, output, selection.scenes, say)
     scenes = find_scenes(benchmark, data.expanduser(), selection.scenes)
     jobs = make_jobs(benchmark, scenes, output, selection)
-    harness = Harness(
-        benchmark, output, Runner(), say, fresh=settings.fresh, rescore=settings.rescore
-    )
-    return BenchResult(benchmark, output, harness.run(jobs))
+    records = harness(benchmark, output).run(jobs)
+    return BenchResult(output, [Chapter(benchmark, records)])
+
+
+def _data_of(settings: BenchOptions, suite: Suite) -> Path | None:
+    """The user's folder, where the suite takes one."""
+    if settings.result is not None:
+        raise InputError(f"--result is for {EDGES.name}; {suite.name} scores its own runs.")
+    if settings.data is not None and not suite.takes_data:
+        raise InputError(f"{suite.name} renders its own sequences; leave out the folder.")
+    return None if settings.data is None else settings.data.expanduser()
 
 
 def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> BenchResult:
@@ -62,7 +80,8 @@ def _given(settings: BenchOptions, benchmark: Benchmark, result: Path) -> BenchR
         names = ", ".join(scene.name for scene in scenes)
         raise InputError(f"--result is of one sequence; choose it by --scenes: {names}.")
     output = settings.output or result / f"bench-{benchmark.name}"
-    return BenchResult(benchmark, output, score_given(benchmark, scenes[0], result, output))
+    records = score_given(benchmark, scenes[0], result, output)
+    return BenchResult(output, [Chapter(benchmark, records)])
 
 
 def _name(settings: BenchOptions) -> str:
@@ -73,9 +92,10 @@ def _name(settings: BenchOptions) -> str:
             raise InputError(f"--known-poses is for rooms; {name} has one way to run.")
         return "rooms-known-poses"
     if settings.small:
-        if name not in ("motions", "motions-small"):
-            raise InputError(f"--small is for motions; {name} has one size.")
-        return "motions-small"
+        small = f"{name.removesuffix('-small')}-small"
+        if small not in BENCHMARKS and small not in SUITES:
+            raise InputError(f"--small is for motions and paper; {name} has one size.")
+        return small
     return name
 
 
@@ -87,22 +107,21 @@ def listing() -> str:
         "  needs: nothing; data sets below a folder make more rows",
         "  from:  geogs synth",
     ]
-    for benchmark in BENCHMARKS.values():
-        lines += [benchmark.name, f"  {benchmark.title}", f"  needs: {benchmark.needs}"]
-        lines += [f"  from:  {benchmark.source}"]
-        variants = ", ".join(variant.name for variant in benchmark.variants if variant.name)
-        lines += [f"  variants: {variants}"] if variants else []
+    tests: list[Suite | Benchmark] = [*SUITES.values(), *BENCHMARKS.values()]
+    for test in tests:
+        lines += [test.name, f"  {test.title}", f"  needs: {test.needs}", f"  from:  {test.source}"]
+        variants = test.variants if isinstance(test, Benchmark) else ()
+        names = ", ".join(variant.name for variant in variants if variant.name)
+        lines += [f"  variants: {names}"] if names else []
     return "\n".join(lines)
 
 
-def _selection(settings: BenchOptions, benchmark: Benchmark) -> Selection:
+def _selection(settings: BenchOptions) -> Selection:
     common = [Option("device", settings.device), Option("seed", str(settings.seed))]
     if settings.preset:
         common.append(Option("preset", settings.preset))
     if settings.depth_fusion:
         common.append(Option("depth-mesh"))
-    if benchmark.command == "run" and benchmark.keeps_online:
-        common.append(Option("online-results"))
     return Selection(
         _names(settings.scenes),
         _names(settings.variants),
@@ -129,15 +148,6 @@ def _made_data(
     """What can be rendered, where that serves. Raises InputError where it does not."""
     if benchmark.cells:
         return render_cells(benchmark.cells, output / "data", scenes, say)
-    if not benchmark.synthetic:
-        raise InputError(
-            f"{benchmark.name} needs a folder: {benchmark.needs}; from {benchmark.source}."
-        )
-    from geogs_synth.sequence.replica_files import write_sequence
-
-    say("no data given; rendering a synthetic room")
-    room = output / "data" / "synthetic-0"
-    # Written last, so that a room which was cut off is made again.
-    if not (room / "points_seen_1cm.ply").is_file():
-        write_sequence(room, _FRAMES, _WIDTH, _HEIGHT, seed=0, depth=False)
-    return room.parent
+    raise InputError(
+        f"{benchmark.name} needs a folder: {benchmark.needs}; from {benchmark.source}."
+    )

@@ -19,7 +19,7 @@ class BenchOptions(Settings):
     name: Annotated[str, Positional()]
     """Which benchmark, or list."""
     data: Annotated[Path | None, Positional(required=False)] = None
-    """Folder of the data set; some benchmarks make a synthetic room without one."""
+    """Folder of the data set; without one some benchmarks render synthetic rooms."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/bench-NAME if none is given."""
     scenes: str = ""
@@ -29,7 +29,7 @@ class BenchOptions(Settings):
     known_poses: bool = False
     """Rooms: reconstruct from known poses instead of SLAM."""
     small: bool = False
-    """Motions: few short sequences of small images, for two CPU cores."""
+    """Motions and paper: few short sequences of small images, for two CPU cores."""
     budgets: Annotated[tuple[Positive, ...], Time] = ()
     """From known poses: seconds given to each reconstruction, several with commas between."""
     baseline: bool = False

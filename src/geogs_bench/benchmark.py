@@ -73,11 +73,31 @@ class Benchmark:
     """What to know before comparing with the published figures."""
     budgets: tuple[float, ...] = ()
     """Seconds given to each reconstruction from known poses; each makes a variant."""
-    synthetic: bool = False
-    """Whether a synthetic room serves where the user gives no data."""
-    by_kind: bool = False
-    """Whether objects and scans, whose poses are known, are reconstructed and rooms are run."""
     cells: tuple[Cell, ...] = ()
     """Sequences that are rendered where the user gives no data."""
-    keeps_online: bool = True
-    """Whether a run keeps, and its scores show, how it stood after the stream; it costs time."""
+
+
+@dataclass(frozen=True)
+class SuiteTable:
+    """A benchmark of a suite, and what stands in where the user has no data for it."""
+
+    benchmark: Benchmark
+    find_stand_ins: Callable[[Path], list[BenchmarkScene]]
+    """In the folder of what was rendered."""
+    cells: tuple[Cell, ...]
+    """What is rendered."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Several benchmarks in one ``geogs bench NAME``, in order."""
+
+    name: str
+    title: str
+    needs: str
+    source: str
+    tables: tuple[SuiteTable, ...]
+    options: tuple[Option, ...] = ()
+    """Of every task."""
+    takes_data: bool = True
+    """Whether the user's data is looked for; else all are stand-ins."""

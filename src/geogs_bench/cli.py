@@ -30,7 +30,8 @@ def main(argv: Sequence[str]) -> int:
     for table in _tables(done):
         Console().print(table)
     print(f"Results are in {done.output}/ (results.md, results.json, report/index.html)")
-    return 2 if not done.records or any(record.error for record in done.records) else 0
+    records = [record for chapter in done.chapters for record in chapter.records]
+    return 2 if not records or any(record.error for record in records) else 0
 
 
 def _board(options: BenchOptions) -> int:
@@ -46,13 +47,13 @@ def _board(options: BenchOptions) -> int:
 
 
 def _tables(done: "BenchResult") -> "list[Table]":
-    """The tables of a benchmark for a terminal."""
+    """The tables of all chapters for a terminal."""
     from rich.table import Table
 
-    from geogs_bench.tables.result_tables import result_tables
+    from geogs_bench.tables.benchmark_report import chapter_tables
 
     shown = []
-    for table in result_tables(done.benchmark, done.records):
+    for table in (table for chapter in done.chapters for table in chapter_tables(chapter)):
         shown.append(Table(*table.header, title=table.title, caption=table.note or None))
         for column in shown[-1].columns[1:]:
             column.justify = "right"

@@ -26,7 +26,7 @@ from geogs_bench.results.store import (
 )
 from geogs_bench.runners.runner import Runner
 from geogs_bench.scoring.scores import scored
-from geogs_bench.tables.benchmark_report import write_report
+from geogs_bench.tables.benchmark_report import Chapter, write_report
 
 _ERROR_FILE = "bench_error.txt"
 
@@ -53,28 +53,43 @@ class Harness:
         self._commit = program_version()
         self._machine = machine_name()
 
-    def run(self, jobs: Sequence[BenchmarkJob]) -> list[Record]:
+    def run(
+        self,
+        jobs: Sequence[BenchmarkJob],
+        report: Callable[[list[Record]], None] | None = None,
+    ) -> list[Record]:
         """All records of the benchmark, those of earlier calls in the same folder included.
 
-        A job that fails leaves a record that says why, and the others go on. The report is written
-        after each job.
+        A job that fails leaves a record that says why, and the others go on. After each job
+        ``report`` is given all records; without one they become a report in the folder.
 
         Raises:
             InputError: an option does not exist or fit; found before anything is run.
             OutputError: the folder cannot be written.
         """
-        settings = [self._runner.settings(job.task) for job in jobs]
+        settings = self.check(jobs)
+        report = report or self._write_report
         prepare_output_folder(self._output)
         records: list[Record] = []
         for number, (job, values) in enumerate(zip(jobs, settings, strict=True), start=1):
             name = f"{job.scene.name} {job.variant}".strip()
             self._say(f"[{number}/{len(jobs)}] {self._benchmark.name}: {name}")
             self._process(job, values)
-            records = self._ordered(records_below(self._output, self._benchmark.name), jobs)
-            write_report(self._output, self._benchmark, records)
+            records = self.records(jobs)
+            report(records)
         return records
 
-    def _ordered(self, records: Sequence[Record], jobs: Sequence[BenchmarkJob]) -> list[Record]:
+    def check(self, jobs: Sequence[BenchmarkJob]) -> list[dict[str, object]]:
+        """The settings of each job. Raises InputError where an option does not exist or fit."""
+        return [self._runner.settings(job.task) for job in jobs]
+
+    def _write_report(self, records: list[Record]) -> None:
+        title = self._benchmark.title
+        write_report(self._output, title, [Chapter(self._benchmark, records)])
+
+    def records(self, jobs: Sequence[BenchmarkJob]) -> list[Record]:
+        """What the folder holds of this benchmark by now, in the order of the jobs."""
+        records = records_below(self._output, self._benchmark.name)
         scenes = [*self._benchmark.scenes, *(job.scene.name for job in jobs)]
         variants = [job.variant for job in jobs]
 
@@ -151,7 +166,7 @@ def score_given(
     )  # fmt: skip
     record = Record(benchmark.name, scene.name, "", str(result.path), provenance)
     record = scored(replace(record, cost=cost_of(result, seconds)), scene, result)
-    write_report(output, benchmark, [record])
+    write_report(output, benchmark.title, [Chapter(benchmark, [record])])
     return [record]
 
 

@@ -9,9 +9,6 @@ from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
 from geogs_bench.runners.task import Command, Task
 
-_BUDGET = 120.0
-"""Seconds of reconstructions beside runs."""
-
 
 @dataclass(frozen=True)
 class Selection:
@@ -67,7 +64,7 @@ def make_jobs(
     Raises:
         InputError: a variant that is named does not exist, or can be run on none of the scenes.
     """
-    variants = _variants(benchmark, selection)
+    variants = variants_of(benchmark, selection)
     known = [variant.name for variant in variants]
     if missing := [name for name in selection.variants if name not in known]:
         raise InputError(
@@ -86,7 +83,7 @@ def make_jobs(
     return jobs
 
 
-def _variants(benchmark: Benchmark, selection: Selection) -> list[Variant]:
+def variants_of(benchmark: Benchmark, selection: Selection) -> list[Variant]:
     """The benchmark's variants, at each budget, and the baseline at each."""
     variants = list(benchmark.variants)
     budgets = selection.budgets or benchmark.budgets
@@ -126,10 +123,6 @@ def _job(
     options = merged(scene.options, selection.options, variant.options)
     folder = output / scene.name / variant.name
     command = variant.command or benchmark.command
-    if benchmark.by_kind and scene.kind in ("object", "scan"):
-        command = "reconstruct"
-        budget = (Option("budget", f"{_BUDGET:g}s"),)
-        options = merged(budget, [o for o in options if o.name != "online-results"])
     return BenchmarkJob(scene, variant.name, Task(command, scene.source, folder, options))
 
 

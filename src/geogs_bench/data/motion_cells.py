@@ -1,7 +1,7 @@
 """The matrix of motions and cameras that ``geogs bench motions`` renders, and finds again."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import folders_like
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
 from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
+from geogs_synth.scene.light_changes import LampKind
 
 if TYPE_CHECKING:
     from geogs_synth.raycast.raycaster import Raycaster
@@ -30,11 +31,23 @@ class Cell:
     """Share of the image that moves."""
     seed: int = 0
     """Seed of the place and of the path."""
+    lamps: LampKind = "steady"
+    """Whether the light changes on the way."""
 
     @property
     def place(self) -> MotionKind:
         """One of the motions through the same place, of which there are four."""
         return self.motion if self.motion in PLACES else "handheld"
+
+
+ROOM = Cell("synthetic-0", "handheld", Flaws(), 280, 640, 480)
+"""A room in whose frames the path comes back to its start."""
+
+
+def relighted(cell: Cell) -> Cell:
+    """The same path in a light that changes, by a camera whose exposure follows it."""
+    flaws = replace(cell.flaws, gain_drift=0.7, colour_drift=0.1, vignetting=0.3)
+    return replace(cell, name=f"{cell.name}-light", flaws=flaws, lamps="switched")
 
 
 PLACES: tuple[MotionKind, ...] = ("handheld", "dining", "driving", "corridor")
@@ -166,6 +179,6 @@ def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
 
     write_sequence(
         folder, cell.frames, cell.width, cell.height, cell.seed,
-        motion=cell.motion, flaws=cell.flaws, moving=cell.moving,
+        motion=cell.motion, flaws=cell.flaws, moving=cell.moving, lamps=cell.lamps,
         threads=available_cores(), raycaster=raycaster,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """What a benchmark leaves in its folder: results.json, results.md and report/index.html."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geogs.evaluation.pages.page import (
@@ -19,17 +20,35 @@ from geogs_bench.scoring.score_pictures import PICTURES
 from geogs_bench.tables.result_tables import Table, published_tables, result_tables
 
 
-def write_report(output: Path, benchmark: Benchmark, records: Sequence[Record]) -> None:
+@dataclass(frozen=True)
+class Chapter:
+    """A benchmark and its records, alone or as a part of a suite."""
+
+    benchmark: Benchmark
+    records: Sequence[Record]
+    """Their folders are relative to that of the whole report."""
+    prefix: str = ""
+    """Before the titles of its tables, where a report has several benchmarks."""
+
+
+def write_report(output: Path, title: str, chapters: Sequence[Chapter]) -> None:
     """Write all three files from the records.
 
     Raises:
         OutputError: they cannot be written.
     """
-    write_json(output / "results.json", list(records))
-    write_text(output / "results.md", markdown(benchmark, records))
-    curves = output / "report" / "convergence.png"
-    has_curves = plot_curves(curves, records)
-    _write_page(output, benchmark, records, curves if has_curves else None)
+    records = [record for chapter in chapters for record in chapter.records]
+    write_json(output / "results.json", records)
+    texts = [markdown(chapter.benchmark, chapter.records) for chapter in chapters]
+    write_text(output / "results.md", "\n".join(texts))
+    sections = [part for chapter in chapters for part in _sections(output, chapter)]
+    write_page(output / "report" / "index.html", title, sections, " ".join(_provenance(records)))
+
+
+def chapter_tables(chapter: Chapter) -> list[Table]:
+    """All its tables with a number."""
+    tables = result_tables(chapter.benchmark, chapter.records)
+    return [replace(table, title=chapter.prefix + table.title) for table in tables]
 
 
 def markdown(benchmark: Benchmark, records: Sequence[Record]) -> str:
@@ -55,14 +74,15 @@ def _provenance(records: Sequence[Record]) -> list[str]:
     return [*made, *warning]
 
 
-def _write_page(
-    output: Path, benchmark: Benchmark, records: Sequence[Record], curves: Path | None
-) -> None:
-    sections: list[Section] = [_section(t) for t in result_tables(benchmark, records)]
-    if curves is not None:
-        sections.append(PictureSection("Error over time", curves))
+def _sections(output: Path, chapter: Chapter) -> list[Section]:
+    """Tables, curves, notes, what papers printed, pictures."""
+    benchmark, records = chapter.benchmark, chapter.records
+    sections: list[Section] = [_section(table) for table in chapter_tables(chapter)]
+    curves = output / "report" / f"{benchmark.name}-convergence.png"
+    if plot_curves(curves, records):
+        sections.append(PictureSection(f"{chapter.prefix}Error over time", curves))
     if benchmark.notes:
-        sections.append(TextSection("Notes", "\n".join(benchmark.notes)))
+        sections.append(TextSection(f"{chapter.prefix}Notes", "\n".join(benchmark.notes)))
     sections += [_section(table) for table in published_tables(benchmark)]
     for record in records:
         name = f"{record.scene} {record.variant}".strip()
@@ -70,8 +90,7 @@ def _write_page(
         sections += [
             PictureSection(f"{name}: {title}", report / file) for file, title in PICTURES.items()
         ]
-    subtitle = " ".join(_provenance(records))
-    write_page(output / "report" / "index.html", benchmark.title, sections, subtitle)
+    return sections
 
 
 def _section(table: Table) -> TableSection:

@@ -10,7 +10,6 @@ from geogs_bench.results.record import (
     Place,
     Record,
     StageName,
-    StageScore,
     SurfaceScore,
     Weighting,
 )
@@ -229,38 +228,40 @@ def place(kind: Place, name: str) -> Value:
     return _of(lambda record: record.place(kind), name)
 
 
-def result_layout() -> Layout:
-    """The last stage of runs and of reconstructions, in one table."""
+def efficiency_layout(published: PublishedTable) -> Layout:
+    """How large the model is, and how good; published figures beside ours."""
 
-    def last(record: Record) -> StageScore | None:
-        return record.stages[-1] if record.stages else None
+    def column(title: str, metric: str, value: Value, digits: int) -> Column:
+        return Column(title, value, digits, Published(published, metric))
 
-    def field(measure: str, *weightings: Weighting) -> Value:
-        def scored(record: Record) -> SurfaceScore | None:
-            stage = last(record)
-            found = (s for w in weightings if stage and (s := stage.surface(w)))
-            return next(found, None)
-
-        return _of(scored, measure)
-
-    last_ate = _of(lambda record: (stage := last(record)) and stage.trajectory, "ate")
-    surfaces: tuple[Weighting, Weighting] = ("area", "points")
+    chamfer = _of(_surface_of_result, "chamfer")
     return Layout(
-        "Results",
+        "Model efficiency",
         (
-            Column("ATE after the stream (cm)", trajectory("online", "ate"), 3),
-            Column("ATE of the result (cm)", last_ate, 3),
-            Column("Acc ({unit})", field("accuracy", *surfaces)),
-            Column("Comp ({unit})", field("completeness", *surfaces)),
-            Column("Comp.Rat (%)", field("ratio", "area"), 1),
-            Column("CD ({unit})", field("chamfer", *surfaces)),
-            Column("agreement of held-out images (%)", figure("photo", "score"), 1),
-            Column("thousand disks", figure("cost", "disks", 1e-3), 1),
-            Column("seconds", figure("cost", "seconds"), 1),
+            column("thousand disks", "thousand disks", figure("cost", "disks", 1e-3), 1),
+            column("map (MB)", "MB", figure("cost", "map_bytes", 1e-6), 2),
+            column("CD ({unit})", "CD", chamfer, 2),
         ),
-        "Of the result, whichever stage that is: rooms in cm, area-weighted, objects in mm, DTU by "
-        "its protocol where the official files are there.",
+        "MB are those of the map's file; a disk has ten numbers of four bytes.",
     )
+
+
+def curve_layout(seconds: Sequence[float]) -> Layout:
+    """Error of the surface as it stood after so many seconds, and of the result."""
+
+    def after(moment: float) -> Value:
+        return _of(lambda r: next((p.surface for p in r.curve if p.seconds == moment), None),
+                   "chamfer")  # fmt: skip
+
+    moments = (Column(f"CD after {s:g} s ({{unit}})", after(s)) for s in seconds)
+    result = Column("CD of the result ({unit})", _of(_surface_of_result, "chamfer"))
+    return Layout("Convergence", (*moments, result))
+
+
+def _surface_of_result(record: Record) -> SurfaceScore | None:
+    """By DTU's protocol where that was measured, else area-weighted."""
+    final = record.stage("final")
+    return None if final is None else final.surface("points") or final.surface("area")
 
 
 COST = Layout(

@@ -94,7 +94,7 @@ class Raycaster:
         self.scene = scene
         self._pool = ThreadPoolExecutor(threads)
         self._threads = threads
-        self._lightings = (self._compute_lighting(),)
+        self._lightings: tuple[Lighting, ...] = (self._compute_lighting(),)
         self._switched_at = np.zeros(0)
         self._use(())
 
