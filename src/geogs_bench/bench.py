@@ -16,7 +16,7 @@ from geogs_bench.harness import Harness, score_given
 from geogs_bench.plan import Selection, find_scenes, make_jobs
 from geogs_bench.runners.runner import Runner
 from geogs_bench.runners.task import Task
-from geogs_bench.suite import run_parts, suite_parts
+from geogs_bench.suite import run_parts, suite_parts, wanted_tables
 from geogs_bench.tables.benchmark_report import Chapter
 
 
@@ -45,8 +45,8 @@ def bench(settings: BenchOptions, say: Callable[[str], None]) -> BenchResult:
 
     if name in SUITES:
         suite, selection = SUITES[name], _selection(settings)
-        for command in {table.benchmark.command for table in suite.tables}:
-            Runner().settings(Task(command, Path(), output, selection.options))
+        for table, chosen in wanted_tables(suite, selection):  # before anything is rendered
+            Runner().settings(Task(table.benchmark.command, Path(), output, chosen.options))
         parts = suite_parts(suite, _data_of(settings, suite), output, selection, say)
         return BenchResult(output, run_parts(suite.title, parts, output, harness))
     benchmark = find_benchmark(name)

@@ -65,10 +65,7 @@ def suite_parts(
     """
     if data is not None and not data.is_dir():
         raise InputError(f"{data} is not a folder; {suite.name} needs {suite.needs}.")
-    selection = replace(selection, options=(*suite.options, *selection.options))
-    wanted = [(t, s) for t in suite.tables if (s := _selected(t.benchmark, selection)) is not None]
-    if not wanted:
-        raise InputError(f"no table of {suite.name} has a variant {selection.variants[0]}.")
+    wanted = wanted_tables(suite, selection)
     found = [_scenes_below(data, table.benchmark) for table, _ in wanted]
     cells = {c.name: c for (t, _), scenes in zip(wanted, found, strict=True) if not scenes
              for c in t.cells}  # fmt: skip
@@ -90,6 +87,19 @@ def suite_parts(
         if own:
             parts.append(SuitePart(test, make_jobs(test, own, output / test.name, chosen)))
     return parts
+
+
+def wanted_tables(suite: Suite, selection: Selection) -> list[tuple[SuiteTable, Selection]]:
+    """The tables that have a variant of those that are asked for, each with what of the choice
+    concerns it.
+
+    Raises InputError if there are none.
+    """
+    selection = replace(selection, options=(*suite.options, *selection.options))
+    wanted = [(t, s) for t in suite.tables if (s := _selected(t.benchmark, selection)) is not None]
+    if not wanted:
+        raise InputError(f"no table of {suite.name} has a variant {selection.variants[0]}.")
+    return wanted
 
 
 def run_parts(

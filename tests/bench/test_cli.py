@@ -124,7 +124,7 @@ def test_a_wrong_setting_is_found_before_anything_runs(room, tmp_path, capsys, s
 def test_the_options_of_the_ablations_exist_and_make_a_difference(room):
     counts = {
         "ablation-update": 3, "ablation-pose-lr": 6, "ablation-losses": 10, "ablation-init": 8,
-        "paper": 2,
+        "replica": 3, "convergence": 2,
     }  # fmt: skip
     for name, count in counts.items():
         benchmark = find_benchmark(name)

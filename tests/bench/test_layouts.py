@@ -12,7 +12,6 @@ from geogs.io.sources.sniff import open_source
 from geogs_bench.catalogue.registry import BENCHMARKS, find_benchmark
 from geogs_bench.data.benchmark_scene import Option
 from geogs_bench.data.dtu_scenes import find_dtu
-from geogs_bench.data.mixed_scenes import find_mixed
 from geogs_bench.data.posed_scenes import find_any_posed, find_objects, find_posed_rooms
 from geogs_bench.data.replica_scenes import find_relighted, find_replica, find_rooms
 from geogs_bench.data.sequence_scenes import (
@@ -82,26 +81,6 @@ def test_rooms_objects_and_light(tmp_path):
     (scene,) = find_objects(tmp_path)
     assert (scene.name, scene.kind) == ("jug", "object")
     assert [s.name for s in find_any_posed(tmp_path)] == ["jug"]
-
-
-def test_a_mix_of_rooms_and_objects_is_run_and_reconstructed(tmp_path):
-    for name in ("hall", "rooms/den", "objects/vase"):
-        folder = replica_scene(tmp_path / name)
-        touch(folder / "mesh.ply")
-    write_images(tmp_path / "objects" / "vase" / "results", ["mask000000.png"], *SIZE)
-    benchmark = find_benchmark("paper")
-    scenes = find_mixed(tmp_path)
-    assert [(s.name, s.kind) for s in scenes] == [
-        ("den", "room"), ("hall", "room"), ("vase", "object")
-    ]  # fmt: skip
-    selection = Selection(options=(Option("online-results"),))
-    jobs = make_jobs(benchmark, scenes, tmp_path / "out", selection)
-    commands = {(j.scene.name, j.variant): j.task.command for j in jobs}
-    assert commands["den", "paper"] == "run"
-    assert commands["vase", "default"] == commands["vase", "paper"] == "reconstruct"
-    vase = next(options_of(j.task) for j in jobs if (j.scene.name, j.variant) == ("vase", "paper"))
-    assert "online-results" not in vase
-    assert (vase["budget"], vase["preset"]) == ("120s", "paper")
 
 
 def test_known_poses_use_about_a_hundred_images(tmp_path):

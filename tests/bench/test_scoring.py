@@ -12,7 +12,7 @@ from geogs.evaluation.surfaces.surface import Surface
 from geogs.io.writers.ply_writer import write_mesh
 from geogs_bench import published as paper
 from geogs_bench.catalogue.ablations import MAP_UPDATE
-from geogs_bench.catalogue.registry import DTU, REPLICA, TUM
+from geogs_bench.catalogue.data_sets import DTU, REPLICA, TUM
 from geogs_bench.results.record import (
     Cost,
     CurvePoint,
@@ -27,7 +27,7 @@ from geogs_bench.results.record import (
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.room_scores import with_short_edges
 from geogs_bench.scoring.scores import scored
-from geogs_bench.tables.benchmark_report import markdown, write_report
+from geogs_bench.tables.benchmark_report import Chapter, markdown, write_report
 from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
@@ -225,7 +225,7 @@ def test_an_ablation_compares_means_over_scenes_that_all_variants_finished(tmp_p
     assert "| per-keyframe | 2.00 | 2.16 |" in text
     assert "every variant finished: a." in text
     assert "| b, per-keyframe | Lost. |" in text
-    write_report(tmp_path, MAP_UPDATE, rows)
+    write_report(tmp_path, MAP_UPDATE.title, [Chapter(MAP_UPDATE, rows)])
     page = (tmp_path / "report" / "index.html").read_text()
     assert "Lost." in page
     assert "2.16" in page
@@ -234,9 +234,10 @@ def test_an_ablation_compares_means_over_scenes_that_all_variants_finished(tmp_p
 
 def test_curves_are_drawn(tmp_path):
     curve = tuple(CurvePoint(s, 10, surface("area", 1 / s)) for s in (1.0, 2.0))
-    write_report(tmp_path, DTU, [replace(record("scan24"), curve=curve)])
-    assert (tmp_path / "report" / "convergence.png").is_file()
-    assert "convergence.png" in (tmp_path / "report" / "index.html").read_text()
+    made = [replace(record("scan24"), curve=curve)]
+    write_report(tmp_path, DTU.title, [Chapter(DTU, made)])
+    assert (tmp_path / "report" / "dtu-convergence.png").is_file()
+    assert "dtu-convergence.png" in (tmp_path / "report" / "index.html").read_text()
 
 
 def test_published_tables_are_complete_and_their_means_are_those_printed():

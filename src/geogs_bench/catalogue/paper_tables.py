@@ -62,11 +62,16 @@ PAPER_TABLES = Suite(
     ),
 )
 
-_FEW_ROWS = (
-    "default", "online", "paper", "random-7", "local-plane-7", "paper-random-7",
-    "paper-local-plane-7", "per-keyframe", "coherent", "off", "4e-4", "all", "no-multi-view",
-    "paper-all", "paper-no-multi-view",
-)  # fmt: skip
+_FEW_ROWS = {
+    "scannet": ("default", "paper"),
+    "scannetpp": ("default", "paper"),
+    "ablation-init": ("random-7", "local-plane-7"),
+    "ablation-update": ("per-keyframe", "coherent"),
+    "ablation-pose-lr": ("off", "4e-4"),
+    "ablation-losses": ("all", "no-multi-view"),
+    "light": ("default",),
+}
+"""Of the tables that have more than the small suite makes."""
 _SECONDS = 8.0
 """Of each reconstruction from known poses."""
 
@@ -74,11 +79,13 @@ _SECONDS = 8.0
 def _small(table: SuiteTable) -> SuiteTable:
     """Few rows of few small images."""
     test = table.benchmark
-    budgets = (_SECONDS,) if test.budgets else ()
+    if test.name in _FEW_ROWS:
+        test = replace(test, variants=_of(test, _FEW_ROWS[test.name]))
+    if test.budgets:
+        test = replace(test, budgets=(_SECONDS,))
     is_pair = table.find_stand_ins is find_relighted
     cells = table.cells if is_pair else table.cells[:1]
-    few = replace(test, variants=_of(test, _FEW_ROWS), budgets=budgets)
-    return SuiteTable(few, table.find_stand_ins, tuple(map(_small_cell, cells)))
+    return SuiteTable(test, table.find_stand_ins, tuple(map(_small_cell, cells)))
 
 
 def _small_cell(cell: Cell) -> Cell:

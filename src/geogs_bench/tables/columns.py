@@ -246,14 +246,14 @@ def efficiency_layout(published: PublishedTable) -> Layout:
     )
 
 
-def curve_layout(seconds: Sequence[float]) -> Layout:
+def curve_layout(seconds: Sequence[int]) -> Layout:
     """Error of the surface as it stood after so many seconds, and of the result."""
 
-    def after(moment: float) -> Value:
+    def after(moment: int) -> Value:
         return _of(lambda r: next((p.surface for p in r.curve if p.seconds == moment), None),
                    "chamfer")  # fmt: skip
 
-    moments = (Column(f"CD after {s:g} s ({{unit}})", after(s)) for s in seconds)
+    moments = (Column(f"CD after {s} s ({{unit}})", after(s)) for s in seconds)
     result = Column("CD of the result ({unit})", _of(_surface_of_result, "chamfer"))
     return Layout("Convergence", (*moments, result))
 
