@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench_results import options_of
 from flat_rooms import SIZE, flat_room
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
@@ -21,7 +20,7 @@ from geogs_bench.data.sequence_scenes import (
     find_tum,
 )
 from geogs_bench.data.true_poses import read_true_poses
-from geogs_bench.plan import Selection, find_scenes, make_jobs
+from geogs_bench.plan import find_scenes
 from io_samples import write_images
 from posed_layouts import write_colmap_text, write_dtu, write_scannet
 

@@ -147,7 +147,7 @@ DTU = Benchmark(
     "official SampleSet/MVS Data (ObsMask, Points/stl) beside them",
     "https://github.com/hbb1/2d-gaussian-splatting (prepared scans); "
     "https://roboimagedata.compute.dtu.dk (SampleSet.zip, Points.zip)",
-    (dtu_layout(paper.DTU), photo_layout(), COST),
+    (dtu_layout(paper.DTU), photo_layout(), area_layout(posed=True), COST),
     (DEFAULT, PAPER),
     scenes=paper.DTU_SCENES,
     published=(paper.DTU,),

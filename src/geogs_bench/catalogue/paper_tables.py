@@ -15,7 +15,7 @@ from geogs_bench.catalogue.ablations import (
     POSE_RATE,
 )
 from geogs_bench.catalogue.data_sets import DTU, REPLICA, RGBD, SCANNET, SCANNETPP
-from geogs_bench.catalogue.variants import with_paper
+from geogs_bench.catalogue.variants import PAPER, with_paper
 from geogs_bench.data.benchmark_scene import BenchmarkScene, Option
 from geogs_bench.data.dtu_scenes import find_dtu
 from geogs_bench.data.motion_cells import ROOM, Cell, relighted
@@ -74,18 +74,34 @@ _FEW_ROWS = {
 """Of the tables that have more than the small suite makes."""
 _SECONDS = 8.0
 """Of each reconstruction from known poses."""
+_COARSE = Option("mesh.voxel", "0.03")
+"""Metres, for these."""
+_DENSE = (Option("mapping.disk.stride", "3"), Option("mapping.disk.edge-stride", "3"))
+_DENSE_NOTE = (
+    "Rows of the paper have a disk at every third pixel instead of every eighth, as the images are "
+    "a fifth as wide as the paper's."
+)
 
 
 def _small(table: SuiteTable) -> SuiteTable:
     """Few rows of few small images."""
     test = table.benchmark
-    if test.name in _FEW_ROWS:
-        test = replace(test, variants=_of(test, _FEW_ROWS[test.name]))
-    if test.budgets:
-        test = replace(test, budgets=(_SECONDS,))
+    rows = _of(test, _FEW_ROWS[test.name]) if test.name in _FEW_ROWS else test.variants
+    coarse = (_COARSE,) if test.budgets else ()
+    rows = tuple(
+        replace(row, options=(*row.options, *coarse, *(_DENSE if _is_papers(row) else ())))
+        for row in rows
+    )
+    notes = (*test.notes, _DENSE_NOTE) if any(map(_is_papers, rows)) else test.notes
+    budgets = (_SECONDS,) if test.budgets else ()
+    test = replace(test, variants=rows, notes=notes, budgets=budgets)
     is_pair = table.find_stand_ins is find_relighted
     cells = table.cells if is_pair else table.cells[:1]
     return SuiteTable(test, table.find_stand_ins, tuple(map(_small_cell, cells)))
+
+
+def _is_papers(row: Variant) -> bool:
+    return PAPER.options[0] in row.options
 
 
 def _small_cell(cell: Cell) -> Cell:
