@@ -1,20 +1,18 @@
 """Self-calibration: error of the focal length, and what it costs the trajectory.
 
     python benchmarks/calibration.py NAME=FOLDER... [--frames 300] [--field-of-view 60]
-        [--starts 0,100,200] [--device cpu] [--no-tracking] [--offset 0.025]
+        [--starts 0,100,200] [--device cpu] [--no-tracking]
 
 FOLDER is in Replica or 7-Scenes layout. The known focal length and poses are read for the printed
 errors only; the search begins at the field of view given, with the principal point in the middle.
 --starts estimates from those frames on, as if the video began there;
 the trajectories are tracked, and adjusted as a whole, from frame 0 with the known focal length and
-with the one estimated there. --offset is for poses of another camera: how many metres to the right
-of it the one stands that took the images (7-Scenes: 0.025).
+with the one estimated there.
 """
 
 import argparse
 import math
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,32 +21,12 @@ import torch
 from geogs.config import InputConfig
 from geogs.evaluation.trajectory_errors import evaluate_trajectory
 from geogs.geometry.camera import Camera
-from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.self_calibration import self_calibrate
 from geogs.tracking.tracker import lone_tracker
-from geogs.types import Frame, Trajectory
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """Frames with what is known of them."""
-
-    camera: Camera
-    frames: list[Frame]
-    T_wc: np.ndarray
-
-
-def load(path: Path, count: int) -> Sequence:
-    """The first frames of a sequence."""
-    source = open_source(path, InputConfig(stop=count))
-    if (path / "traj.txt").is_file():
-        T_wc = np.loadtxt(path / "traj.txt").reshape(-1, 4, 4)
-    else:
-        T_wc = np.stack([np.loadtxt(f) for f in sorted((path / "seq-01").glob("*.pose.txt"))])
-    frames = list(source)
-    return Sequence(source.camera, frames, T_wc[: len(frames)])
+from geogs.types import Trajectory
+from sequences import Sequence, load
 
 
 def guess(camera: Camera, degrees: float) -> Camera:
@@ -79,7 +57,6 @@ def main() -> None:
     parser.add_argument("--starts", default="0")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--radial", action="store_true")
-    parser.add_argument("--offset", type=float, default=0.0)
     parser.add_argument("--no-tracking", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -90,8 +67,7 @@ def main() -> None:
     print("|---" * 13 + "|")
     for item in options.sequences:
         name, _, path = item.partition("=")
-        sequence = load(Path(path), options.frames)
-        sequence.T_wc[:, :3, 3] += options.offset * sequence.T_wc[:, :3, 0]
+        sequence = load(Path(path), InputConfig(stop=options.frames))
         first = guess(sequence.camera, options.field_of_view)
         known = sequence.camera.fx
         for start in map(int, options.starts.split(",")):

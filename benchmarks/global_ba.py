@@ -34,8 +34,8 @@ from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.world.segments import TrackState
 from geogs_synth.sequence.location import centred_camera
 from planted_walk import CAMERA, drift, planted_tracker
+from sequences import align
 from suite import Suite
-from tracking import align
 
 
 def error_cm(tracker: Tracker, truth: torch.Tensor) -> float:

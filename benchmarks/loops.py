@@ -2,7 +2,7 @@
 
     python benchmarks/loops.py FOLDER[:POINTS.ply] ... [--every 5] [--long-edge 512] [--drift 1]
 
-Each FOLDER is one that benchmarks/tracking.py reads. POINTS.ply holds points of the visible
+Each FOLDER is in Replica or 7-Scenes layout. POINTS.ply holds points of the visible
 surface; without it, points_seen_1cm.ply or tsdf_pseudo_gt.ply of the folder is taken. No tracker
 runs: keyframes are every n-th frame with depth from the points (3 % smooth error) and true poses
 with a drift (a random walk of 0.3 degrees, 4 mm and 1 % scale per keyframe, times --drift). Ground
@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from geogs.bundle.device_choice import grid_fields
-from geogs.config import LoopConfig
+from geogs.config import InputConfig, LoopConfig
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense_check import dense_check
@@ -36,7 +36,7 @@ from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs.world.loops import ImageFeatures
-from tracking import Sequence, load
+from sequences import load
 
 OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 5.0, 0.1
 SIMILAR = 30.0
@@ -121,8 +121,7 @@ def prepare(
     folder: Path, points: Path, every: int, long_edge: int, drift: float
 ) -> tuple[KeyframeSet, ClassicalFlow, Truth]:
     """Keyframes as a drifting tracker would have left them, and the truth about them."""
-    whole = load(folder, long_edge, None)
-    sequence = Sequence(whole.files[::every], whole.camera, whole.T_wc[::every], None)
+    sequence = load(folder, InputConfig(long_edge=long_edge, stride=every))
     grid = SampleGrid(sequence.camera)
     depth = depths(read_surface(points).vertices, sequence.T_wc, grid)
     T_cw = se3_inverse(torch.from_numpy(sequence.T_wc))
@@ -130,7 +129,7 @@ def prepare(
     scale = np.exp(np.cumsum(drift * 0.01 * rng.standard_normal(len(depth))))
     store, operator = KeyframeTable.on(grid).new_set(), ClassicalFlow(grid)
     T, fields = T_cw[0], grid_fields(grid)
-    for n, frame in enumerate(sequence.frames()):
+    for n, frame in enumerate(sequence.frames):
         if n:
             step = T_cw[n] @ se3_inverse(T_cw[n - 1])
             step[:3, 3] *= scale[n]

@@ -33,7 +33,7 @@ from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.motion.handheld import HandheldPath
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
-from tracking import align
+from sequences import align
 
 PRIORS = {"none": None, "good": PLAUSIBLE, "patchy": PATCHY, "bad": BAD}
 
