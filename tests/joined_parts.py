@@ -126,7 +126,7 @@ def make_part(folder: Path, places: np.ndarray, number: int, paint: int = 0) -> 
     disks = transformed(disks, S.expand(len(disks), 4, 4))
     ids = np.arange(len(places))
     views = MapViews(
-        CAMERA, DEPTH_CAMERA, 0.5, 0.02, np.zeros(3), 1.0, disks, ids, times[1::FRAMES], T_cw,
+        CAMERA, DEPTH_CAMERA, 0.5, 0.02, 0.04, np.zeros(3), 1.0, disks, ids, times[1::FRAMES], T_cw,
         np.zeros(len(ids), bool), True,
     )  # fmt: skip
     save_map_with_views(folder / "map.safetensors", disks, views, {"source": folder.name})

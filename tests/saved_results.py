@@ -66,7 +66,7 @@ def make_result(folder: Path, with_images: bool = True) -> Path:
     T_cw[:, :3, 3] = UNIT * own[:, :3, 3] - own[:, :3, :3] @ ORIGIN
     times = np.array(IDS) / 30
     views = MapViews(
-        CAMERA, DEPTH_CAMERA, 0.5, 0.02, ORIGIN, UNIT, disks, np.array(IDS), times, T_cw,
+        CAMERA, DEPTH_CAMERA, 0.5, 0.02, 0.04, ORIGIN, UNIT, disks, np.array(IDS), times, T_cw,
         np.arange(len(IDS)) == MASKED, with_images,
     )  # fmt: skip
     save_map_with_views(folder / "map.safetensors", world, views, {"source": "planes"})

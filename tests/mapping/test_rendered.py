@@ -1,17 +1,27 @@
 """The surface that blended disks show: of one at a slant their mean, of two one of them."""
 
 import math
+from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
-from geogs.config import MeshConfig
+from geogs.config import MappingConfig, MeshConfig, preset, reconstruct_preset
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.jumps import JUMP
 from geogs.mapping.rendered import SurfaceMaps, SurfaceRules, rendered_surface
 from geogs.world.disks import DiskParameters
 
 CAMERA = Camera(160.0, 160.0, 159.5, 31.5, 320, 160)
-RULES = SurfaceRules(min_alpha=0.5, max_spread=0.01)
+RULES = SurfaceRules.of(MappingConfig())
+EVERY_RULE = {
+    SurfaceRules.of(of_command(name).mapping)
+    for of_command in (preset, reconstruct_preset)
+    for name in ("default", "fast", "accurate", "paper")
+}
+ABSURD = {replace(RULES, plane_reach=reach) for reach in (1.0, 2e6, math.inf)}
 HEIGHT = 1.2
 
 
@@ -39,10 +49,12 @@ def uneven_road() -> DiskParameters:
     return disks(position, lean, 0.03 * position[:, 2], 0.7)
 
 
-def show(map_of: DiskParameters, mask: Tensor | None = None) -> SurfaceMaps:
+def show(
+    map_of: DiskParameters, mask: Tensor | None = None, rules: SurfaceRules = RULES
+) -> SurfaceMaps:
     """What the camera sees at the origin."""
     with torch.no_grad():
-        return rendered_surface(map_of, CAMERA, torch.eye(4, dtype=torch.float64), RULES, mask)
+        return rendered_surface(map_of, CAMERA, torch.eye(4, dtype=torch.float64), rules, mask)
 
 
 def test_an_uneven_road_is_one_surface_far_ahead():
@@ -86,3 +98,45 @@ def test_one_view_makes_a_surface_but_for_its_ends():
     inside = ((x - step + 0.5).abs() > 4) & (x < 247)
     assert float((maps.weight[inside] >= least).float().mean()) > 0.99
     assert float(maps.weight[x >= 250].abs().max()) == 0
+
+
+def walls_and_hole() -> DiskParameters:
+    """The walls of :func:`two_walls`, of which the far one lacks what is right of x = z / 2, and
+    with all disks off their wall by 0.2 % of its distance."""
+    walls = two_walls()
+    there = walls.position[:, 0] < 0.5 * walls.position[:, 2]
+    random = torch.Generator().manual_seed(1)
+    noise = 1 + 0.002 * torch.randn(len(walls.position), generator=random)
+    position = torch.cat([walls.position[:, :2], walls.position[:, 2:] * noise[:, None]], 1)
+    return DiskParameters(*(values[there] for values in walls._replace(position=position)))
+
+
+@pytest.mark.parametrize("rules", sorted(EVERY_RULE | ABSURD, key=repr), ids=repr)
+def test_walls_stay_apart_and_holes_stay_holes_by_every_rule(rules):
+    assert len(EVERY_RULE) == 3
+    maps = show(walls_and_hole(), rules=rules)
+    x = torch.arange(CAMERA.width).expand(CAMERA.height, -1)
+    hole = x > 240 + 8  # disks reach over the end of their wall
+    assert float(maps.depth[hole].abs().max()) == 0
+    assert float(maps.weight[hole].abs().max()) == 0
+    for wall, side in ((2.0, x < 160 - 8), (4.0, (x > 160 + 8) & (x < 240 - 8))):
+        off = maps.depth[side] / wall - 1
+        assert float(off.abs().max()) < 0.01
+        assert float(off.mean().abs()) < 0.003  # disks in front hide those behind
+
+
+@pytest.mark.parametrize("rules", sorted(EVERY_RULE | ABSURD, key=repr), ids=repr)
+def test_a_floor_stays_a_plane_by_every_rule(rules):
+    floor = uneven_road()
+    level = torch.full_like(floor.opacity_logit, math.pi / 2)
+    maps = show(disks(floor.position, level, 0.02 * floor.position[:, 2], 0.7), rules=rules)
+    rays = CAMERA.rays()
+    true = HEIGHT / rays[..., 1].clamp(min=1e-3)
+    seen = (true > 4) & (true < 8) & ((rays[..., 0] * true).abs() < 2)
+    assert float((maps.depth / true - 1)[seen].abs().max()) < 1e-3
+
+
+def test_no_run_may_average_farther_than_a_jump():
+    assert MappingConfig(plane_reach=JUMP).plane_reach == JUMP
+    with pytest.raises(InputError, match="plane-reach"):
+        MappingConfig(plane_reach=1.01 * JUMP)

@@ -144,8 +144,10 @@ class MappingConfig(Settings, group="mapping"):
     """Adam step of the pose tangents: radians, and u for translations."""
     max_spread: Weight = 0.01
     """Surfaces take the mean depth of a ray where the median differs by less (at a slant: along the
-    normal), else the median, and then its average over the planes of the pixels around that differ
-    no more; 0: the median."""
+    normal), else the median; 0: the median."""
+    plane_reach: Annotated[float, Range(0, 0.04)] = 0.02
+    """Surfaces take the average depth over the planes of the pixels around that differ by less,
+    which takes out noise; 0: what each ray has itself."""
     disk: DiskConfig = field(default_factory=DiskConfig)
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)

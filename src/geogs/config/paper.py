@@ -81,6 +81,7 @@ def paper_mapping() -> MappingConfig:
         pose_every=1,
         pose_lr=4e-4,
         max_spread=_UNBOUNDED,
+        plane_reach=0.0,
         disk=paper_disks(),
         photo=PhotoConfig(per_step=1, fresh=True, compensate_exposure=False),
         depth=DepthConfig(engine="tracker", bare_planes=False),
@@ -99,6 +100,7 @@ def paper_known_pose_mapping(usual: MappingConfig) -> MappingConfig:
         depth=replace(usual.depth, bare_planes=False),
         photo_scale=1.0,
         max_spread=_UNBOUNDED,
+        plane_reach=0.0,
         disk=replace(paper_disks(), insert_confidence=0.3, fill_confidence=0.1),
         photo=PhotoConfig(
             candidates=8, max_view_angle=30.0, per_step=1, fresh=True, compensate_exposure=False

@@ -46,6 +46,7 @@ def known_pose_mapping() -> MappingConfig:
         lr_position=3e-4,
         lr_final=0.03,
         max_spread=0.003,
+        plane_reach=0.006,
         photo=PhotoConfig(per_step=4),
         depth=DepthConfig(engine="classical"),
         loss=loss,

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.geometry.jumps import JUMP
 from geogs.gpu.kernels import kernels_for
 
 _SOURCE = Path(__file__).parent / "cuda" / "depth.cu"
@@ -50,11 +51,13 @@ def averaged_over_planes(
     the ray of any pixel p, which is linear in p. A pixel takes the mean of what those within
     ``radius`` say, itself included, each weighted by ``(1 - (e / reach)^2)^2`` (Tukey's biweight),
     where e is its relative distance from what the pixel had before, and not at all beyond
-    ``reach``; so planes stay as they are, however slanted, and steps stay steps. Pixels without
-    depth, and those that are seen at less than six degrees, stay as they are and say nothing.
+    ``reach``, nor beyond ``JUMP``; so planes stay as they are, however slanted, and steps stay
+    steps. Pixels without depth, and those that are seen at less than six degrees, stay as they are
+    and say nothing.
     """
     if reach < _LEAST_REACH:
         return depth
+    reach = min(reach, JUMP)
     slope = (normal * camera.rays(depth.dtype, depth.device)).sum(-1)
     good = (depth > 0) & (slope.abs() > 0.1)
     inverse = torch.where(good, 1 / depth.clamp(min=1e-9), 0.0)

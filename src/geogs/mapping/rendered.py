@@ -65,13 +65,14 @@ class SurfaceRules:
     min_alpha: float
     """Opacity above which the map hides what lies behind."""
     max_spread: float
-    """Relative difference of mean and median depth up to which a ray meets one surface, and from
-    the planes of the pixels around up to which these are the same surface."""
+    """Relative difference of mean and median depth up to which a ray meets one surface."""
+    plane_reach: float
+    """Relative distance up to which a depth is averaged over the planes of the pixels around."""
 
     @staticmethod
     def of(config: MappingConfig) -> "SurfaceRules":
         """The rules of a run's settings."""
-        return SurfaceRules(MIN_ALPHA, config.max_spread)
+        return SurfaceRules(MIN_ALPHA, config.max_spread, config.plane_reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +135,7 @@ def rendered_surface(
     jumps = depth_jumps(depth)
     ends = widened(jumps.near | jumps.far | (depth <= 0), _AROUND)
     weight = torch.where(single, 1.0, 0.5) * torch.where(ends, _AT_ENDS, 1.0) * (depth > 0)
-    if rules.max_spread > 0:
-        depth = averaged_over_planes(depth, normal, camera, _RADIUS, 2 * rules.max_spread)
+    depth = averaged_over_planes(depth, normal, camera, _RADIUS, rules.plane_reach)
     return SurfaceMaps(depth, normal, weight)
 
 

@@ -95,6 +95,7 @@ def write_map(
         render_camera=camera.with_long_edge(long_edge),
         min_alpha=first.min_alpha,
         max_spread=first.max_spread,
+        plane_reach=first.plane_reach,
         origin=WORLD.origin,
         unit=WORLD.unit,
         disks=disks,

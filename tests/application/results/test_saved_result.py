@@ -10,7 +10,7 @@ import geogs
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.keyframe_folder import image_path, read_image
-from geogs.io.writers.map_file import save_map
+from geogs.io.writers.map_file import load_map_file, save_map
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.types import Uncertainty
@@ -110,6 +110,18 @@ def test_frames_without_a_place_come_back_between_the_others(tmp_path):
     np.testing.assert_allclose(found.T_wc[tracked], whole.T_wc[tracked], atol=1e-12)
     np.testing.assert_allclose(found.T_wc[1, :3, :3], whole.T_wc[1, :3, :3], atol=1e-12)
     assert np.ptp(found.T_wc[2:, :3, 3], axis=0).max() > 0
+
+
+def test_a_map_that_tells_no_reach_of_its_planes_averages_over_twice_its_spread(tmp_path):
+    path = make_result(tmp_path) / "map.safetensors"
+    file = load_map_file(path)
+    del file.metadata["views"]["plane_reach"]
+    for spread, reach in ((0.003, 0.006), (1e6, 2e6)):
+        file.metadata["views"]["max_spread"] = spread
+        save_map(path, file.disks, file.metadata, file.tensors)
+        loaded = geogs.load_result(tmp_path)
+        assert loaded.renderer.rules.plane_reach == reach
+        assert torch.equal(loaded.keyframes[0].depth > 0, loaded.keyframes[0].weight > 0)
 
 
 def test_without_images_all_else_is_there(tmp_path):

@@ -61,6 +61,7 @@ def write_keyframes(
         render_camera=renderer.camera,
         min_alpha=renderer.rules.min_alpha,
         max_spread=renderer.rules.max_spread,
+        plane_reach=renderer.rules.plane_reach,
         origin=renderer.frame.origin,
         unit=renderer.frame.unit,
         disks=renderer.disks,

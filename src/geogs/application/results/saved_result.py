@@ -112,7 +112,7 @@ class SavedResult:
         """What shows the map from anywhere."""
         views = self.views
         frame = MapFrame(views.origin, views.unit)
-        rules = SurfaceRules(views.min_alpha, views.max_spread)
+        rules = SurfaceRules(views.min_alpha, views.max_spread, views.plane_reach)
         return MapRenderer(views.disks, frame, views.render_camera, rules)
 
     @on_one_torch_thread

@@ -138,6 +138,8 @@ class MapViews(ShortRepr):
     """Opacity above which the map hides what lies behind."""
     max_spread: float
     """Relative difference of mean and median depth up to which a ray meets one surface."""
+    plane_reach: float
+    """Relative distance up to which a depth is averaged over the planes of the pixels around."""
     origin: Float64[np.ndarray, "3"]
     """World coordinates of the origin of the map's own frame."""
     unit: float
@@ -176,6 +178,7 @@ def save_map_with_views(
         "render_camera": asdict(views.render_camera),
         "min_alpha": views.min_alpha,
         "max_spread": views.max_spread,
+        "plane_reach": views.plane_reach,
         "origin": views.origin.tolist(),
         "unit": views.unit,
         "has_images": views.has_images,
@@ -222,6 +225,8 @@ def _views(file: MapFile) -> MapViews:
         render_camera=camera_of(said["render_camera"]),
         min_alpha=float(said["min_alpha"]),
         max_spread=float(said["max_spread"]),
+        # Before the reach had a number of its own it was twice the spread.
+        plane_reach=float(said.get("plane_reach", 2 * said["max_spread"])),
         origin=origin,
         unit=unit,
         disks=MapSnapshot(position, disks.quaternion, scale, disks.opacity),
