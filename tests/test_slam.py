@@ -211,24 +211,6 @@ def test_the_papers_stage_lies_between_the_stream_and_the_refinement(small_resul
 
 
 @pytest.mark.long
-def test_the_preset_of_the_paper_runs_and_ends_with_the_adjustment(small_room, tmp_path):
-    out = tmp_path / "paper"
-    done = geogs(
-        "run", small_room, "--preset", "paper", "--stop", SMALL_FRAMES, "-o", out,
-        "--online-results", "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
-        "--mapping.pose-iterations", "1", "--mapping.window", "4", "--mapping.disk.stride", "4",
-        "--tracking.init-keyframes", "6", "--device", "cpu",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert not json.loads((out / "summary.json").read_text())["refined"]
-    assert (out / "online" / "mesh.ply").is_file()
-    assert not (out / "adjusted").exists()
-    assert cli.main(["eval", str(out), "--gt", str(small_room), "--no-plots"]) == 0
-    assert json.loads((out / "eval.json").read_text())["trajectory"]["ate_rmse_cm"] < 2.0
-    assert len(read_surface(out / "mesh.ply").faces) > 300
-
-
-@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_ground_truth_is_never_read(small_room, small_result, tmp_path):
     """Without the truth beside the images the poses come out the same, bit for bit.

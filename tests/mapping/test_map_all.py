@@ -120,6 +120,20 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
     assert not slam.world.is_refined
 
 
+@pytest.mark.parametrize("distance", [0.0, 0.009])
+def test_keyframes_that_nothing_removes_are_mapped_as_soon_as_they_exist(frames, distance):
+    config = quick()
+    tracking = replace(config.tracking, keyframe_distance=distance)
+    mapping = replace(config.mapping, lag=0, iterations=0)
+    slam = Slam(frames[0], replace(config, tracking=tracking, mapping=mapping), device="cpu")
+    waiting, keyframes = set(), slam.segments
+    for frame in frames[1]:
+        slam.process(frame)
+        if slam.world.map.mapped:
+            waiting.add(len(keyframes.keyframe_ids) - len(slam.world.map.mapped))
+    assert waiting == ({0} if distance == 0 else {1})
+
+
 def test_without_a_keyframe_there_is_no_map(frames):
     slam = Slam(frames[0], quick(), defers_map=True, device="cpu")
     slam.refine()

@@ -6,7 +6,7 @@ import torch
 
 from geogs.config import DiskConfig
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs.splat.init import face_camera, fit_local_planes, initialise_disks, randomly_oriented
+from geogs.splat.init import face_camera, fit_local_planes, initialise_disks, random_disks
 
 CONFIG = DiskConfig(planarity_shrink=0.1)
 
@@ -92,8 +92,8 @@ def started(points: torch.Tensor, **settings):
     return initialise_disks(points, torch.zeros(3), footprint, points[:0], config)
 
 
-def turned(points: torch.Tensor, seed: int = 0, **settings):
-    return randomly_oriented(started(points, **settings), torch.Generator().manual_seed(seed))
+def turned(points: torch.Tensor, seed: int = 0, opacity: float = 0.7):
+    return random_disks(points, points[:0], opacity, torch.Generator().manual_seed(seed))
 
 
 def test_unbounded_scales_are_3dgs_s_and_far_points_make_blankets():
@@ -108,11 +108,20 @@ def test_unbounded_scales_are_3dgs_s_and_far_points_make_blankets():
     assert bounded.log_scale[-1].exp().max() < 1.51 * 0.04
 
 
-def test_random_disks_differ_from_those_in_planes_by_their_orientation_alone():
+def test_random_disks_are_as_large_as_3dgs_makes_them():
+    random = torch.Generator().manual_seed(2)
+    points, existing = torch.rand(40, 3, generator=random), torch.rand(30, 3, generator=random)
+    points[7] = 30.0  # far from all, and as large as that asks for
+    nearest = torch.cdist(points, torch.cat([points, existing])).sort(1).values[:, 1:4]
+    disks = random_disks(points, existing, 0.7, random)
+    expected = nearest.square().mean(1).sqrt().log()[:, None].expand(-1, 2)
+    assert torch.allclose(disks.log_scale, expected, atol=1e-4)
+
+
+def test_random_disks_lie_anyhow():
     points = plane(60, 0.04)
-    disks, planes = turned(points, opacity=0.6), started(points, opacity=0.6)
+    disks = turned(points, opacity=0.6)
     assert torch.equal(disks.position, points)
-    assert torch.equal(disks.log_scale, planes.log_scale)
     assert torch.allclose(disks.opacity_logit.sigmoid(), torch.tensor(0.6))
     assert torch.allclose(disks.quaternion.norm(dim=1), torch.tensor(1.0))
     normal = quaternion_to_matrix(disks.quaternion)[..., 2]

@@ -12,7 +12,6 @@ from geogs.config import Config, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking import local_mapping
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs.world.grid import SampleGrid
@@ -253,13 +252,11 @@ def test_correct_scales_depth_with_the_pose():
 
 
 @pytest.mark.long
-def test_slow_motion_makes_few_keyframes_and_culling_removes_more(monkeypatch):
+def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
     slow = frames(sideways(30, 0.012))
     few, _ = run(slow)
-    monkeypatch.setattr(local_mapping, "CULL_DISTANCE", 0.0)
-    many, _ = run(slow, replace(CONFIG, keyframe_parallax=0.012))
-    monkeypatch.setattr(local_mapping, "CULL_DISTANCE", 0.02)
-    culled, _ = run(slow, replace(CONFIG, keyframe_parallax=0.012))
+    many, _ = run(slow, replace(CONFIG, keyframe_parallax=0.012, keyframe_distance=0.0))
+    culled, _ = run(slow, replace(CONFIG, keyframe_parallax=0.012, keyframe_distance=0.02))
     assert len(few.segment.ids) < len(many.segment.ids)
     assert len(culled.segment.ids) < len(many.segment.ids)
     assert len(culled.segment.ids) < culled.keyframes.table.next_id

@@ -99,7 +99,8 @@ class MapAblation(Settings, group="mapping.ablation"):
     """Other ways to start disks and to move them, to compare with."""
 
     initialisation: Literal["local_plane", "random"] = "local_plane"
-    """Disks start in the plane of the points around them, or as large but turned at random."""
+    """Disks start in the plane of the points around them, or turned at random and with the scales
+    of 3DGS: the distance to the three nearest points."""
     map_update: Annotated[Literal["blended", "coherent", "per_keyframe"], Only("run")] = "blended"
     """How the map follows a correction of the poses: each disk with all keyframes that see it in
     place, all by one similarity (the paper's), or each with the keyframe that made it."""
@@ -118,7 +119,8 @@ class MappingConfig(Settings, group="mapping"):
     which takes less time and shows nothing before; auto: after, where images come from files,
     nobody looks on, and there is a final training."""
     lag: Annotated[CountOrZero, Only("run")] = 4
-    """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
+    """A keyframe that is not removed any more (see tracking.keyframe-distance) is mapped once this
+    many later ones are so, too, so that its depth can be searched."""
     window: Annotated[Count, Only("run")] = 8
     """Recent keyframes that are trained together."""
     iterations: Annotated[CountOrZero, Only("run")] = 8

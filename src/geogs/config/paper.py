@@ -15,7 +15,7 @@ from geogs.config.mapping_config import (
     PhotoConfig,
 )
 from geogs.config.prior_config import PriorConfig
-from geogs.config.tracking_config import LoopConfig
+from geogs.config.tracking_config import LoopConfig, TrackingConfig
 
 LONG_EDGE = 616
 """Pixels; as large as the front ends that the paper builds on have Replica's images."""
@@ -107,6 +107,11 @@ def paper_known_pose_mapping(usual: MappingConfig) -> MappingConfig:
         ),
         loss=replace(paper_losses(), depth_weight=0.0, normal_weight=0.0),
     )
+
+
+def paper_tracking() -> TrackingConfig:
+    """Keyframes that stay, so that each is mapped as soon as it exists."""
+    return TrackingConfig(keyframe_distance=0.0)
 
 
 def paper_loops() -> LoopConfig:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, get_args
 from geogs.config.input_config import InputConfig
 from geogs.config.mapping_config import MappingConfig
 from geogs.config.mesh_config import MeshConfig
-from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior
+from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior, paper_tracking
 from geogs.config.prior_config import DepthSensorConfig, OdometryConfig, PriorConfig
 from geogs.config.setting import Count, Range, Settings
 from geogs.config.tracking_config import CalibrationConfig, LoopConfig, TrackingConfig
@@ -75,6 +75,7 @@ def preset(name: Preset, on_gpu: bool = False) -> Config:
         return replace(
             base,
             input=replace(base.input, long_edge=LONG_EDGE),
+            tracking=paper_tracking(),
             prior=paper_prior(),
             loop=paper_loops(),
             mapping=paper_mapping(),

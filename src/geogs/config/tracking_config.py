@@ -47,6 +47,10 @@ class TrackingConfig(Settings, group="tracking"):
     keyframe_overlap: Fraction = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""
+    keyframe_distance: Fraction = 0.009
+    """A keyframe is removed again when the next one has come and less lies between it and the one
+    before: DROID-SLAM's frame distance, of the long edge. 0 removes none, and each is final, and
+    mapped, as soon as it exists."""
     init_keyframes: Annotated[int, Range(4, 1000)] = 12
     """Keyframes gathered before the map is started."""
     window: Annotated[int, Range(1, 1000)] = 8

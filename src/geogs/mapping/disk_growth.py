@@ -10,7 +10,7 @@ from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import confident_jumps
 from geogs.splat.density import spread_candidates, unexplained, worth_keeping
-from geogs.splat.init import NEIGHBOURS, initialise_disks, randomly_oriented
+from geogs.splat.init import NEIGHBOURS, initialise_disks, random_disks
 from geogs.splat.render import render
 from geogs.world.map import MapTable
 
@@ -65,11 +65,13 @@ class DiskGrowth:
             return
         footprint = spacing * z / camera.fx
         existing = disks.position.detach()
+        if self.config.ablation.initialisation == "random":
+            new = random_disks(points, existing, config.opacity, self.table.random.of_torch)
+            disks.append(new, view.id)
+            return
         seen = None
         if config.fit_normals:
             normals = fitted_normals(depth, confidence, camera, (v, u), config.stride)
             seen = normals @ T_wc[:3, :3].T
         new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config, seen)
-        if self.config.ablation.initialisation == "random":
-            new = randomly_oriented(new, self.table.random.of_torch)
         disks.append(new, view.id)

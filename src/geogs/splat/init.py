@@ -16,6 +16,8 @@ NEIGHBOURS = 12
 """Points of the local plane fit: enough for noise to average, few enough to follow edges."""
 MIN_COSINE = 0.15
 """Least cosine of a disk's normal to its own camera: one that is seen edge-on gets no gradient."""
+# Scale of points in one place, map units.
+_LEAST_SCALE = 1e-7
 # Margin around some points, over their extent, in which neighbours are searched first.
 _MARGIN = 0.05
 
@@ -31,7 +33,7 @@ class LocalPlane:
     planarity: Float[Tensor, "n"]
     """(l1 - l0) / l2 in [0, 1]: near 1 on an evenly sampled plane, 0 on a line or a blob."""
     spacing: Float[Tensor, "n"]
-    """Root mean square distance to the three nearest other points, map units."""
+    """Root mean square distance to the three nearest other points, as 3DGS has it, map units."""
 
 
 def fit_local_planes(
@@ -127,7 +129,7 @@ def initialise_disks(
     tangent = plane.tangent - (plane.tangent * normal).sum(-1, keepdim=True) * normal
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     rotation = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)
-    spacing = plane.spacing.clamp(min=1e-7)
+    spacing = plane.spacing.clamp(min=_LEAST_SCALE)
     if config.bound_spacing:
         spacing = torch.minimum(torch.maximum(spacing, 0.3 * footprint), 1.5 * footprint)
     shrink = torch.where(plane.planarity < config.planarity_threshold, config.planarity_shrink, 1.0)
@@ -138,8 +140,22 @@ def initialise_disks(
     )
 
 
-def randomly_oriented(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
-    """The same disks, of the same scales, with orientations uniform over all rotations."""
+def random_disks(
+    points: Float[Tensor, "n 3"],
+    existing: Float[Tensor, "m 3"],
+    opacity: float,
+    random: torch.Generator,
+) -> DiskParameters:
+    """Disks at ``points`` as 3DGS starts its Gaussians, with orientations uniform over all.
+
+    They are round, with the root mean square distance to the three nearest of ``points`` and
+    ``existing`` for their scale; nothing shrinks or bounds it.
+    """
+    count = len(points)
     # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
-    quaternion = torch.randn(len(disks.position), 4, generator=random).to(disks.position)
-    return disks._replace(quaternion=quaternion / quaternion.norm(dim=-1, keepdim=True))
+    quaternion = torch.randn(count, 4, generator=random).to(points)
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    spacing = fit_local_planes(points, existing, NEIGHBOURS).spacing if count else points[:, 0]
+    scale = spacing.clamp(min=_LEAST_SCALE).log()[:, None].expand(-1, 2).clone()
+    logit = torch.logit(points.new_full((count,), opacity))
+    return DiskParameters(points, quaternion, scale, logit)

@@ -20,9 +20,6 @@ from geogs.world.edges import Pair, edge_matches
 from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.keyframes import Keyframe
 
-CULL_DISTANCE = 0.009
-"""A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
-makes one."""
 DEEPER = 3
 """Keyframes before the window of adjusted poses whose inverse depths are adjusted, too."""
 PROXIMITY_WINDOW = 25
@@ -60,6 +57,12 @@ class LocalMapping:
         fixed = {*self.segment.fixed}
         latest = self.keyframes.ids[-(self.config.window + DEEPER) :]
         return [k for k in latest if k not in fixed]
+
+    @property
+    def lasting(self) -> Sequence[int]:
+        """Ids that are removed no more: but for the latest, about which the next one decides."""
+        ids = self.keyframes.ids
+        return ids[:-1] if self.config.keyframe_distance else ids
 
     def insert(self, frame: Frame, encoded: Any, motion: FrameMotion) -> Keyframe:
         """Make a located frame a keyframe, with the depths that its anchor gives it."""
@@ -169,5 +172,5 @@ class LocalMapping:
         if [self.keyframes[k].measured is not None for k in ids[-3:]] == [False, True, False]:
             return  # the only one around whose depth was measured
         distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
-        if float(distance) < CULL_DISTANCE * self._long_edge:
+        if float(distance) < self.config.keyframe_distance * self._long_edge:
             self.map.cull(id, before)

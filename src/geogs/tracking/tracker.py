@@ -225,7 +225,7 @@ class Tracker:
         assert new is not None, "no keyframe waits to be completed"
         culls = not new.is_last
         self.local.update(new.keyframe, new.motion.keyframe, new.rotations, culls)
-        fresh = self.map.finalise(self.keyframes.ids[:-1])
+        fresh = self.map.finalise(self.local.lasting)
         state, active = self.segment.status.state, self.local.active
         return TrackResult(state, fresh, active)
 
@@ -251,7 +251,7 @@ class Tracker:
             return TrackResult(status.state)
         self._begin()
         self._orientation.located(status.orientation, frame, encoded)
-        fresh = self.map.finalise(keyframes.ids[:-1])
+        fresh = self.map.finalise(self.local.lasting)
         return TrackResult(status.state, fresh, self.local.active)
 
     def _begin(self) -> None:
