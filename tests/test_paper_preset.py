@@ -33,7 +33,7 @@ def test_a_run_keeps_its_surfaces_and_ends_with_the_adjustment(room, tmp_path):
     surface = found["reconstruction"]
     assert surface["accuracy_cm"] < 5.0
     assert surface["completeness_ratio"] > 46.0
-    assert surface["precision"] > 65.0
+    assert surface["precision_ratio"] > 65.0
 
 
 def test_known_poses_keep_their_surfaces(small_room, tmp_path):
@@ -45,4 +45,4 @@ def test_known_poses_keep_their_surfaces(small_room, tmp_path):
     surface = scores(tmp_path, small_room)["reconstruction"]
     assert surface["accuracy_cm"] < 5.0
     assert surface["completeness_ratio"] > 64.0
-    assert surface["precision"] > 65.0
+    assert surface["precision_ratio"] > 65.0

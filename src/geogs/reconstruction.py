@@ -130,10 +130,11 @@ class Reconstruction:
                 points = self._stage.first_points(lambda f: progress("first look", f))
         self.table.frame = MapFrame.around(points, self._poses)
         self._place_keyframes()
+        points = self.table.frame.points(points)
         try:
             with self.stopwatch("depth"):
                 self._stage.search(
-                    self.table.frame.points(points), lambda f: progress("depth", f),
+                    points, lambda f: progress("depth", f),
                     None if more is None else lambda count_of: self._add_more(more, count_of),
                     self._all is not None,
                 )  # fmt: skip
@@ -141,7 +142,7 @@ class Reconstruction:
             if self.mapper.table.mapped:
                 with self.stopwatch("growing"):
                     self.mapper.check_depths()
-                    self.mapper.grow()
+                    self.mapper.grow(torch.from_numpy(points))
         progress("growing", 1.0)
         self._train(progress)
 

@@ -29,9 +29,9 @@ from geogs_bench.appearance.densify import GradientStatistics, refine, split_dis
 from geogs_bench.appearance.disk_optimizer import DiskOptimizer
 from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
 from geogs_bench.appearance.rasteriser import MedianDisks, normals_of_depth, shifted_matrix
-from geogs_bench.appearance.start_points import find_start_points, in_visual_hull
 from geogs_bench.appearance.training_schedule import RefinementClock, Schedule
 from geogs_bench.appearance.training_views import TrainingView, scene_scale
+from geogs_photos.start_points import find_start_points, in_visual_hull
 from oracles.appearance_reference import ReferenceRasteriser, basis, view_colours
 
 pytestmark = pytest.mark.system

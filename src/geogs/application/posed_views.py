@@ -6,6 +6,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.application.structure_from_motion.photos import triangulated_points
 from geogs.depth.depth_view import ViewPose
 from geogs.errors import InputError
 from geogs.io.sources.posed.posed_source import PosedSource
@@ -19,6 +20,7 @@ from geogs.mapping.coverage import (
 )
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
+from geogs.mapping.map_all import spread_order
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress
 from geogs.types import Trajectory
@@ -46,6 +48,9 @@ class PosedViews:
     def first_look(self) -> Float64[np.ndarray, "n 3"]:
         """Points of the scene: those of the source, or where some small images match.
 
+        Where the map starts from points and the source has none, those of features of the images,
+        evenly spread where they are too many.
+
         Raises:
             InputError: there is one image only, or hardly anything matches anywhere.
         """
@@ -54,6 +59,12 @@ class PosedViews:
             raise InputError("There is only 1 image; depth needs at least two.")
         if source.points is not None and len(source.points.positions) >= FEWEST_POINTS:
             return source.points.positions
+
+        config = self._scene.config
+        if config.mapping.ablation.start == "points":
+            which = spread_order(range(len(source)))[: config.search.most_views]
+            with self._scene.stopwatch("first look"):
+                return triangulated_points(source, sorted(which), config.seed)
 
         def image_at(index: int) -> SmallImage:
             image = source[index]

@@ -101,6 +101,10 @@ class MapAblation(Settings, group="mapping.ablation"):
     initialisation: Literal["local_plane", "random"] = "local_plane"
     """Disks start in the plane of the points around them, or turned at random and with the scales
     of 3DGS: the distance to the three nearest points."""
+    start: Annotated[Literal["depths", "points"], Only("reconstruct")] = "depths"
+    """Disks start where searched depths see more than the map, also while it is trained, or once,
+    at sparse points as in the paper's runs on DTU: those of the data set, or of features of its
+    images."""
     map_update: Annotated[Literal["blended", "coherent", "per_keyframe"], Only("run")] = "blended"
     """How the map follows a correction of the poses: each disk with all keyframes that see it in
     place, all by one similarity (the paper's), or each with the keyframe that made it."""

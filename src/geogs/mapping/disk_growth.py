@@ -1,17 +1,22 @@
 """Growth of the map: disks added where depths show more than the map, dropped in free space."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from geogs.config import MappingConfig
+from geogs.config import DiskConfig, MappingConfig
 from geogs.geometry.fitted_normals import fitted_normals
+from geogs.geometry.neighbors import nearest_neighbors
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import confident_jumps
 from geogs.splat.density import spread_candidates, unexplained, worth_keeping
 from geogs.splat.init import NEIGHBOURS, initialise_disks, random_disks
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters
 from geogs.world.map import MapTable
 
 # Nearest keyframes that vote on a keyframe's disks.
@@ -42,6 +47,18 @@ class DiskGrowth:
         self.carve(views)
 
     @torch.no_grad()
+    def start(self, points: Float[Tensor, "n 3"], views: Sequence[MapView]) -> None:
+        """Disks at sparse points of the scene, each of the keyframe that lies nearest to it."""
+        disks = self.table.disks
+        centres = torch.stack([view.T_wc[:3, 3] for view in views]).to(points)
+        nearest = nearest_neighbors(points, centres, 1)[1][:, 0]
+        # Sparse points have no spacing of their own that a scale could be bounded by.
+        config = replace(self.config.disk, bound_spacing=False)
+        new = self._initialised(points, centres[nearest], points[:, 0], config, None)
+        ids = torch.tensor([view.id for view in views]).to(nearest.device)
+        disks.append(new, ids[nearest])
+
+    @torch.no_grad()
     def insert(self, view: MapView, min_confidence: float) -> None:
         """Disks where the map does not explain a view's depth, by local planes."""
         config, disks = self.config.disk, self.table.disks
@@ -63,15 +80,23 @@ class DiskGrowth:
             v, u, points, z, spacing = (x[kept] for x in (v, u, points, z, spacing))
         if len(points) + len(disks) < NEIGHBOURS or len(points) == 0:
             return
-        footprint = spacing * z / camera.fx
-        existing = disks.position.detach()
-        if self.config.ablation.initialisation == "random":
-            new = random_disks(points, existing, config.opacity, self.table.random.of_torch)
-            disks.append(new, view.id)
-            return
-        seen = None
+        footprint, seen = spacing * z / camera.fx, None
         if config.fit_normals:
             normals = fitted_normals(depth, confidence, camera, (v, u), config.stride)
             seen = normals @ T_wc[:3, :3].T
-        new = initialise_disks(points, T_wc[:3, 3], footprint, existing, config, seen)
+        new = self._initialised(points, T_wc[:3, 3], footprint, config, seen)
         disks.append(new, view.id)
+
+    def _initialised(
+        self,
+        points: Float[Tensor, "n 3"],
+        camera_centre: Float[Tensor, "*c 3"],
+        footprint: Float[Tensor, "n"],
+        config: DiskConfig,
+        seen: Float[Tensor, "n 3"] | None,
+    ) -> DiskParameters:
+        """New disks beside those of the map, as the settings have them start."""
+        existing = self.table.disks.position.detach()
+        if self.config.ablation.initialisation == "random":
+            return random_disks(points, existing, config.opacity, self.table.random.of_torch)
+        return initialise_disks(points, camera_centre, footprint, existing, config, seen)

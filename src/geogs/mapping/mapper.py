@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from geogs.config import DepthSensorConfig, MappingConfig
 from geogs.depth.depth_engine import Progress, silent
@@ -213,10 +214,16 @@ class Mapper:
         """Check the depths of all mapped keyframes by each other, once per search."""
         self.depths.check(self._searched())
 
-    def grow(self) -> None:
-        """Carve the map with all mapped keyframes, and add what their depths show beyond it."""
+    def grow(self, points: Float[Tensor, "n 3"] | None = None) -> None:
+        """Carve the map with all mapped keyframes, and add what their depths show beyond it.
+
+        Where the settings start disks at points, it begins with these instead.
+        """
         views = self._mapped()
         self.partners.choose(views)
+        if points is not None and self.config.ablation.start == "points":
+            self.growth.start(points.to(self.table.disks.position), views)
+            return
         self.growth.prune(views)
         for view in views:
             self.growth.insert(view, self.config.disk.insert_confidence)

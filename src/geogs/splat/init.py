@@ -102,7 +102,7 @@ def face_camera(
 
 def initialise_disks(
     points: Float[Tensor, "n 3"],
-    camera_centre: Float[Tensor, "3"],
+    camera_centre: Float[Tensor, "*c 3"],
     footprint: Float[Tensor, "n"],
     existing: Float[Tensor, "m 3"],
     config: DiskConfig,
@@ -112,6 +112,7 @@ def initialise_disks(
 
     Where ``seen``, unit normals (world frame) that face the camera, is given and not zero, it
     stands for the neighbourhood's, however slanted.
+    ``camera_centre`` is that of the camera that sees them, or of one for each.
     ``footprint`` is the distance between neighbouring samples at each point's depth; the spacing
     is kept within [0.3, 1.5] of it so that a stray point makes neither a speck nor a blanket.
     Without ``bound_spacing`` it is what it is, as in the paper. Where planarity is under the

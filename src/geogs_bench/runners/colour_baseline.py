@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from geogs.mesh.triangle_mesh import Mesh
     from geogs_bench.appearance.appearance_disks import AppearanceDisks
     from geogs_bench.appearance.appearance_trainer import AppearanceResult
-    from geogs_bench.appearance.start_points import StartPoints
     from geogs_bench.appearance.training_views import TrainingView
+    from geogs_photos.start_points import StartPoints
 
 _BUDGET = 120.0
 """Seconds of training where none are given; start points and mesh come on top."""
@@ -47,8 +47,8 @@ def train_baseline(settings: ReconstructSettings) -> None:
 
     from geogs.gpu.installation import require_device
     from geogs.io.sources.sniff import open_posed_source
-    from geogs_bench.appearance.start_points import find_start_points
     from geogs_bench.appearance.training_views import training_views
+    from geogs_photos.start_points import find_start_points
 
     assert settings.output is not None, "a task has a folder"
     device, config = require_device(settings.device), settings.config

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
@@ -23,8 +23,8 @@ from geogs.threads import worker_count
 from geogs.types import FoundFrames, Frame
 
 GROUP = "geogs.photos"
-"""Entry points: ``open_photographs``, ``place_frames``, ``place_lost`` and ``Localiser``, as used
-below."""
+"""Entry points: ``open_photographs``, ``place_frames``, ``place_lost``, ``find_start_points`` and
+``Localiser``, as used below."""
 
 Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
 """The pose, world to camera, of any frame of a video; none where too few points agree on one."""
@@ -186,6 +186,30 @@ def open_photographs(
         folder, config, kept, hold_out, again, progress, stop, seconds, expects
     )
     return source
+
+
+@dataclass(frozen=True)
+class _PosedView:
+    """An image of a source beside the camera of all."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"] | None
+    camera: Camera
+    T_cw: Float64[np.ndarray, "4 4"]
+
+
+def triangulated_points(
+    source: PosedSource, which: Sequence[int], seed: int
+) -> Float64[np.ndarray, "k 3"]:
+    """World points of features of some images of a source, under their poses.
+
+    Raises:
+        InputError: the package for photographs is missing, or no point comes out.
+    """
+    images = [source[i] for i in which]
+    views = [_PosedView(v.image, v.mask, source.camera, v.T_cw) for v in images]
+    positions: Float64[np.ndarray, "k 3"] = _registered("find_start_points")(views, seed).positions
+    return positions
 
 
 def _registered(name: str) -> Any:

@@ -51,7 +51,7 @@ class FullTraining:
         table, config = self._table, self._config
         begin, seconds_to_prune = time.perf_counter() - table.place.seconds, 0.0
         prunes = max(total // 4, 1)
-        fills = {total // 3, 2 * total // 3}
+        fills = {total // 3, 2 * total // 3} if config.ablation.start == "depths" else set()
         coarse = int(self._trainer.coarse_part * total)
         events = fills | set(range(prunes, total, prunes)) | {coarse} - {0}
         # Where time is short, steps are few and slow, and the clock is read more often.

@@ -1,23 +1,44 @@
-"""Points to start the baseline from: COLMAP's triangulation of features under the known poses."""
+"""Sparse points to start a map from: COLMAP's triangulation of features under known poses."""
 
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.threads import thread_map, worker_count
-from geogs_bench.appearance.training_views import TrainingView
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.incremental_mapping import of_poses
 from geogs_photos.photo_features import find_features
 from geogs_photos.photo_pairs import choose_pairs
 from geogs_photos.pycolmap_library import load_colmap
+
+
+@runtime_checkable
+class PosedView(Protocol):
+    """An image, what of it counts, and where it was taken."""
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB."""
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "h w"] | None:
+        """Pixels that count; none where all do."""
+
+    @property
+    def camera(self) -> Camera:
+        """Pinhole of the image."""
+
+    @property
+    def T_cw(self) -> Float64[np.ndarray, "4 4"]:
+        """World to camera."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +54,7 @@ class StartPoints:
         return len(self.positions)
 
 
-def find_start_points(views: Sequence[TrainingView], seed: int = 0) -> StartPoints:
+def find_start_points(views: Sequence[PosedView], seed: int = 0) -> StartPoints:
     """Features, matches, triangulation; cut to the visual hull where there are masks.
 
     Raises:
@@ -66,7 +87,7 @@ def find_start_points(views: Sequence[TrainingView], seed: int = 0) -> StartPoin
 
 
 def in_visual_hull(
-    views: Sequence[TrainingView], points: Float64[np.ndarray, "n 3"]
+    views: Sequence[PosedView], points: Float64[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "n"]:
     """Points that no image with a mask shows outside it; unseen ones count as inside."""
     inside = np.ones(len(points), dtype=bool)
@@ -83,7 +104,7 @@ def in_visual_hull(
     return inside
 
 
-def _triangulated(database: Path, views: Sequence[TrainingView], seed: int) -> Any:
+def _triangulated(database: Path, views: Sequence[PosedView], seed: int) -> Any:
     """The reconstruction of the images of a database, in their order, with the views' poses."""
     colmap = load_colmap()
     model, _ = of_poses(database, {n: view.T_cw for n, view in enumerate(views, 1)})
@@ -96,7 +117,7 @@ def _triangulated(database: Path, views: Sequence[TrainingView], seed: int) -> A
     return colmap.triangulate_points(model, database, database.parent, written, options=options)
 
 
-def _colours(views: Sequence[TrainingView], model: Any) -> UInt8[np.ndarray, "n 3"]:
+def _colours(views: Sequence[PosedView], model: Any) -> UInt8[np.ndarray, "n 3"]:
     """Mean colour of the pixels that see each point."""
     row = {number: k for k, number in enumerate(model.points3D)}
     total, count = np.zeros((len(row), 3)), np.zeros((len(row), 1))
