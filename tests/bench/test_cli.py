@@ -123,7 +123,7 @@ def test_a_wrong_setting_is_found_before_anything_runs(room, tmp_path, capsys, s
 
 def test_the_options_of_the_ablations_exist_and_make_a_difference(room):
     counts = {
-        "ablation-update": 3, "ablation-pose-lr": 6, "ablation-losses": 10, "ablation-init": 8,
+        "ablation-update": 3, "ablation-pose-lr": 6, "ablation-losses": 8, "ablation-init": 8,
         "replica": 3, "convergence": 2,
     }  # fmt: skip
     for name, count in counts.items():

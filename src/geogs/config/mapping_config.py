@@ -143,7 +143,8 @@ class MappingConfig(Settings, group="mapping"):
     lr_final: Annotated[float, Range(1e-9, 1)] = 0.1
     """Factor that the learning rates fall to over the final iterations."""
     pose_iterations: Annotated[CountOrZero, Only("run")] = 2
-    """Pose-only steps of a refinement on the map; 0 leaves the poses to the tracker."""
+    """Pose-only steps of a refinement on the map; 0 leaves the poses to the tracker, as a live run
+    always does, which does not wait for the map."""
     pose_every: Annotated[Count, Only("run")] = 4
     """Mapped keyframes from one refinement of the latest poses to the next; the paper's is 1."""
     pose_lr: Annotated[Weight, Only("run")] = 4e-4

@@ -216,6 +216,6 @@ def _registered(name: str) -> Any:
     for point in entry_points(group=GROUP, name=name):
         return point.load()
     raise InputError(
-        "Finding the poses of photographs needs geogs_photos; pip install 'geogs[photos]' brings "
-        "it."
+        "Poses of photographs and points of their features need geogs_photos; "
+        "pip install 'geogs[photos]' brings it."
     )
