@@ -122,6 +122,10 @@ def test_a_map_that_tells_no_reach_of_its_planes_averages_over_twice_its_spread(
         loaded = geogs.load_result(tmp_path)
         assert loaded.renderer.rules.plane_reach == reach
         assert torch.equal(loaded.keyframes[0].depth > 0, loaded.keyframes[0].weight > 0)
+    file.metadata["views"]["plane_reach"] = float("nan")
+    save_map(path, file.disks, file.metadata, file.tensors)
+    with pytest.raises(InputError, match="was it changed"):
+        _ = geogs.load_result(tmp_path).views
 
 
 def test_without_images_all_else_is_there(tmp_path):

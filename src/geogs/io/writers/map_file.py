@@ -217,16 +217,18 @@ def _views(file: MapFile) -> MapViews:
     if not times.shape == masked.shape == ids.shape or T_cw.shape != (*ids.shape, 4, 4):
         raise ValueError("its keyframes differ in number")
     origin, unit = np.array(said["origin"], np.float64).reshape(3), float(said["unit"])
-    numbers = (((RIGID,), T_cw), ((), times), ((), origin), ((POSITIVE,), unit))
+    spread = float(said["max_spread"])
+    # Before the reach had a number of its own it was twice the spread.
+    reach = float(said.get("plane_reach", 2 * spread))
+    numbers = (((RIGID,), T_cw), ((), times), ((), origin), ((), reach), ((POSITIVE,), unit))
     if not all(holds(marks, value) for marks, value in numbers):
         raise ValueError("a pose is none, or a number is not finite")
     return MapViews(
         camera=camera_of(said["camera"]),
         render_camera=camera_of(said["render_camera"]),
         min_alpha=float(said["min_alpha"]),
-        max_spread=float(said["max_spread"]),
-        # Before the reach had a number of its own it was twice the spread.
-        plane_reach=float(said.get("plane_reach", 2 * said["max_spread"])),
+        max_spread=spread,
+        plane_reach=reach,
         origin=origin,
         unit=unit,
         disks=MapSnapshot(position, disks.quaternion, scale, disks.opacity),
