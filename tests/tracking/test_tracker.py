@@ -1,6 +1,7 @@
 """The tracker end to end on a rendered room, and what it must survive."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from geogs.config import Config, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
+from geogs.tracking.graph.proximity import frame_distances
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs.world.grid import SampleGrid
@@ -263,6 +265,26 @@ def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
     assert culled.trajectory().tracked.all()
     truth = np.stack(sideways(30, 0.012))[:, :3, 3]
     assert error_cm(culled.trajectory().T_wc[:, :3, 3], truth) < 0.4
+
+
+def test_keyframes_by_mean_flow_are_as_far_apart_as_asked_for():
+    """DROID-SLAM's: a mean motion of 0.031 makes one; one within 0.052 is removed again."""
+    path = sideways(45, 0.04)
+    few, _ = run(frames(path), replace(CONFIG, keyframe_mean_flow=0.031, keyframe_distance=0.052))
+    usual, _ = run(frames(path))
+    ids = few.segment.ids
+    assert len(ids) < 0.6 * len(usual.segment.ids)
+    assert len(ids) < few.keyframes.table.next_id - 1  # some were removed again
+    later = list(pairwise(ids[CONFIG.init_keyframes - 1 : -1]))
+    assert len(later) >= 4
+    there_and_back = [*later, *(pair[::-1] for pair in later)]
+    apart = frame_distances(few.keyframes, there_and_back).reshape(2, -1).mean(0)
+    apart = apart / CAMERA.long_edge
+    assert 0.05 < float(apart.min())
+    # A removed one was nearer than 0.052, and the next made by 0.031 and less than a frame's 0.012.
+    assert 0.052 + 0.012 < float(apart.max()) < 0.052 + 0.031 + 0.012
+    assert few.trajectory().tracked.all()
+    assert error_cm(few.trajectory().T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.15
 
 
 def test_thirty_frames_of_a_rendered_living_room(shared_data):

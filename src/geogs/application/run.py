@@ -36,6 +36,7 @@ from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.flow.operator_choice import operator_found
 
 
 @on_one_torch_thread
@@ -64,6 +65,8 @@ def run(
         raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
     for sentence in () if settings.offline else idle_settings(config):
         progress.write(f"note: {sentence}")
+    if (operator := operator_found(config.tracking)) is not None:
+        progress.write(f"note: {operator}")
     base = None if settings.map is None else load_result(settings.map, device)
     opened = opened_for(settings, base)
     for sentence in opened.depths_found if config.input.depth == "auto" else ():

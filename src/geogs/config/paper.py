@@ -110,8 +110,13 @@ def paper_known_pose_mapping(usual: MappingConfig) -> MappingConfig:
 
 
 def paper_tracking() -> TrackingConfig:
-    """Keyframes that stay, so that each is mapped as soon as it exists."""
-    return TrackingConfig(keyframe_distance=0.0)
+    """DROID-SLAM's network where its file is found, and the paper's keyframes: a mean motion of 2.4
+    cells of 8 pixels makes one, which stays, so that it is mapped as soon as it exists."""
+    return TrackingConfig(
+        operator="droid_if_found",
+        keyframe_mean_flow=0.031,
+        keyframe_distance=0.0,
+    )
 
 
 def paper_loops() -> LoopConfig:
@@ -120,5 +125,5 @@ def paper_loops() -> LoopConfig:
 
 
 def paper_prior() -> PriorConfig:
-    """JDSA's scale field of two by two nodes, which are free of each other."""
-    return PriorConfig(scale_rows=2, scale_columns=2, scale_step=10.0)
+    """JDSA's scale field of two by two nodes, free of each other; no prior is rejected."""
+    return PriorConfig(scale_rows=2, scale_columns=2, scale_step=10.0, reject=False)

@@ -55,3 +55,6 @@ class PriorConfig(Settings, group="prior"):
     """Nodes from left to right. HI-SLAM2 has 2 by 2, with no bound on their difference."""
     scale_step: Positive = 0.1
     """Relative difference that is usual between neighbouring nodes."""
+    reject: bool = True
+    """Leave out what contradicts the matches, cells and whole keyframes, and trust the rest by how
+    well it agrees; off believes every prior everywhere alike, as HI-SLAM2 does."""

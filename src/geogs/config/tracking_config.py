@@ -36,8 +36,11 @@ class TrackingConfig(Settings, group="tracking"):
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
-    operator: Annotated[Literal["auto", "classical", "own", "droid"], Basic()] = "auto"
-    """What measures image motion; auto takes classical, which needs no weights."""
+    operator: Annotated[Literal["auto", "classical", "own", "droid", "droid_if_found"], Basic()] = (
+        "auto"
+    )
+    """What measures image motion; auto takes classical, which needs no weights; droid_if_found
+    takes droid, or classical where it finds no droid.pth."""
     weights: Annotated[str, NamesFile(), Basic()] = ""
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
     keyframe_parallax: Fraction = 0.018
@@ -47,6 +50,9 @@ class TrackingConfig(Settings, group="tracking"):
     keyframe_overlap: Fraction = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""
+    keyframe_mean_flow: Fraction = 0.0
+    """Mean motion since the last keyframe, of the long edge, that makes a frame a keyframe whatever
+    its parallax, overlap and sharpness, as in the paper; 0 leaves it to these."""
     keyframe_distance: Fraction = 0.009
     """A keyframe is removed again when the next one has come and less lies between it and the one
     before: DROID-SLAM's frame distance, of the long edge. 0 removes none, and each is final, and

@@ -115,6 +115,12 @@ def locate(known: KnownWeights) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
+def located(purpose: Purpose) -> Path | None:
+    """Where the first known file for a purpose is, None if there is none."""
+    paths = (locate(known) for known in CATALOGUE if known.purpose == purpose)
+    return next((path for path in paths if path is not None), None)
+
+
 def find_weights(purpose: Purpose, chosen: str = "") -> Path:
     """The weights file for a purpose: the chosen one, else what is found.
 
@@ -134,9 +140,8 @@ def find_weights(purpose: Purpose, chosen: str = "") -> Path:
         known = known_as(Path(variable).name)
         if known is None or known.purpose == purpose:
             return Path(variable)
-    for known in CATALOGUE:
-        if known.purpose == purpose and (path := locate(known)):
-            return path
+    if (path := located(purpose)) is not None:
+        return path
     places = ", ".join(map(str, weights_folders()))
     if purpose == "depth":
         raise InputError(

@@ -174,8 +174,6 @@ class AdjustedDepth:
     scale: Float[Tensor, "n k"]
     information: Float[Tensor, "n p"]
     """alpha: what the prior adds to the inverse variance of inverse depth; 0 where it is unused."""
-    deviation: Float[Tensor, "n"]
-    """Relative error of the scaled prior that four fifths of the matched cells keep below."""
 
 
 def adjust_depth(
@@ -190,18 +188,42 @@ def adjust_depth(
 
     The scales are fitted, the prior is judged by the depth that matches want (:func:`local
     deviation <local_deviation>`), and that is repeated with the new weights. Cells where the prior
-    seems bad, and frames where it is bad on the whole, keep what the matches say.
+    seems bad, and frames where it is bad on the whole, keep what the matches say. Without
+    ``config.reject`` every cell has the weight of a good prior, as in JDSA itself.
     """
     basis = node_weights(grid, config.scale_rows, config.scale_columns)
     stiffness = node_differences(config.scale_rows, config.scale_columns).to(basis).double()
     stiffness = stiffness / config.scale_step**2
-    C = flow.curvature
+    alpha = _prior_weight(prior, scale, basis, torch.full_like(prior, DEVIATION))
+    if config.reject:
+        alpha = _judged(
+            grid, flow, inverse_depth, ScaledPrior(prior, scale, alpha), basis, stiffness
+        )
+    step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, scale, alpha), basis, stiffness)
+    good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
+    good &= (scale + step.scale > 0).all(1, keepdim=True)
+    taken = good & (alpha > 0)  # what goes without the prior has just been adjusted to the matches
+    return AdjustedDepth(
+        torch.where(taken, (inverse_depth + step.depth).clamp(*LIMITS), inverse_depth),
+        torch.where(good, scale + step.scale, scale),
+        torch.where(good, alpha, 0.0),
+    )
+
+
+def _judged(
+    grid: SampleGrid,
+    flow: FlowEvidence,
+    inverse_depth: Float[Tensor, "n p"],
+    good: ScaledPrior,
+    basis: Float[Tensor, "p k"],
+    stiffness: Float[Tensor, "k k"],
+) -> Float[Tensor, "n p"]:
+    """Weights of priors by how well they agree with the matches, from those of ``good`` ones."""
+    C, prior, start, alpha = flow.curvature, good.inverse_depth, good.scale, good.weight
     wanted = inverse_depth + torch.where(C > 0, flow.gradient / C.clamp(min=1e-30), 0.0)
-    start = scale
     deviation = torch.full_like(prior, DEVIATION)
     trust = torch.ones_like(prior)
     for _ in range(REWEIGHTINGS):
-        alpha = _prior_weight(prior, start, basis, deviation)
         step = depth_scale_step(
             flow, inverse_depth, ScaledPrior(prior, start, alpha * trust), basis, stiffness
         )
@@ -210,26 +232,15 @@ def adjust_depth(
         error = torch.where(known, wanted / fitted.clamp(min=1e-12) - 1, 0.0)
         own = (deviation * fitted).square() + 1 / C.clamp(min=1e-12)
         trust = 1 / (1 + (error * fitted).square() / (_CAUCHY**2 * own))
-        confidence = (
-            known * C / (C + _prior_weight(prior, start, basis, deviation).clamp(min=1e-12))
-        )
+        confidence = known * C / (C + alpha.clamp(min=1e-12))
         deviation = local_deviation(grid, error, confidence)
         bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT)
         deviation = torch.hypot(deviation, bent)
+        alpha = _prior_weight(prior, start, basis, deviation)
     overall = _weighted_quantile(error.abs(), confidence, _AGREEING)
     used = (deviation < MAX_DEVIATION) & (overall < MAX_DISAGREEMENT)[:, None]
     used &= (start + step.scale > 0).all(1, keepdim=True)
-    alpha = torch.where(used, trust * _prior_weight(prior, start, basis, deviation), 0.0)
-    step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, start, alpha), basis, stiffness)
-    good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
-    good &= (start + step.scale > 0).all(1, keepdim=True)
-    taken = good & (alpha > 0)  # what goes without the prior has just been adjusted to the matches
-    return AdjustedDepth(
-        torch.where(taken, (inverse_depth + step.depth).clamp(*LIMITS), inverse_depth),
-        torch.where(good, start + step.scale, start),
-        torch.where(good, alpha, 0.0),
-        overall,
-    )
+    return torch.where(used, trust * alpha, 0.0)
 
 
 def local_deviation(

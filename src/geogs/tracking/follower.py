@@ -84,8 +84,7 @@ class Follower:
         motion = locator.best(keyframe, encoded, expected)
         if motion is None:
             return None
-        seen = motion.flow, motion.overlap, motion.parallax
-        if calls_for_keyframe(config, camera.long_edge, *seen, patience=PATIENCE):
+        if calls_for_keyframe(config, keyframe.grid, motion.seen, patience=PATIENCE):
             return None
         velocity = motion.T_cw @ se3_inverse(self.T_cw)
         T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)

@@ -63,8 +63,7 @@ def track_from_start(local: LocalMapping, locator: FrameLocator) -> None:
 
 def _is_far(local: LocalMapping, motion: FrameMotion) -> bool:
     """Whether a frame is far enough from the keyframe it was located at to become one."""
-    long_edge = local.keyframes.grid.camera.long_edge
-    return calls_for_keyframe(local.config, long_edge, motion.flow, motion.overlap, motion.parallax)
+    return calls_for_keyframe(local.config, local.keyframes.grid, motion.seen)
 
 
 def _located(

@@ -76,7 +76,7 @@ class Tracker:
         self.segment, self.keyframes, self.config = segment, segment.keyframes, config.tracking
         self.map = SegmentMap(segment, operator, config, prior)
         grid = self.keyframes.grid
-        self._choice = KeyframeChoice(self.config, grid.camera.long_edge, segment.sharpness)
+        self._choice = KeyframeChoice(self.config, grid, segment.sharpness)
         self._start_up = StartUp(self.map, self._choice, self.config)
         self._localiser = SegmentLocaliser(self.map)
         self._orientation = OrientationFollower(grid, operator, self.config)
@@ -295,10 +295,9 @@ class Tracker:
         is_first_measured = (
             frame.depth is not None and self.segment.is_metric and anchor.measured is None
         )
-        seen = motion.flow, motion.overlap, motion.parallax
         latest = (self.keyframes[k].frame_index for k in self.keyframes.ids[-LATEST:])
         ends = is_near_end(frame.left, latest)
-        if not (is_first_measured or self._choice.calls_for(*seen, ends)):
+        if not (is_first_measured or self._choice.calls_for(motion.seen, ends)):
             self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)
             return TrackResult(status.state, active=self.local.active)
         keyframe = self.local.insert(frame, encoded, motion)

@@ -60,7 +60,6 @@ class ViewGatherer:
         The frames begin anew where the view changes at once, with what comes after.
         """
         views = list(views)
-        edge = self._grid.camera.long_edge
         while len(views) < count and not self.is_over:
             image = next(self._images, None)
             if image is None:
@@ -80,7 +79,7 @@ class ViewGatherer:
                     if len(views) >= count // 2:
                         break
                     views = []
-                elif not calls_for_keyframe(self._config, edge, match.flow, match.matched):
+                elif not calls_for_keyframe(self._config, self._grid, match.seen):
                     continue
                 else:
                     step = match

@@ -1,10 +1,12 @@
 """Which flow operator the tracker uses."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool
 
 from geogs.config import TrackingConfig
-from geogs.networks.weights_files import find_weights
+from geogs.networks.weights_files import find_weights, located, weights_folders
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.world.grid import SampleGrid
@@ -28,7 +30,32 @@ def build_operator(
     return MaskedFlow(operator, grid) if black_is_masked else operator
 
 
+def operator_found(config: TrackingConfig) -> str | None:
+    """Which operator ``droid_if_found`` comes to, and why; None where another one is named."""
+    if config.operator != "droid_if_found":
+        return None
+    found = _resolved(config)
+    if found.operator == "droid":
+        return f"image motion is measured by DROID-SLAM's network, {found.weights}."
+    places = ", ".join(map(str, weights_folders()))
+    return (
+        "image motion is measured by the classical operator, as there is no droid.pth of "
+        f"DROID-SLAM's in {places}."
+    )
+
+
+def _resolved(config: TrackingConfig) -> TrackingConfig:
+    """The configuration with an operator that does not depend on which files are there."""
+    if config.operator != "droid_if_found":
+        return config
+    weights = config.weights or located("droid")
+    if weights is None:
+        return replace(config, operator="classical")
+    return replace(config, operator="droid", weights=str(weights))
+
+
 def _operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
+    config = _resolved(config)
     if config.operator in ("auto", "classical"):
         return _classical(grid)
     if config.operator == "own":

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ from jaxtyping import UInt8
 
 from geogs.concurrent import BackgroundTask
 from geogs.config import TrackingConfig
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
 
 MIN_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
@@ -34,12 +37,36 @@ _EDGE = 320
 """Longer side of the image in which sharpness is measured; below it, noise counts for less."""
 
 
+@dataclass(frozen=True)
+class SeenMotion:
+    """How a frame has moved since the last keyframe."""
+
+    flow: float
+    """Median motion of the cells that are matched, pixels."""
+    overlap: float
+    """Fraction of the keyframe's cells that are. In forward motion the cells that move most leave
+    the image or are not matched any more, so that the median motion of the rest stays small while
+    the overlap goes."""
+    match: FlowMatch
+    """One edge, keyframe -> frame."""
+    parallax: float | None = None
+    """Median of the motion without the rotation's, where it is known, pixels."""
+
+
+def mean_flow(grid: SampleGrid, match: FlowMatch) -> float:
+    """Mean motion in pixels of the cells that are matched in the first edge, 0 without any.
+
+    Source: DROID-SLAM's motion filter, which asks all cells as its network says a motion of each.
+    """
+    used = match.weight[0, :, 0] > 0
+    motion = (match.pixels[0] - grid.pixels).norm(dim=-1)
+    return float((motion * used).sum() / used.sum().clamp(min=1))
+
+
 def calls_for_keyframe(
     config: TrackingConfig,
-    long_edge: int,
-    flow: float,
-    overlap: float,
-    parallax: float | None = None,
+    grid: SampleGrid,
+    seen: SeenMotion,
     patience: float = 0.0,
     part: float = 1.0,
 ) -> bool:
@@ -50,23 +77,22 @@ def calls_for_keyframe(
     depths are known, the rotation is not told from the motion, and all of it counts.
 
     Args:
-        config: ``keyframe_parallax`` and ``keyframe_overlap``.
-        long_edge: of the image, pixels.
-        flow: median motion of the cells that are matched, pixels.
-        overlap: fraction of the keyframe's cells that are. In forward motion the cells that move
-            most leave the image or are not matched any more, so that the median motion of the rest
-            stays small while the overlap goes.
-        parallax: median of the motion without the rotation's, where it is known, pixels.
+        config: ``keyframe_parallax`` and ``keyframe_overlap``; or ``keyframe_mean_flow``, which
+            decides alone where it is given.
+        grid: of the keyframe.
+        seen: the motion.
         patience: it may come so much further.
         part: of the usual parallax that is enough.
     """
-    more = 1 + patience
+    more, long_edge = 1 + patience, grid.camera.long_edge
+    if config.keyframe_mean_flow > 0:
+        return mean_flow(grid, seen.match) >= config.keyframe_mean_flow * more * long_edge
     enough = config.keyframe_parallax * more * long_edge
-    if overlap < config.keyframe_overlap / more and flow >= MIN_FLOW * enough:
+    if seen.overlap < config.keyframe_overlap / more and seen.flow >= MIN_FLOW * enough:
         return True
-    if parallax is None:
-        return flow >= WITH_ROTATION * part * enough
-    return parallax >= part * enough or flow >= MAX_FLOW * more * long_edge
+    if seen.parallax is None:
+        return seen.flow >= WITH_ROTATION * part * enough
+    return seen.parallax >= part * enough or seen.flow >= MAX_FLOW * more * long_edge
 
 
 def is_near_end(left: int | None, latest: Iterable[int]) -> bool:
@@ -101,12 +127,11 @@ class KeyframeChoice:
     """Says which frames become keyframes, from their parallax, overlap and sharpness."""
 
     def __init__(
-        self, config: TrackingConfig, long_edge: int, recent: list[float] | None = None
+        self, config: TrackingConfig, grid: SampleGrid, recent: list[float] | None = None
     ) -> None:
-        """``long_edge`` is that of the images, in pixels; ``recent`` the sharpness of the latest
-        frames, which is changed in place."""
+        """``recent`` is the sharpness of the latest frames, and is changed in place."""
         self.config = config
-        self.long_edge = long_edge
+        self.grid = grid
         self._recent = [] if recent is None else recent
         self._concurrent = BackgroundTask("sharpness")
 
@@ -121,19 +146,17 @@ class KeyframeChoice:
         """Wait until the latest frame has been noted."""
         self._concurrent.wait()
 
-    def calls_for(
-        self, flow: float, overlap: float, parallax: float | None = None, near: bool = False
-    ) -> bool:
+    def calls_for(self, seen: SeenMotion, near: bool = False) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
 
         A frame that is blurred compared with the latest ones waits for a sharper one, though not
         for long: nothing else sees what comes into view meanwhile. ``near`` says that
-        :func:`is_near_end`.
+        :func:`is_near_end`. Where the mean flow decides, neither counts.
         """
+        if self.config.keyframe_mean_flow > 0:
+            return calls_for_keyframe(self.config, self.grid, seen)
         patience, part = BLUR_WAIT if self._is_blurred() else 0.0, END_FRACTION if near else 1.0
-        return calls_for_keyframe(
-            self.config, self.long_edge, flow, overlap, parallax, patience, part
-        )
+        return calls_for_keyframe(self.config, self.grid, seen, patience, part)
 
     def _note(self, value: float) -> None:
         self._recent.append(value)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields, motion_solver
 from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.keyframes.keyframe_choice import SeenMotion
 from geogs.tracking.matching.photometric_check import PhotometricCheck, correlation_at
 from geogs.tracking.matching.pnp import pnp, pnp_features
 from geogs.tracking.matching.sparse_features import match_features
@@ -63,6 +64,11 @@ class FrameMotion:
     """Median distance in pixels between matches and reprojection."""
     check: PhotometricCheck
     """How well the images agree there."""
+
+    @property
+    def seen(self) -> SeenMotion:
+        """What says whether the frame becomes a keyframe."""
+        return SeenMotion(self.flow, self.overlap, self.match, self.parallax)
 
     def is_where(self, other: "FrameMotion") -> bool:
         """Whether matches of the same keyframe say the same as another's, in the median."""

@@ -66,8 +66,7 @@ class OrientationFollower:
             return None
         track.misses = 0
         R = None if view.R is None else found.R @ view.R
-        edge = self.grid.camera.long_edge
-        if calls_for_keyframe(self.config, edge, match.flow, match.matched):
+        if calls_for_keyframe(self.config, self.grid, match.seen):
             track.reset(ReferenceView(frame.index, frame.image, R, encoded))
         rotation = RelativeRotation(view.index, found.R, found.deviation)
         return Followed(rotation, R, found.is_pure)

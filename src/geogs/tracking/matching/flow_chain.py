@@ -7,6 +7,7 @@ import torch
 
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.keyframes.keyframe_choice import SeenMotion
 from geogs.tracking.matching.photometric_check import (
     MIN_NCC,
     PhotometricCheck,
@@ -36,6 +37,11 @@ class ChainedMatch:
     """Median motion of the matched cells in pixels."""
     matched: float
     """Fraction of the cells that are matched; 0 where the images do not agree there."""
+
+    @property
+    def seen(self) -> SeenMotion:
+        """What says whether the frame becomes a keyframe."""
+        return SeenMotion(self.flow, self.matched, self.there)
 
 
 def follow_flow(

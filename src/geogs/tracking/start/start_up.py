@@ -70,7 +70,7 @@ class StartUp:
             return
         self._progress.misses = 0
         measure = partial(_rotation, last.frame_index, self._grid, match.there.on_cpu())
-        if self._choice.calls_for(match.flow, match.matched):
+        if self._choice.calls_for(match.seen):
             self._gather(frame, encoded, rotations, measure)
             return
         eye = torch.eye(4, dtype=torch.float64)
