@@ -2,6 +2,7 @@
 
 import hashlib
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,15 +10,18 @@ import torch
 from safetensors.torch import save_file
 
 from droid_state import public_state
+from geogs.application.progress.run_progress import RunProgress
+from geogs.application.run import run
+from geogs.application.run_settings import RunSettings
 from geogs.cli.main import main
-from geogs.config import Config, TrackingConfig
+from geogs.config import Config, TrackingConfig, preset
 from geogs.errors import InputError
 from geogs.networks import weights_files
 from geogs.networks.tensor_files import read_tensors
 from geogs.networks.weights_files import CATALOGUE, checksum, find_weights, weights_folders
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.droid import DroidFlow
-from geogs.tracking.flow.operator_choice import build_operator
+from geogs.tracking.flow.operator_choice import build_operator, operator_found
 from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA
@@ -244,6 +248,51 @@ def test_the_configuration_names_the_operator(places):
     assert isinstance(build_operator(TrackingConfig(operator="droid"), grid), DroidFlow)
     config = TrackingConfig(operator="droid", weights=str(path))
     assert isinstance(lone_tracker(CAMERA, Config(tracking=config)).map.operator, DroidFlow)
+
+
+def test_the_papers_preset_takes_the_network_where_it_is_found_and_says_so(places, tmp_path):
+    grid, paper = SampleGrid(CAMERA), preset("paper").tracking
+    # A file that is not known by name may be for anything.
+    save_file(TENSORS, places["cache"] / "other.safetensors")
+    assert isinstance(build_operator(paper, grid), ClassicalFlow)
+    (sentence,) = said_of_the_operator(preset("paper"), tmp_path)
+    assert "by the classical operator, as there is no droid.pth" in sentence
+    assert str(places["cache"]) in sentence
+    path = places["cache"] / "droid.pth"
+    torch.save(public_state(), path)
+    assert isinstance(build_operator(paper, grid), DroidFlow)
+    (sentence,) = said_of_the_operator(preset("paper"), tmp_path)
+    assert sentence == f"note: image motion is measured by DROID-SLAM's network, {path}."
+    given = tmp_path / "mine.pth"
+    torch.save(public_state(), given)
+    chosen = replace(paper, weights=str(given))
+    assert isinstance(build_operator(chosen, grid), DroidFlow)
+    assert str(given) in str(operator_found(chosen))
+    with pytest.raises(InputError, match=r"no weights file .*none\.pth"):
+        build_operator(replace(paper, weights=str(tmp_path / "none.pth")), grid)
+
+
+@pytest.mark.parametrize("name", ["default", "fast", "accurate"])
+def test_other_presets_take_no_network_that_lies_about(places, tmp_path, name):
+    torch.save(public_state(), places["cache"] / "droid.pth")
+    assert isinstance(build_operator(preset(name).tracking, SampleGrid(CAMERA)), ClassicalFlow)
+    assert said_of_the_operator(preset(name), tmp_path) == []
+
+
+def said_of_the_operator(config: Config, folder: Path) -> list[str]:
+    """What a run says before it finds that there is no video."""
+    said = Said()
+    with pytest.raises(InputError):
+        run(RunSettings((folder / "none.mp4",), config, device="cpu"), said)
+    return [sentence for sentence in said.sentences if "image motion" in sentence]
+
+
+class Said(RunProgress):
+    def __init__(self) -> None:
+        self.sentences: list[str] = []
+
+    def write(self, text: str) -> None:
+        self.sentences.append(text)
 
 
 @pytest.mark.parametrize("name", ["own", "droid"])

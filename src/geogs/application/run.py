@@ -63,7 +63,8 @@ def run(
     scale = scale_source(settings.scale_from)
     if settings.offline and (scale is not None or config.input.depth != "none"):
         raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
-    for sentence in () if settings.offline else idle_settings(config):
+    defers = maps_at_the_end(settings, observer)
+    for sentence in () if settings.offline else idle_settings(config, defers):
         progress.write(f"note: {sentence}")
     if (operator := operator_found(config.tracking)) is not None:
         progress.write(f"note: {operator}")
@@ -119,9 +120,11 @@ def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> 
 
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
     """Whether the map is made once, after the video; by default where nobody looks on."""
+    mapping = settings.config.mapping
+    if not mapping.may_follow or any(map(live_address, settings.source)):
+        return False
     is_shown = observer is not None or settings.online_results or settings.map is not None
-    when = settings.config.mapping.when
-    return when == "after" or (when == "auto" and not is_shown)
+    return mapping.when == "after" or not is_shown
 
 
 def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> Plan | None:
@@ -134,8 +137,7 @@ def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> Pl
     if settings.offline:
         return offline_plan(settings.config, source, on_gpu, calibrates)
     if maps_at_end is None:
-        may_follow = settings.config.mapping.may_follow
-        maps_at_end = may_follow and maps_at_the_end(settings, driver.observer)
+        maps_at_end = maps_at_the_end(settings, driver.observer)
     size = source.camera.width, source.camera.height
     return RunPlan(settings.config, source.length, size, on_gpu, calibrates, maps_at_end)
 

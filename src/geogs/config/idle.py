@@ -1,18 +1,62 @@
 """Settings that change nothing beside others: what to tell who has given them."""
 
 from collections.abc import Iterator
+from operator import attrgetter
 
 from geogs.config.loss_config import LossConfig
 from geogs.config.mapping_config import MappingConfig
 from geogs.config.prior_config import DepthSensorConfig, OdometryConfig
 from geogs.config.reconstruct_config import ReconstructConfig
-from geogs.config.run_config import Config
+from geogs.config.run_config import Config, preset, preset_of
+from geogs.config.setting import dashed
+
+ON_THE_WAY = (
+    "lag",
+    "window",
+    "views_per_step",
+    "final_depth",
+    "pose_iterations",
+    "pose_every",
+    "pose_lr",
+    "ablation.map_update",
+)
+"""Settings of the mapping that act on nothing but a map that is made while frames come."""
 
 
-def idle_settings(config: Config | ReconstructConfig) -> list[str]:
-    """A sentence for every setting that was changed and does nothing, with what it would need."""
-    of_run = _run(config) if isinstance(config, Config) else ()
-    return [*of_run, *_mapping(config.mapping)]
+def idle_settings(config: Config | ReconstructConfig, maps_at_end: bool = False) -> list[str]:
+    """A sentence for every setting that was changed and does nothing, with what it would need.
+
+    ``maps_at_end`` says that a run makes its map of all keyframes at once, after the video.
+    """
+    if isinstance(config, ReconstructConfig):
+        return [*_mapping(config.mapping)]
+    of_map = _deferred(config) if maps_at_end else _on_the_way(config.mapping)
+    return [*_run(config), *of_map, *_mapping(config.mapping)]
+
+
+def _deferred(config: Config) -> Iterator[str]:
+    mapping, usual = config.mapping, preset(preset_of(config)).mapping
+    if not usual.may_follow:  # what such a preset sets is meant for a map that is made on the way
+        usual = MappingConfig()
+    values = [(path, attrgetter(path)) for path in ON_THE_WAY]
+    idle = [f"mapping.{dashed(path)}" for path, of in values if of(mapping) != of(usual)]
+    if idle:
+        yield (
+            f"{', '.join(idle)} {'does' if len(idle) == 1 else 'do'} nothing: the map is made of "
+            "all keyframes at once after the video; mapping.when online makes it on the way."
+        )
+
+
+def _on_the_way(mapping: MappingConfig) -> Iterator[str]:
+    if mapping.final_iterations == 0 and not mapping.final_depth:
+        yield (
+            "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "
+            "searched again."
+        )
+    if mapping.pose_iterations == 0 and mapping.pose_lr != MappingConfig.pose_lr:
+        yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."
+    if mapping.pose_iterations == 0 and mapping.pose_every != MappingConfig.pose_every:
+        yield "mapping.pose-every does nothing: mapping.pose-iterations is 0."
 
 
 def _run(config: Config) -> Iterator[str]:
@@ -33,19 +77,10 @@ def _run(config: Config) -> Iterator[str]:
             yield "mapping.loss.measured-factor does nothing: input.depth is none."
     if config.input.poses == "none" and config.odometry != OdometryConfig():
         yield "odometry does nothing: input.poses is none, so that no measured pose is used."
-    if mapping.final_iterations == 0 and not mapping.final_depth:
-        yield (
-            "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "
-            "searched again."
-        )
     if mapping.when == "after" and not mapping.may_follow:
         yield (
             "mapping.when after does nothing: without a final training the map is made on the way."
         )
-    if mapping.pose_iterations == 0 and mapping.pose_lr != MappingConfig.pose_lr:
-        yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."
-    if mapping.pose_iterations == 0 and mapping.pose_every != MappingConfig.pose_every:
-        yield "mapping.pose-every does nothing: mapping.pose-iterations is 0."
     if config.loop.matches and not config.loop.enabled:
         yield "loop.matches does nothing: no loops are looked for."
 

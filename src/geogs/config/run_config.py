@@ -36,9 +36,24 @@ class Config(Settings):
 
 
 def preset_of(config: Config) -> Preset:
-    """The preset by which a run makes its map; the default where that is none of any."""
-    mapped = (name for name in get_args(Preset) if preset(name).mapping == config.mapping)
-    return next(mapped, "default")
+    """The preset by which a run makes its map: that from which fewest settings of it differ."""
+
+    def changed(name: Preset) -> int:
+        return min(
+            sum(a != b for a, b in zip(_values(usual.mapping), own, strict=True))
+            for usual in (preset(name), preset(name, on_gpu=True))
+        )
+
+    own = _values(config.mapping)
+    return min(get_args(Preset), key=changed)
+
+
+def _values(settings: Settings) -> list[object]:
+    """Of all settings of a group and the groups in it, in their order."""
+    found = list[object]()
+    for value in vars(settings).values():
+        found += _values(value) if isinstance(value, Settings) else [value]
+    return found
 
 
 def preset(name: Preset, on_gpu: bool = False) -> Config:
