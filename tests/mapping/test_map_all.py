@@ -1,6 +1,7 @@
 """A map that is made at the end, instead of on the way."""
 
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 from geogs.application.checkpoints.checkpoint import SavedState, checkpoint_folder, write_checkpoint
 from geogs.config import Config, InputConfig, preset
+from geogs.config.idle import ON_THE_WAY
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from quick_systems import Work, quick_config
@@ -33,10 +35,10 @@ def frames(small_room):
     return source.camera, list(source)
 
 
-def followed(frames, defers_map: bool, count: int = FRAMES) -> Slam:
+def followed(frames, defers_map: bool, count: int = FRAMES, config: Config | None = None) -> Slam:
     """A system that has seen so many frames."""
     camera, images = frames
-    slam = Slam(camera, quick(), defers_map=defers_map, device="cpu")
+    slam = Slam(camera, config or quick(), defers_map=defers_map, device="cpu")
     for frame in images[:count]:
         slam.process(frame)
     return slam
@@ -67,6 +69,31 @@ def test_poses_are_the_same_and_the_surface_nearly(both):
         seen = (a.depth > 0) & (b.depth > 0)
         assert seen.float().mean() > 0.9 * (a.depth > 0).float().mean()
         assert float(((a.depth - b.depth).abs() / a.depth)[seen].median()) < 0.01
+
+
+def test_what_is_said_to_act_on_the_way_only_changes_no_bit(frames, both):
+    """All settings that ``idle_settings`` names; and a number of steps, which it does not."""
+    config = quick()
+    mapping = replace(
+        config.mapping,
+        lag=1,
+        window=3,
+        views_per_step=0,
+        final_depth=not config.mapping.final_depth,
+        pose_iterations=3,
+        pose_every=1,
+        pose_lr=1e-3,
+        ablation=replace(config.mapping.ablation, map_update="coherent"),
+    )
+    assert all(attrgetter(name)(mapping) != attrgetter(name)(config.mapping) for name in ON_THE_WAY)
+    more = replace(config.mapping, iterations=config.mapping.final_iterations)
+    after = both[1]
+    for other, is_same in ((mapping, True), (more, False)):
+        slam = followed(frames, True, config=replace(config, mapping=other))
+        slam.finish()
+        assert np.array_equal(slam.trajectory().T_wc, after.trajectory().T_wc)
+        own, usual = slam.snapshot(), after.snapshot()
+        assert torch.equal(own.position, usual.position) == is_same
 
 
 def test_there_is_no_online_result(both):
