@@ -11,8 +11,9 @@ from geogs.errors import InputError
 from geogs.evaluation.surfaces.surface import Surface
 from geogs.io.writers.ply_writer import write_mesh
 from geogs_bench import published as paper
-from geogs_bench.catalogue.ablations import MAP_UPDATE
-from geogs_bench.catalogue.data_sets import DTU, REPLICA, TUM
+from geogs_bench.benchmark import Variant
+from geogs_bench.catalogue.ablations import INITIALISATION, MAP_UPDATE
+from geogs_bench.catalogue.data_sets import DTU, REPLICA, SCANNET, TUM
 from geogs_bench.results.record import (
     Cost,
     CurvePoint,
@@ -28,6 +29,7 @@ from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.scoring.room_scores import with_short_edges
 from geogs_bench.scoring.scores import scored
 from geogs_bench.tables.benchmark_report import Chapter, markdown, write_report
+from geogs_bench.tables.result_tables import result_tables
 from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
@@ -230,6 +232,43 @@ def test_an_ablation_compares_means_over_scenes_that_all_variants_finished(tmp_p
     assert "Lost." in page
     assert "2.16" in page
     assert len(json.loads((tmp_path / "results.json").read_text())) == 4
+
+
+def test_published_figures_stand_beside_the_variant_they_belong_to():
+    """The paper's settings, not the defaults; images alone, not depth; two minutes, not one."""
+
+    def beside(benchmark, rows: list[Record], title: str, metric: str) -> dict[str, str]:
+        table = next(t for t in result_tables(benchmark, rows) if t.title.endswith(title))
+        place = table.header.index(f"{metric} (paper)")
+        return {row[0]: row[place] for row in table.rows}
+
+    names = [v.name for v in INITIALISATION.variants]
+    rows = [record("room0", name, benchmark=INITIALISATION.name) for name in names]
+    table = beside(INITIALISATION, rows, "(toolbox of Splat-SLAM)", "Acc")
+    assert table == dict.fromkeys(names, "–") | {
+        "paper-random-7": "2.77", "paper-random-10": "2.37",
+        "paper-local-plane-7": "2.09", "paper-local-plane-10": "1.98",
+    }  # fmt: skip
+    both = replace(REPLICA, variants=(Variant("default"), Variant("paper")))
+    rows = [record("room0", name) for name in ("default", "paper")]
+    assert beside(both, rows, "(toolbox of Splat-SLAM)", "Acc") == {"default": "–", "paper": "1.63"}
+    rows = [record(s, name) for name in ("default", "paper") for s in paper.REPLICA_SCENES]
+    assert beside(both, rows, "alignment (cm)", "ATE") == {"default": "–", "paper": "0.28"}
+    detail = beside(both, rows, "Splat-SLAM): every scene", "Acc")
+    assert (detail["office4, paper"], detail["office4, default"]) == ("2.89", "–")
+    rows = [record("scene0000_00", name, benchmark="scannet") for name in ("rgb", "rgb-d")]
+    of_paper = paper.SCANNET.value("scene0000_00", "ATE")
+    table = beside(SCANNET, rows, "Sim(3) alignment (cm)", "ATE")
+    assert table == {"rgb": f"{of_paper:.2f}", "rgb-d": "–"}
+    score = StageScore("final", None, (surface("points", unit="mm"),))
+    names = ("60s", "120s", "colour-2dgs")
+    rows = [replace(record("scan24", name), stages=(score,)) for name in names]
+    assert beside(DTU, rows, "DTU's protocol", "CD") == {
+        "60s": "–", "120s": "0.53", "colour-2dgs": "–"
+    }  # fmt: skip
+    # A column without a figure is left out.
+    others = [record("attic", "default"), record("attic", "paper")]
+    assert all("(paper)" not in "".join(t.header) for t in result_tables(both, others))
 
 
 def test_curves_are_drawn(tmp_path):

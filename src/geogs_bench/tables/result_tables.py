@@ -1,7 +1,7 @@
 """Tables of results: a row for each scene, their mean, and the published figures beside ours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from geogs_bench.benchmark import Benchmark, Column, Layout
 from geogs_bench.published import PublishedTable
@@ -9,6 +9,12 @@ from geogs_bench.results.record import Record
 
 MISSING = "–"
 """Cell of a number that is not there."""
+_BESIDE = " (paper)"
+"""What the title of a column of published figures ends with."""
+_OF_PAPER = "paper"
+"""Name of the variant that has the paper's settings, or what its name begins with."""
+_SECONDS = "120s"
+"""The time that the paper gives a reconstruction from known poses."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ def result_tables(benchmark: Benchmark, records: Sequence[Record]) -> list[Table
     for layout in benchmark.layouts:
         columns = [c for c in layout.columns if any(c.value(r) is not None for r in scored)]
         if columns:
-            made += _layout_tables(benchmark, layout, _without_foreign(columns, scored), scored)
+            made += _layout_tables(benchmark, layout, columns, scored)
     failed = [r for r in records if r.error is not None]
     if failed:
         rows = tuple((_name(r), r.error or "") for r in failed)
@@ -63,37 +69,37 @@ def _layout_tables(
     benchmark: Benchmark, layout: Layout, columns: Sequence[Column], records: Sequence[Record]
 ) -> list[Table]:
     title, header = layout.title, _header(columns, records)
-    body = tuple(_row(record, columns) for record in records)
+    body = tuple(_row(benchmark, record, columns) for record in records)
     variants = list(dict.fromkeys(record.variant for record in records))
     if len(variants) == 1:
         mean = (_mean_row(benchmark, "mean", records, columns),) if len(records) > 1 else ()
-        return [Table(title, ("scene", *header), (*body, *mean), layout.note)]
-    detail = Table(f"{title}: every scene", ("scene, variant", *header), body)
+        return [_table(title, ("scene", *header), (*body, *mean), layout.note)]
+    detail = _table(f"{title}: every scene", ("scene, variant", *header), body)
     common = _common_scenes(records, variants)
     if not common:
         return [detail]
     means = tuple(
-        _mean_row(benchmark, variant or "default", rows, columns, variant)
+        _mean_row(benchmark, variant or "default", rows, columns)
         for variant in variants
         if (rows := [r for r in records if r.variant == variant and r.scene in common])
     )
     if len(common) == 1 and len(body) == len(variants):
-        return [Table(title, ("variant", *header), means, f"{common[0]}. {layout.note}".strip())]
+        return [_table(title, ("variant", *header), means, f"{common[0]}. {layout.note}".strip())]
     note = f"Means over the scenes that every variant finished: {', '.join(common)}."
-    return [Table(title, ("variant", *header), means, f"{note} {layout.note}".strip()), detail]
+    return [_table(title, ("variant", *header), means, f"{note} {layout.note}".strip()), detail]
 
 
-def _without_foreign(columns: Sequence[Column], records: Sequence[Record]) -> list[Column]:
-    """The columns, without published figures where none is of these scenes and variants."""
-    rows = {name for record in records for name in (record.scene, record.variant)}
-    return [
-        replace(column, published=None)
-        if column.published
-        and not rows & {*column.published.table.columns}
-        and column.published.table.columns != ("mean",)
-        else column
-        for column in columns
+def _table(
+    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], note: str = ""
+) -> Table:
+    """A table without the columns of published figures that none of its rows has."""
+    kept = [
+        n
+        for n, name in enumerate(header)
+        if not name.endswith(_BESIDE) or any(row[n] != MISSING for row in rows)
     ]
+    cells = (tuple(row[n] for n in kept) for row in (header, *rows))
+    return Table(title, next(cells), tuple(cells), note)
 
 
 def _common_scenes(records: Sequence[Record], variants: Sequence[str]) -> list[str]:
@@ -109,29 +115,25 @@ def _header(columns: Sequence[Column], records: Sequence[Record]) -> list[str]:
     for column in columns:
         titles.append(column.title.replace("{unit}", unit))
         if column.published is not None:
-            titles.append(f"{column.published.metric} (paper)")
+            titles.append(f"{column.published.metric}{_BESIDE}")
     return titles
 
 
-def _row(record: Record, columns: Sequence[Column]) -> tuple[str, ...]:
+def _row(benchmark: Benchmark, record: Record, columns: Sequence[Column]) -> tuple[str, ...]:
     cells = [_name(record)]
     for column in columns:
         cells.append(_cell(column.value(record), column.digits))
         if column.published is not None:
             table, metric = column.published.table, column.published.metric
-            value = table.value(record.scene, metric)
-            cells.append(_cell(value, 2))
+            is_papers = _is_papers(benchmark, record.variant)
+            cells.append(_cell(table.value(record.scene, metric) if is_papers else None, 2))
     return tuple(cells)
 
 
 def _mean_row(
-    benchmark: Benchmark,
-    name: str,
-    records: Sequence[Record],
-    columns: Sequence[Column],
-    variant: str | None = None,
+    benchmark: Benchmark, name: str, records: Sequence[Record], columns: Sequence[Column]
 ) -> tuple[str, ...]:
-    """Means over the records that have a number; how many, where some have none."""
+    """Means over the records of a variant that have a number; how many, where some have none."""
     cells = [name]
     for column in columns:
         values = [v for r in records if (v := column.value(r)) is not None]
@@ -140,26 +142,46 @@ def _mean_row(
                      else mean)  # fmt: skip
         if column.published is not None:
             table, metric = column.published.table, column.published.metric
-            scenes = [r.scene for r in records]
-            cells.append(_cell(_published_mean(benchmark, table, metric, scenes, variant), 2))
+            cells.append(_cell(_published_mean(benchmark, table, metric, records), 2))
     return tuple(cells)
 
 
 def _published_mean(
-    benchmark: Benchmark,
-    table: PublishedTable,
-    metric: str,
-    scenes: Sequence[str],
-    variant: str | None,
+    benchmark: Benchmark, table: PublishedTable, metric: str, records: Sequence[Record]
 ) -> float | None:
-    """Value of a variant where the table has such columns (over all the paper's scenes), else of
-    the scenes; a mean alone only where all the paper's scenes are there."""
+    """Value of the records' variant where the table has such columns (over all the paper's
+    scenes), else of their scenes; a mean alone only where all the paper's scenes are there."""
+    variant, scenes = records[0].variant, [r.scene for r in records]
     complete = set(benchmark.scenes) <= set(scenes) and bool(benchmark.scenes)
-    if variant is not None and variant in table.columns:
-        return table.value(variant, metric)
+    of_variants = _columns_of_variants(benchmark, table)
+    if of_variants:
+        column = of_variants.get(variant)
+        return None if column is None else table.value(column, metric)
+    if not _is_papers(benchmark, variant):
+        return None
     if table.columns == ("mean",):
         return table.value("mean", metric) if complete else None
     return table.mean(scenes, metric)
+
+
+def _columns_of_variants(benchmark: Benchmark, table: PublishedTable) -> dict[str, str]:
+    """The column of an ablation's table for each variant that it belongs to: the one that has the
+    paper's other settings, too, where the benchmark has both."""
+    names = {variant.name for variant in benchmark.variants}
+    found = dict[str, str]()
+    for column in table.columns:
+        with_all = f"{_OF_PAPER}-{column}"
+        if {with_all, column} & names:
+            found[with_all if with_all in names else column] = column
+    return found
+
+
+def _is_papers(benchmark: Benchmark, variant: str) -> bool:
+    """Whether published figures of scenes belong to the rows of a variant: to those of the paper's
+    settings, where the benchmark has them, else of its first variant; in the paper's time."""
+    names = [v.name for v in benchmark.variants]
+    own = _OF_PAPER if _OF_PAPER in names else names[0]
+    return variant in (own, f"{own}-{_SECONDS}".removeprefix("-"))
 
 
 def _name(record: Record) -> str:
