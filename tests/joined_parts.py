@@ -129,7 +129,7 @@ def make_part(folder: Path, places: np.ndarray, number: int, paint: int = 0) -> 
         CAMERA, DEPTH_CAMERA, 0.5, 0.02, 0.04, np.zeros(3), 1.0, disks, ids, times[1::FRAMES], T_cw,
         np.zeros(len(ids), bool), True,
     )  # fmt: skip
-    save_map_with_views(folder / "map.safetensors", disks, views, {"source": folder.name})
+    save_map_with_views(folder / "map.safetensors", views, {"source": folder.name})
     for id, T in zip(ids, true, strict=True):
         write_image(image_path(folder, int(id)), image(T, pictures))
     write_tum_trajectory(folder / "trajectory.tum", Trajectory(times, T_wc, times > -1))

@@ -58,10 +58,6 @@ def poses_of_the_scene() -> np.ndarray:
 def make_result(folder: Path, with_images: bool = True) -> Path:
     """Write a result whose world is the map's frame times ``UNIT``, moved to ``ORIGIN``."""
     disks, own = disks_of_the_scene(), poses_of_the_scene()
-    shift = torch.from_numpy(ORIGIN).float()
-    world = MapSnapshot(
-        disks.position * UNIT + shift, disks.quaternion, disks.scale * UNIT, disks.opacity
-    )
     T_cw = own.copy()
     T_cw[:, :3, 3] = UNIT * own[:, :3, 3] - own[:, :3, :3] @ ORIGIN
     times = np.array(IDS) / 30
@@ -69,7 +65,7 @@ def make_result(folder: Path, with_images: bool = True) -> Path:
         CAMERA, DEPTH_CAMERA, 0.5, 0.02, 0.04, ORIGIN, UNIT, disks, np.array(IDS), times, T_cw,
         np.arange(len(IDS)) == MASKED, with_images,
     )  # fmt: skip
-    save_map_with_views(folder / "map.safetensors", world, views, {"source": "planes"})
+    save_map_with_views(folder / "map.safetensors", views, {"source": "planes"})
     random = np.random.default_rng(0)
     for id in IDS:
         coarse = random.integers(30, 220, (6, 8, 3), dtype=np.uint8)

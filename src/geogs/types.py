@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.config.setting import Range
@@ -331,6 +331,11 @@ class MapSnapshot(ShortRepr):
     def normal(self) -> Float[Tensor, "n 3"]:
         """Third axis of each disk, world frame."""
         return quaternion_to_matrix(self.quaternion)[..., 2]
+
+    def in_world(self, origin: Float64[np.ndarray, "3"], unit: float) -> "MapSnapshot":
+        """The disks of a map whose origin lies there in the world, and whose unit is so long."""
+        position = self.position * unit + torch.from_numpy(origin).to(self.position)
+        return MapSnapshot(position, self.quaternion, self.scale * unit, self.opacity)
 
     def is_finite(self) -> bool:
         """Whether every number is finite."""

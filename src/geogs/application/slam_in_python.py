@@ -131,7 +131,7 @@ def save_slam(slam: Slam, folder: str | Path) -> Path:
         write_config(new / "config.yaml", slam.config)
         views = write_keyframes(new, slam, slam.camera, renders, with_images=True)
         metadata = {"source": "a Python program", "seed": slam.config.seed}
-        save_map_with_views(new / "map.safetensors", slam.snapshot(), views, metadata)
+        save_map_with_views(new / "map.safetensors", views, metadata)
     return output
 
 

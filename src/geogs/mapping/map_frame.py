@@ -52,9 +52,7 @@ class MapFrame:
 
     def world_snapshot(self, disks: MapSnapshot) -> MapSnapshot:
         """Disks of the map in world coordinates and units."""
-        origin = torch.from_numpy(self.origin).to(disks.position)
-        position = disks.position * self.unit + origin
-        return replace(disks, position=position, scale=disks.scale * self.unit)
+        return disks.in_world(self.origin, self.unit)
 
     def map_snapshot(self, disks: MapSnapshot) -> MapSnapshot:
         """Disks in world coordinates and units in those of the map."""

@@ -106,7 +106,7 @@ def write_map(
         has_images=True,
     )
     metadata = {"source": " + ".join(part.span.name for part in parts), "seed": config.seed}
-    save_map_with_views(output / "map.safetensors", disks, views, metadata)
+    save_map_with_views(output / "map.safetensors", views, metadata)
     write_intrinsics(output / "intrinsics.json", camera)
     write_config(output / "config.yaml", config)
 

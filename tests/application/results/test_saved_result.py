@@ -1,10 +1,13 @@
 """A result that was written can be used again."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 import geogs
 from geogs.errors import InputError
@@ -69,6 +72,35 @@ def test_disks_are_in_the_world_for_those_who_only_want_them(result):
     expected = disks_of_the_scene().position.double() * UNIT + torch.from_numpy(ORIGIN)
     np.testing.assert_allclose(disks.position, expected, rtol=1e-6)
     np.testing.assert_array_equal(result.disks.scale, disks.scale)
+
+
+def test_positions_and_scales_are_kept_once_and_those_of_older_files_are_read(tmp_path, result):
+    """In the map's own frame, to the last digit; older files have them in the world beside it."""
+    path = make_result(tmp_path) / "map.safetensors"
+    own, said = load_file(path), load_map_file(path)
+    assert not {"position", "scale"} & set(own)
+    for name, part in (("map_position", "position"), ("map_scale", "scale")):
+        assert torch.equal(own[name], getattr(disks_of_the_scene(), part))
+    with safe_open(path, "pt") as file:
+        header = file.metadata()
+    assert header["version"] == "2"  # what older programs say cannot be read
+    older = own | {"position": said.disks.position, "scale": said.disks.scale}
+    save_file(older, path, header | {"version": "1"})
+    for disks in (geogs.load_map(path), load_map_file(path).disks):
+        assert torch.equal(disks.position, said.disks.position)
+        assert torch.equal(disks.scale, said.disks.scale)
+    again = geogs.load_result(tmp_path).views.disks
+    for name in ("position", "quaternion", "scale", "opacity"):
+        assert torch.equal(getattr(again, name), getattr(disks_of_the_scene(), name))
+    views = json.loads(header["metadata"])
+    for wrong in ({"unit": 0.0}, {"unit": "wide"}, {"origin": [1.0, 2.0]}, {"origin": None}):
+        changed = json.dumps(views | {"views": views["views"] | wrong})
+        save_file(own, path, header | {"metadata": changed})
+        with pytest.raises(InputError, match="does not say where its disks are"):
+            geogs.load_map(path)
+    save_file({n: t for n, t in own.items() if n != "map_scale"}, path, header)
+    with pytest.raises(InputError, match="its scale is missing or misshapen"):
+        geogs.load_map(path)
 
 
 def test_loaded_disks_are_rendered_as_they_are(result):

@@ -136,7 +136,7 @@ def _scale_map(new: Path, result: SavedResult, world: MapSnapshot, factor: float
         disks=world if own is None else own,
         T_cw=T_cw,
     )
-    save_map_with_views(new / "map.safetensors", world, moved, said)
+    save_map_with_views(new / "map.safetensors", moved, said)
     return moved
 
 

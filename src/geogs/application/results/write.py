@@ -94,7 +94,7 @@ def _write_map(
         if result.why_no_map is None:
             views = write_keyframes(output, scene, source.camera, renders, keyframe_images)
             metadata = {"source": source.name, "seed": scene.config.seed}
-            save_map_with_views(output / "map.safetensors", disks, views, metadata)
+            save_map_with_views(output / "map.safetensors", views, metadata)
         if len(disks):
             colours = splat_colours(disks, fusion_views(renders))
             write_splats(output / "splats.ply", disks, colours)

@@ -22,10 +22,13 @@ from geogs.limits import POSITIVE, RIGID, holds
 from geogs.short_repr import ShortRepr
 from geogs.types import MapSnapshot
 
-FORMAT_VERSION = 1
-"""Raised when older programs could not read the file any more."""
+FORMAT_VERSION = 2
+"""Raised when older programs could not read the file any more; the first has all in the world."""
 
 _SHAPES = {"position": (3,), "quaternion": (4,), "scale": (2,), "opacity": ()}
+_OWN = {"position": "map_position", "scale": "map_scale"}
+"""Names of what is in the map's own frame, where that is not the world's."""
+_NONE = torch.zeros(0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -38,29 +41,26 @@ class MapFile:
     metadata: dict[str, Any]
 
 
-def save_map(
-    path: str | Path,
-    disks: MapSnapshot,
-    metadata: Mapping[str, Any] = {},
-    tensors: Mapping[str, Tensor] = {},
-) -> None:
+def save_map(path: str | Path, disks: MapSnapshot, metadata: Mapping[str, Any] = {}) -> None:
     """Write the disks in float32.
 
     Args:
         path: the file.
         disks: the map.
         metadata: anything JSON can hold, kept beside the disks.
-        tensors: more to keep beside them, by names that the disks do not use.
     """
-    own = {name: getattr(disks, name).detach().cpu().float().contiguous() for name in _SHAPES}
-    more = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    _write(path, {name: getattr(disks, name).float() for name in _SHAPES}, metadata)
+
+
+def _write(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
     header = {
         "format": "geogs-map",
-        "version": str(FORMAT_VERSION),
+        "version": "1" if "position" in tensors else str(FORMAT_VERSION),
         "metadata": json.dumps(dict(metadata)),
     }
+    on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # The library would write the metadata in an order of its own, another in every process.
-    data = memoryview(save({**more, **own}))
+    data = memoryview(save(on_cpu))
     end = 8 + int.from_bytes(data[:8], "little")
     table = {"__metadata__": header, **json.loads(bytes(data[8:end]))}
     text = json.dumps(table, separators=(",", ":")).encode()
@@ -71,7 +71,7 @@ def save_map(
 
 
 def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapshot:
-    """Read the disks of a map.
+    """Read the disks of a map, in the world.
 
     Raises:
         InputError: the file is missing, damaged, no map, of a newer version, or holds NaN.
@@ -80,7 +80,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapsho
 
 
 def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFile:
-    """Read the disks of a map and what lies beside them.
+    """Read the disks of a map, in the world, and what lies beside them.
 
     Raises:
         InputError: as of ``load_map``.
@@ -88,14 +88,29 @@ def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFi
     with _open(path) as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         metadata = _metadata(path, (file.metadata() or {}).get("metadata", "{}"))
-    count = len(tensors["position"]) if "position" in tensors else 0
+    is_own = "position" not in tensors
+    parts = {n: tensors.get(_OWN.get(n, n) if is_own else n, _NONE) for n in _SHAPES}
     for name, shape in _SHAPES.items():
-        if name not in tensors or tensors[name].shape != (count, *shape):
+        if parts[name].shape != (len(parts["position"]), *shape):
             raise InputError(f"{path} is no map of geogs: its {name} is missing or misshapen.")
-    disks = MapSnapshot(**{name: tensors.pop(name).to(device) for name in _SHAPES})
+    disks = MapSnapshot(**{name: part.to(device).float() for name, part in parts.items()})
+    if is_own:
+        try:
+            disks = disks.in_world(*_frame(metadata["views"]))
+        except UNUSABLE as error:
+            raise InputError(f"{path} does not say where its disks are; was it changed?") from error
     if not disks.is_finite():
         raise InputError(f"{path} holds NaN or infinity; the map is damaged.")
-    return MapFile(disks, tensors, metadata)
+    others = {name: tensor for name, tensor in tensors.items() if name not in _SHAPES}
+    return MapFile(disks, others, metadata)
+
+
+def _frame(views: dict[str, Any]) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Origin and unit of the map's own frame. Raises an error of ``UNUSABLE`` if they are none."""
+    origin, unit = np.array(views["origin"], np.float64).reshape(3), float(views["unit"])
+    if not (holds((), origin) and holds((POSITIVE,), unit)):
+        raise ValueError("a number is not finite, or no length")
+    return origin, unit
 
 
 def _metadata(path: str | Path, text: str) -> dict[str, Any]:
@@ -158,12 +173,12 @@ class MapViews(ShortRepr):
 
 
 def save_map_with_views(
-    path: str | Path, disks: MapSnapshot, views: MapViews, metadata: Mapping[str, Any] = {}
+    path: str | Path, views: MapViews, metadata: Mapping[str, Any] = {}
 ) -> None:
-    """Write the disks in the world, and the views beside them.
+    """Write the disks, and the views beside them.
 
-    A map in a frame of its own has its positions and scales there as well: those of the world have
-    lost digits.
+    A map in a frame of its own has its positions and scales there, under names that say so: those
+    of the world, which have lost digits, are computed when it is read.
     """
     tensors: dict[str, Tensor] = {
         "keyframe_id": torch.from_numpy(views.keyframe_id),
@@ -171,8 +186,9 @@ def save_map_with_views(
         "keyframe_T_cw": torch.from_numpy(views.T_cw),
         "keyframe_has_mask": torch.from_numpy(views.has_mask),
     }
-    if views.origin.any() or views.unit != 1.0:
-        tensors |= {"map_position": views.disks.position, "map_scale": views.disks.scale}
+    names = _OWN if views.origin.any() or views.unit != 1.0 else {}
+    for name in _SHAPES:
+        tensors[names.get(name, name)] = getattr(views.disks, name).float()
     description = {
         "camera": asdict(views.camera),
         "render_camera": asdict(views.render_camera),
@@ -183,13 +199,13 @@ def save_map_with_views(
         "unit": views.unit,
         "has_images": views.has_images,
     }
-    save_map(path, disks, {**metadata, "views": description}, tensors)
+    _write(path, tensors, {**metadata, "views": description})
 
 
 def load_map_views(
     path: str | Path, device: torch.device | str = "cpu"
 ) -> tuple[MapSnapshot, MapViews]:
-    """Read the disks in the world, and the views beside them.
+    """Read the disks in the world, and the views beside them, which have them in the map's frame.
 
     Raises:
         InputError: the map cannot be read, or was written before maps had views.
@@ -216,12 +232,11 @@ def _views(file: MapFile) -> MapViews:
     ids, times, T_cw, masked = (tensors[f"keyframe_{name}"] for name in names)
     if not times.shape == masked.shape == ids.shape or T_cw.shape != (*ids.shape, 4, 4):
         raise ValueError("its keyframes differ in number")
-    origin, unit = np.array(said["origin"], np.float64).reshape(3), float(said["unit"])
+    origin, unit = _frame(said)
     spread = float(said["max_spread"])
     # Before the reach had a number of its own it was twice the spread.
     reach = float(said.get("plane_reach", 2 * spread))
-    numbers = (((RIGID,), T_cw), ((), times), ((), origin), ((), reach), ((POSITIVE,), unit))
-    if not all(holds(marks, value) for marks, value in numbers):
+    if not (holds((RIGID,), T_cw) and holds((), times) and holds((), reach)):
         raise ValueError("a pose is none, or a number is not finite")
     return MapViews(
         camera=camera_of(said["camera"]),
