@@ -108,8 +108,9 @@ def test_what_cannot_be_placed_once_more(settings, source, reason):
 def test_the_map_is_made_by_the_preset_of_the_run():
     for name in ("default", "fast", "accurate", "paper"):
         assert preset_of(replace(preset(name), seed=7)) == name
-    own = replace(Config().mapping, render_long_edge=111)
-    assert preset_of(replace(Config(), mapping=own)) == "default"
+        own = replace(preset(name).mapping, render_long_edge=111)  # the rest is the preset's still
+        assert preset_of(replace(Config(), mapping=own)) == name
+    assert preset_of(preset("default", on_gpu=True)) == "default"
 
 
 @functools.cache
