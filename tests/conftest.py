@@ -3,7 +3,8 @@
 import fcntl
 import gc
 import os
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jaxtyping
@@ -59,6 +60,21 @@ def pytest_collection_finish() -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """In tests of the whole system not every call of a function has its types checked."""
     lazy_check.CALLS.begin(all_checked=item.get_closest_marker("system") is None)
+
+
+@pytest.fixture(autouse=True)
+def heeded_signals() -> Iterator[None]:
+    """A test gets signals as in a terminal, and so do its processes.
+
+    A script's background ignores SIGINT and nohup SIGHUP, which processes inherit.
+    """
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    ignored = [number for number in usual if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, usual[number])
+    yield
+    for number in ignored:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @pytest.fixture(scope="session")

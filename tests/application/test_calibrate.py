@@ -106,15 +106,6 @@ def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
     assert self_calibrated(guessed, off) is guessed
 
 
-@pytest.fixture
-def heard():
-    """Ctrl-C is heard, though the tests may have been started where it is not."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("heard")
 def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
     def interrupted(frames, camera, radial, device, report, *masks):
         signal.raise_signal(signal.SIGINT)

@@ -12,11 +12,8 @@ import pytest
 
 from io_samples import write_images
 
-DEFAULT = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-"""What Python does itself, but for where tests run in the background of a script."""
-AT_IMPORT = f"""
+AT_IMPORT = """
 import os, sys
-{DEFAULT}
 from geogs.cli.main import main
 
 number, count = int(sys.argv[1]), int(sys.argv[2])
@@ -85,7 +82,7 @@ def test_two_signals_in_an_import_leave_no_empty_folder(tmp_path):
 def test_a_signal_before_geogs_is_imported_ends_it_without_a_word():
     at_first = "event == 'import' and arguments[0] == 'geogs' and os.kill(os.getpid(), 2)"
     hook = f"sys.addaudithook(lambda event, arguments: {at_first} and None)"
-    code = f"import os, sys; {DEFAULT}; {hook}; import geogs_start; geogs_start.main()"
+    code = f"import os, sys; {hook}; import geogs_start; geogs_start.main()"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, b"", b"")
 
@@ -104,7 +101,7 @@ def test_signals_at_many_times_in_the_first_seconds(tmp_path, number):
     for k in range(40):
         code = "print(flush=True); import sys; from geogs.cli import main; sys.exit(main.main())"
         begun = subprocess.Popen(
-            [sys.executable, "-c", f"{DEFAULT}; import geogs.cli.main; {code}", *arguments],
+            [sys.executable, "-c", f"import geogs.cli.main; {code}", *arguments],
             env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert begun.stdout is not None

@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver
 from geogs.application.interrupt import Stop
-from geogs.application.machine.compilation import compiling
+from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
@@ -46,10 +47,12 @@ def run(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     observer: RunObserver | None = None,
+    kernels: Compilation | None = None,
 ) -> Result:
     """Open the sources, calibrate, track and map every frame, write the results.
 
-    Where ``settings.offline`` says so, frames are placed by structure from motion instead.
+    Where ``settings.offline`` says so, frames are placed by structure from motion instead. Kernels
+    for the CPU may be compiled already by others, whom somebody else stops.
 
     Raises:
         InputError: a source, a setting or a prior cannot be used.
@@ -77,7 +80,8 @@ def run(
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
-    with claimed(wanted) as output, compiling(device) as kernels:
+    compiled = compiling(device) if kernels is None else nullcontext(kernels)
+    with claimed(wanted) as output, compiled as kernels:
         compile_gpu_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
         opened = without_overlay(opened, progress)

@@ -1,10 +1,12 @@
 """``geogs demo``: make a small room, reconstruct it as any other video, show the errors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+from geogs.cli import run
 from geogs.cli.command import find_command
 from geogs.cli.options import parse_options
 from geogs.config import Seed
@@ -33,18 +35,24 @@ def main(argv: Sequence[str]) -> int:
 
 
 def demo(options: DemoOptions) -> int:
-    """The three commands one after the other."""
+    """The three commands one after the other; kernels of the second are compiled from the first."""
+    from geogs.application.machine.compilation import compiling
+    from geogs.gpu.installation import require_device
+
     room, result = str(options.output / "room"), str(options.output / "result")
-    steps = [
-        ["synth", room, "--frames", str(options.frames), "--width", str(options.width),
-         "--height", str(options.height), "--seed", str(options.seed)],
-        ["run", room, "-o", result],
-        ["eval", result, "--gt", room],
-    ]  # fmt: skip
-    for name, *arguments in steps:
-        print(f"$ geogs {name} {' '.join(arguments)}", flush=True)
-        code = find_command(name).run(arguments)
-        if code:
-            return code
+    with compiling(require_device("auto")) as kernels:
+        steps: dict[str, tuple[Callable[[Sequence[str]], int], list[str]]] = {
+            "synth": (find_command("synth").run, [
+                room, "--frames", str(options.frames), "--width", str(options.width),
+                "--height", str(options.height), "--seed", str(options.seed),
+            ]),
+            "run": (partial(run.main, kernels=kernels), [room, "-o", result]),
+            "eval": (find_command("eval").run, [result, "--gt", room]),
+        }  # fmt: skip
+        for name, (command, arguments) in steps.items():
+            print(f"$ geogs {name} {' '.join(arguments)}", flush=True)
+            code = command(arguments)
+            if code:
+                return code
     print(f"Open {result}/report/index.html in a browser.")
     return 0

@@ -19,6 +19,7 @@ from geogs.gpu.early_start import is_gpu, start_gpu
 from geogs.io.sources.address import live_address
 
 if TYPE_CHECKING:
+    from geogs.application.machine.compilation import Compilation
     from geogs.application.viewer.observer import RunObserver
 
 
@@ -40,8 +41,8 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
     --scale-from."""
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+def main(argv: Sequence[str], kernels: "Compilation | None" = None) -> int:
+    """Run the command, with what compiles ``kernels`` already; returns the exit code."""
     options = parse(argv)
     is_live = any(live_address(source) is not None for source in options.source)
     if options.offline and is_live:
@@ -57,7 +58,9 @@ def main(argv: Sequence[str]) -> int:
     settings, stop = record(RunSettings, options), Interruption()
     if options.offline and options.resume is None and (options.viewer or options.record):
         raise InputError("--viewer and --record follow tracking, which --offline has none of.")
-    go = run if options.resume is None else partial(resume, options.resume)
+    go = partial(run, kernels=kernels)
+    if options.resume is not None:
+        go = partial(resume, options.resume)
     observer = _observer(options)
     has_keys = is_live and not any(str(source) == "-" for source in options.source)
     with quit_key(stop.request) if has_keys else nullcontext():

@@ -5,6 +5,7 @@
 """
 
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -20,17 +21,20 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-KERNELS_OF_SEARCH, KERNELS_OF_MAP, KERNELS = 19, 40, 53
-"""How many kernels that are called from Python a rehearsal compiles: up to what searches depths,
-up to what makes a map, up to a mesh."""
-PARTS = {"map": KERNELS_OF_MAP, "mesh": KERNELS - KERNELS_OF_MAP}
-"""What is compiled side by side, and how many kernels that are; what is needed first goes first."""
+PARTS = {"search": 25, "train": 15, "mesh": 13}
+"""What is compiled side by side, and how many kernels that are called from Python; what is needed
+first goes first."""
+KERNELS_OF_SEARCH = PARTS["search"]
+KERNELS_OF_MAP = KERNELS_OF_SEARCH + PARTS["train"]
+KERNELS = sum(PARTS.values())
 ON_GPU = {"planes": 4, "turn": 3, "lens": 3}
 """The same where a GPU does the rest; what takes longest goes first."""
 POSED_ON_GPU = {"look": 5, "planes": 4}
 """The same where poses are known, too."""
 _NICENESS = 5
 """Added to the niceness of each part over what goes before it, images first of all."""
+_OBJECTS = 100_000
+"""New objects after which Python looks for garbage; a compiler makes many that stay."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 
 
@@ -158,6 +162,9 @@ def _made_of() -> str:
 def main(arguments: list[str]) -> None:
     """Compile all, or the parts that are named, with a line for each kernel."""
     parts = arguments or [*PARTS]
+    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # nobody reads them
+    gc.freeze()
+    gc.set_threshold(_OBJECTS)
     with contextlib.suppress(AttributeError, OSError):
         os.nice(_NICENESS * (1 + [*(ON_GPU | POSED_ON_GPU | PARTS)].index(parts[0])))
     if not is_compiled(parts):

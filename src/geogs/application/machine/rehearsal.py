@@ -10,12 +10,13 @@ from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, solve_shared
 from geogs.config import MeshConfig, ReconstructConfig
-from geogs.depth.depth_view import KeyframeDepth, ViewPose
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth, ViewPose
 from geogs.depth.revision.segment_planes import on_planes
 from geogs.geometry.camera import Camera
 from geogs.loop.orb_features import orb_features
 from geogs.loop.verification import FeatureView, TwoViewVerifier
 from geogs.mapping.first_look import first_points
+from geogs.mapping.known_poses import expect_depths
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.reconstruction import Reconstruction
@@ -40,8 +41,9 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """``map`` follows and maps the wall on a CPU, ``mesh`` extracts its mesh; ``look``, ``planes``,
-    ``turn`` and ``lens`` do what no GPU does. Leaves nothing."""
+    """``search`` follows the wall on a CPU and searches its depths, ``train`` trains its map, ``mesh``
+    extracts its mesh; ``look``, ``planes``, ``turn`` and ``lens`` do what no GPU does. Leaves
+    nothing."""
     for step in _STEPS[part]:
         step()
 
@@ -94,17 +96,36 @@ def _lens() -> None:
     RowErrors(grid, {0: seen}, range(VIEWS), way).of_pixels([0], pixels, depth[:1])
 
 
-def _map() -> None:
+def _search() -> None:
+    """Depths of the wall, which check each other."""
+    mapper = _scene().mapper
+    points = DEPTH * CAMERA.rays(torch.float64).numpy()[::4, ::4].reshape(-1, 3)
+    expect_depths(mapper.views.values(), points, mapper.cameras.working)
+    mapper.search_depths([*mapper.views])
+    mapper.check_depths()
+
+
+def _train() -> None:
+    """A map of the wall from depths that are known."""
+    scene = _scene()
+    mapper = scene.mapper
+    size = mapper.cameras.render.height, mapper.cameras.render.width
+    depth = KeyframeDepth(np.full(size, DEPTH, np.float32), np.ones(size, np.float32))
+    for view in mapper.views.values():
+        view.set_depth(DenseDepth.of(depth))
+    mapper.table.mapped = [*mapper.views]
+    mapper.grow()
+    mapper.train(VIEWS)
+    list(scene.renders())
+
+
+def _scene() -> Reconstruction:
     config = ReconstructConfig()
     mapping = replace(config.mapping, render_long_edge=48)
-    search = replace(config.search, least_steps=4, steps_per_view=1)
-    scene = Reconstruction(CAMERA, replace(config, mapping=mapping, search=search), "cpu")
+    scene = Reconstruction(CAMERA, replace(config, mapping=mapping), "cpu")
     for number, picture in enumerate(_pictures()):
         scene.add(picture, _pose(number))
-    points = DEPTH * CAMERA.rays(torch.float64).numpy()[::4, ::4].reshape(-1, 3)
-    scene.finish(points)
-    list(scene.renders())
-    _bare()
+    return scene
 
 
 def _bare() -> None:
@@ -121,7 +142,8 @@ def _mesh() -> None:
 
 
 _STEPS = {
-    "map": (_turn, _recognise, _follow, _lens, _map),
+    "search": (_turn, _recognise, _follow, _lens, _search, _bare),
+    "train": (_train,),
     "mesh": (_mesh,),
     "turn": (_turn, _recognise),
     "lens": (_lens,),
