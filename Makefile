@@ -74,13 +74,15 @@ setup: kernels
 
 # constraints.txt pins every version that was tested, requirements.lock the SHA-256 of all their files but
 # torch's: where there is no NVIDIA driver its CPU build is taken (from where pip already looks, else from
-# PyTorch's own index), elsewhere PyPI's. No file is built by what is not pinned.
+# PyTorch's own index), elsewhere PyPI's. No file is built by what is not pinned. Kernels are begun
+# beside the last step; those that are ready when it ends are kept.
 $(STAMP): pyproject.toml constraints.txt requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geogs needs Python 3.11 or newer; set PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) --require-hashes -r requirements.lock
 	command -v nvidia-smi >/dev/null || $(PIP) 'torch==$(TORCH)+cpu' || $(PIP) --index-url $(TORCH_CPU_INDEX) 'torch==$(TORCH)+cpu'
-	$(PIP) -c constraints.txt --no-build-isolation -e '.[dev]'
+	PYTHONPATH=$(CURDIR)/src PYTHONDONTWRITEBYTECODE= $(BIN)/python -m geogs.application.machine.compilation search >/dev/null 2>&1 & begun=$$!; \
+	  $(PIP) -c constraints.txt --no-build-isolation -e '.[dev]'; code=$$?; kill $$begun 2>/dev/null; exit $$code
 	touch $(STAMP)
 
 # For all systems and Pythons that geogs has; what torch's build for CUDA needs is torch's to choose.

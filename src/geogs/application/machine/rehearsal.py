@@ -41,9 +41,9 @@ DEPTH = CAMERA.fx * BASELINE / SHIFT
 
 @on_one_torch_thread
 def rehearse(part: str) -> None:
-    """``search`` follows the wall on a CPU and searches its depths, ``train`` trains its map, ``mesh``
-    extracts its mesh; ``look``, ``planes``, ``turn`` and ``lens`` do what no GPU does. Leaves
-    nothing."""
+    """Leaves nothing. ``search`` follows the wall on a CPU and searches its depths, ``train``
+    trains its map, ``mesh`` extracts its mesh; ``look``, ``planes``, ``turn`` and ``lens`` do what
+    no GPU does."""
     for step in _STEPS[part]:
         step()
 

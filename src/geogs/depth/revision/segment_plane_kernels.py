@@ -2,7 +2,7 @@
 
 Images are (h, w) and C-contiguous; a box is its first row and column, and those behind its last;
 places are x and y over the image's width and height, from its middle. Every kernel releases the
-interpreter lock.
+interpreter lock. Numba compiles loops faster than expressions of arrays.
 """
 
 from typing import NamedTuple
@@ -88,7 +88,8 @@ def near_part(parts, number, box, reach):
 @njit(**_EXACT)
 def rim_pixels(labels, label, box, reach, confident):
     """Flat indices of the ``confident`` pixels within ``reach`` of a segment, row by row."""
-    top, left, low, right = wide = widened(box, reach, labels.shape)
+    whole = box[0], box[1], box[2], box[3]
+    top, left, low, right = wide = widened(whole, reach, labels.shape)
     near = near_part(labels, label, wide, reach)
     pixels, count = np.empty(near.size, np.int64), 0
     for v in range(top, low):
@@ -150,8 +151,8 @@ def mark_supported(labels, label, box, uncertain, confident, depth, planes, rule
                     if near[v - wide[0], u - wide[1]] and confident[v, u]:
                         around += 1
                         value, is_on = 1 / np.float64(depth[v, u]), False
-                        for plane in planes:
-                            off = abs(at_pixel(plane, v, u, shape)[0] - value)
+                        for p in range(len(planes)):
+                            off = abs(at_pixel(planes[p], v, u, shape)[0] - value)
                             is_on |= off < rules.tolerance * value
                         on += is_on
             if on >= rules.min_on_plane * max(1, around):
@@ -170,7 +171,10 @@ def planes_of_segment(
     """
     known = rim_pixels(labels, label, box, rules.reach, confident)
     some = known[:: max(1, -(-len(known) // rules.max_pixels))]
-    x, y, value, weight = np.empty((4, len(some)))
+    x = np.empty(len(some))
+    y = np.empty(len(some))
+    value = np.empty(len(some))
+    weight = np.empty(len(some))
     for i in range(len(some)):
         v, u = some[i] // labels.shape[1], some[i] % labels.shape[1]
         x[i], y[i] = (u + 0.5) / labels.shape[1] - 0.5, (v + 0.5) / labels.shape[0] - 0.5
@@ -242,17 +246,46 @@ def explained(x, y, value, weight, tolerance, a, b, c):
 
 
 @njit(**_PART)
+def summed(weight):
+    """The sum, from the first on."""
+    total = 0.0
+    for i in range(len(weight)):
+        total += weight[i]
+    return total
+
+
+@njit(**_PART)
+def drawn(chance, uniform):
+    """The first of the increasing chances that is greater than a random number."""
+    low, high = 0, len(chance)
+    while low < high:
+        middle = (low + high) // 2
+        if chance[middle] <= uniform:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(**_PART)
 def best_sample(x, y, value, weight, uniform, tolerance):
     """The plane through three pixels that explains most of the weight, and that weight; it is
     negative if there is none.
 
     ``uniform`` (t, 3) draws the pixels in proportion to their weight.
     """
-    chance = np.cumsum(weight / weight.sum())
-    chance /= chance[-1]
+    whole, reached = summed(weight), 0.0
+    chance = np.empty(len(weight))
+    for n in range(len(weight)):
+        reached += weight[n] / whole
+        chance[n] = reached
+    for n in range(len(weight)):
+        chance[n] /= reached
     best, most = (0.0, 0.0, 0.0), -1.0
     for t in range(len(uniform)):
-        i, j, k = np.searchsorted(chance, uniform[t], side="right")
+        i = drawn(chance, uniform[t, 0])
+        j = drawn(chance, uniform[t, 1])
+        k = drawn(chance, uniform[t, 2])
         x1, y1, v1 = x[j] - x[i], y[j] - y[i], value[j] - value[i]
         x2, y2, v2 = x[k] - x[i], y[k] - y[i], value[k] - value[i]
         area = x1 * y2 - x2 * y1
@@ -267,27 +300,47 @@ def best_sample(x, y, value, weight, uniform, tolerance):
 
 
 @njit(**_PART)
+def mark_inliers(x, y, value, tolerance, a, b, c, on):
+    """Write which pixels are ``on`` the plane a x + b y + c; how many."""
+    count = 0
+    for i in range(len(value)):
+        on[i] = abs(a * x[i] + b * y[i] + c - value[i]) < tolerance * value[i]
+        count += on[i]
+    return count
+
+
+@njit(**_PART)
 def fit_plane(x, y, value, weight, uniform, rules):
     """A plane by random samples of three pixels and a least-squares fit to its inliers, the
     inliers, and their weighted sums of xx, xy, x, yy, y and 1; no inliers where they are too few.
     """
     (a, b, c), most = best_sample(x, y, value, weight, uniform, rules.tolerance)
-    on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
-    sums = np.zeros(6)
+    on, sums = np.empty(len(value), np.bool_), np.zeros(6)
+    count = mark_inliers(x, y, value, rules.tolerance, a, b, c, on)
     for _ in range(rules.refits):
-        if most < 0 or np.count_nonzero(on) < rules.min_pixels:
+        if most < 0 or count < rules.min_pixels:
             on[:] = False
             break
         sums[:] = 0.0
         xv, yv, v = 0.0, 0.0, 0.0
-        for i in np.flatnonzero(on):
-            wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
-            sums[0], sums[1], sums[2] = sums[0] + wx * x[i], sums[1] + wx * y[i], sums[2] + wx
-            sums[3], sums[4], sums[5] = sums[3] + wy * y[i], sums[4] + wy, sums[5] + w
-            xv, yv, v = xv + wx * value[i], yv + wy * value[i], v + w * value[i]
+        for i in range(len(value)):
+            if on[i]:
+                wx, wy, w = weight[i] * x[i], weight[i] * y[i], weight[i]
+                sums[0], sums[1], sums[2] = sums[0] + wx * x[i], sums[1] + wx * y[i], sums[2] + wx
+                sums[3], sums[4], sums[5] = sums[3] + wy * y[i], sums[4] + wy, sums[5] + w
+                xv, yv, v = xv + wx * value[i], yv + wy * value[i], v + w * value[i]
         a, b, c = solved(sums, 1e-12, xv, yv, v)
-        on = np.abs(a * x + b * y + c - value) < rules.tolerance * value
+        count = mark_inliers(x, y, value, rules.tolerance, a, b, c, on)
     return (a, b, c), on, sums
+
+
+@njit(**_PART)
+def picked(values, of):
+    """The values of some pixels."""
+    found = np.empty(len(of))
+    for i in range(len(of)):
+        found[i] = values[of[i]]
+    return found
 
 
 @njit(**_PART)
@@ -300,20 +353,34 @@ def segment_planes(x, y, value, weight, draws, rules):
     """
     planes, covariances = np.empty((len(draws), 3)), np.empty((len(draws), 3, 3))
     of, left, found, tried = np.zeros(len(x), np.int32), np.arange(len(x)), 0, 0
+    whole = summed(weight)
     while tried < len(draws) and len(left) >= rules.min_pixels:
         plane, on, sums = fit_plane(
-            x[left], y[left], value[left], weight[left], draws[tried], rules
+            picked(x, left), picked(y, left), picked(value, left), picked(weight, left),
+            draws[tried], rules,
         )  # fmt: skip
         tried += 1
-        mine = left[on]
-        if len(mine) == 0 or weight[mine].sum() < rules.min_explained * weight.sum():
+        count, own, values = 0, 0.0, 0.0
+        for i in range(len(left)):
+            if on[i]:
+                own += weight[left[i]]
+                values += value[left[i]]
+                count += 1
+        if count == 0 or own < rules.min_explained * whole:
             break
-        variance = rules.correlated * (rules.tolerance / 2 * value[mine].mean()) ** 2
+        variance = rules.correlated * (rules.tolerance / 2 * (values / count)) ** 2
         planes[found, 0], planes[found, 1], planes[found, 2] = plane
-        for k, unit in enumerate(variance * np.eye(3)):
-            row = solved(sums, 1e-9, unit[0], unit[1], unit[2])
+        for k in range(3):
+            x1, y1, one = variance * (k == 0), variance * (k == 1), variance * (k == 2)
+            row = solved(sums, 1e-9, x1, y1, one)
             covariances[found, k, 0], covariances[found, k, 1], covariances[found, k, 2] = row
         found += 1
-        of[mine] = found
-        left = left[~on]
+        kept = 0
+        for i in range(len(left)):
+            if on[i]:
+                of[left[i]] = found
+            else:
+                left[kept] = left[i]
+                kept += 1
+        left = left[:kept]
     return planes[:found], covariances[:found], of, tried

@@ -2,6 +2,7 @@
 
 Corner 3 f + k is that of face f at its k-th vertex, and stands for the edge from there to the next
 vertex of the face. Of the two corners of an edge the one at the lower vertex stands for it.
+Functions get numbers of corners and vertices as 64 bits, so that each is compiled once.
 """
 
 import math
@@ -42,13 +43,13 @@ def rings(faces, count):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _after(faces, corner):
     """The vertex that follows in the face of a corner."""
-    return faces[corner - 2 if corner % 3 == 2 else corner + 1]
+    return np.int64(faces[corner - 2 if corner % 3 == 2 else corner + 1])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _before(faces, corner):
     """The vertex that comes before in the face of a corner."""
-    return faces[corner + 2 if corner % 3 == 0 else corner - 1]
+    return np.int64(faces[corner + 2 if corner % 3 == 0 else corner - 1])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -62,12 +63,14 @@ def begin(low, high, position, faces, first, corners, quadric, fixed):
         quadric[v] = 0.0
         is_fixed = False
         for i in range(first[v], first[v + 1]):
-            c = corners[i]
+            c = np.int64(corners[i])
             _add_plane(position, faces, c - c % 3, quadric, v)
             after, before = _after(faces, c), _before(faces, c)
             twins = 0
             for j in range(first[v], first[v + 1]):
-                next_one, last_one = _after(faces, corners[j]), _before(faces, corners[j])
+                near = np.int64(corners[j])
+                next_one = _after(faces, near)
+                last_one = _before(faces, near)
                 twins += (last_one == after) + (next_one == before)
                 if j != i and (next_one == after or last_one == before):
                     is_fixed = True
@@ -92,8 +95,8 @@ def _normal(position, a, b, c):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_plane(position, faces, c, quadric, v):
-    a = faces[c]
-    nx, ny, nz = _normal(position, a, faces[c + 1], faces[c + 2])
+    a = np.int64(faces[c])
+    nx, ny, nz = _normal(position, a, _after(faces, c), _before(faces, c))
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     if not length > 0:
         return
@@ -153,7 +156,8 @@ def merged(position, quadric, a, b):
 def edge_cost(position, faces, quadric, fixed, bound, corner):
     """Cost of the edge that a corner stands for; infinite where it stands for none or costs, by
     area, more than the square of a bound."""
-    a, b = faces[corner], _after(faces, corner)
+    a = np.int64(faces[corner])
+    b = _after(faces, corner)
     if a >= b or fixed[a] or fixed[b]:
         return np.inf
     _, _, _, error, area = merged(position, quadric, a, b)
@@ -191,7 +195,7 @@ def best_edges(low, high, first, corners, cost, limit, best):
     for v in range(low, high):
         found = NONE
         for i in range(first[v], first[v + 1]):
-            c = corners[i]
+            c = np.int64(corners[i])
             coming = c + 2 if c % 3 == 0 else c - 1
             found = min(found, _rank(bits, limit, c), _rank(bits, limit, coming))
         best[v] = found
@@ -256,7 +260,7 @@ def collapse(
 def _update_costs(position, faces, first, corners, quadric, fixed, bound, cost, v):
     """Costs anew of the edges that were at a vertex, now that its place and its number changed."""
     for i in range(first[v], first[v + 1]):
-        leaving = corners[i]
+        leaving = np.int64(corners[i])
         coming = leaving + 2 if leaving % 3 == 0 else leaving - 1
         cost[leaving] = edge_cost(position, faces, quadric, fixed, bound[0], leaving)
         cost[coming] = edge_cost(position, faces, quadric, fixed, bound[0], coming)
@@ -266,8 +270,8 @@ def _update_costs(position, faces, first, corners, quadric, fixed, bound, cost, 
 def _is_first(faces, first, corners, matched, v):
     """Whether no vertex next to a matched one is matched by an edge that ranks lower."""
     for i in range(first[v], first[v + 1]):
-        after, before = _after(faces, corners[i]), _before(faces, corners[i])
-        if matched[after] < matched[v] or matched[before] < matched[v]:
+        c = np.int64(corners[i])
+        if matched[_after(faces, c)] < matched[v] or matched[_before(faces, c)] < matched[v]:
             return False
     return True
 
@@ -277,9 +281,9 @@ def _common(faces, first, corners, a, b):
     """Neighbours that two vertices share."""
     count = 0
     for i in range(first[a], first[a + 1]):
-        x = _after(faces, corners[i])
+        x = _after(faces, np.int64(corners[i]))
         for j in range(first[b], first[b + 1]):
-            count += _after(faces, corners[j]) == x
+            count += _after(faces, np.int64(corners[j])) == x
     return count
 
 
@@ -287,7 +291,9 @@ def _common(faces, first, corners, a, b):
 def _keeps_sides(faces, first, corners, position, v, other, x, y, z):
     """Whether no face at ``v`` without ``other`` turns over or becomes a needle if ``v`` moves."""
     for i in range(first[v], first[v + 1]):
-        b, c = _after(faces, corners[i]), _before(faces, corners[i])
+        corner = np.int64(corners[i])
+        b = _after(faces, corner)
+        c = _before(faces, corner)
         if b == other or c == other:
             continue
         ox, oy, oz = _normal(position, v, b, c)
