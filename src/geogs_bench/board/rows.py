@@ -25,25 +25,25 @@ class Row:
     """Whether it finds nothing compiled."""
 
 
-_SMALL = Size(40, 160, 120)
+_SMALL = Size(80, 192, 144, stride=2)
 _FULL = Size(150, 400, 300)
 
 FOOTAGE = (
     Footage("handheld-kinect", "handheld", "kinect", 31, _SMALL, _FULL),
     Footage("turning-60", "turning-60", "clean", 32, _SMALL, _FULL),
     Footage("walking-phone", "walking", "phone", 33, _SMALL, _FULL),
-    Footage("street", "driving", "clean", 34, Size(40, 320, 97), Size(120, 800, 242)),
+    Footage("street", "driving", "clean", 34, Size(32, 256, 78), Size(120, 800, 242)),
     Footage("corridor", "corridor", "kinect", 35, _SMALL, _FULL),
     Footage(
         "weak-link",
         "handheld-5hz",
         "phone",
         36,
-        Size(40, 160, 120),
+        Size(40, 192, 144),
         Size(80, 480, 360),
         gap=(0.5, 0.6),
     ),
-    Footage("dining", "dining", "clean", 37, Size(120, 160, 120, stride=3), Size(400, 600, 340)),
+    Footage("dining", "dining", "clean", 37, Size(144, 192, 144, stride=4), Size(400, 600, 340)),
     Footage("slow-stream", "handheld-5hz", "clean", 38, Size(40, 160, 120), Size(40, 160, 120)),
 )
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""

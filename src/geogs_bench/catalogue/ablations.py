@@ -132,7 +132,7 @@ _LOSSES = {
     "ssim": ("loss__ssim_weight",),
     "ncc": ("loss__ncc_weight",),
 }
-_ALL_LOSSES = (_PAPER, *_set(ablation__start="points"))
+_ALL_LOSSES = (*PAPER.options, *_set(ablation__start="points"))
 
 LOSSES = Benchmark(
     "ablation-losses",
