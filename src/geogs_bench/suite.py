@@ -132,7 +132,7 @@ def run_parts(
 
 def _chapter(benchmark: Benchmark, records: Sequence[Record]) -> Chapter:
     own = [replace(record, folder=f"{benchmark.name}/{record.folder}") for record in records]
-    return Chapter(benchmark, own, f"{benchmark.title}: ")
+    return Chapter(benchmark, own, f"{benchmark.name}: ")
 
 
 def _selected(benchmark: Benchmark, selection: Selection) -> Selection | None:

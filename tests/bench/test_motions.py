@@ -12,11 +12,19 @@ from geogs.application.run_settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.types import Trajectory
-from geogs_bench.data.motion_cells import FULL, SMALL, find_motions, render_cells
+from geogs_bench.data.motion_cells import (
+    FULL,
+    SMALL,
+    Cell,
+    find_motions,
+    relighted,
+    render_cells,
+)
+from geogs_bench.data.replica_scenes import find_relighted
 from geogs_bench.results.result_folder import ResultFolder
 from geogs_bench.runners.tracking_only import track_to_folder
 from geogs_bench.scoring.motion_scores import compare_motion, rotation_error, score_motion
-from geogs_synth.camera.flaws import camera_flaws
+from geogs_synth.camera.flaws import Flaws, camera_flaws
 from geogs_synth.sequence.replica_files import write_sequence
 
 
@@ -171,3 +179,23 @@ def test_the_camera_does_not_turn_with_a_truck_ahead(tmp_path: Path) -> None:
     bend = np.degrees(Rotation.from_matrix(true[0].T @ true[-1]).magnitude())
     assert bend > 3
     assert angles.max() < 0.3
+
+
+def test_a_pair_in_steady_and_in_changing_light_shares_its_path(tmp_path: Path) -> None:
+    steady = Cell("hall", "handheld", Flaws(), 6, 64, 48)
+    folder = render_cells((steady, relighted(steady)), tmp_path, (), lambda text: None)
+    assert [scene.name for scene in find_relighted(folder)] == ["hall", "hall-light"]
+    pair = [folder / name for name in ("hall", "hall-light")]
+    np.testing.assert_array_equal(*(np.loadtxt(path / "traj.txt") for path in pair))
+    depths = [cv2.imread(str(path / "results" / "depth000005.png"), -1) for path in pair]
+    np.testing.assert_array_equal(*depths)
+    lamps = [json.loads((path / "cam_params.json").read_text()).get("lamps") for path in pair]
+    assert lamps == [None, "switched"]
+
+    def middle(path: Path, frame: int) -> float:
+        return float(cv2.imread(str(path / "results" / f"frame{frame:06d}.jpg")).mean())
+
+    # Exposure wanders slowly, so what changes between the thirds at once are the lamps.
+    brightness = [[middle(path, k) for k in range(6)] for path in pair]
+    steps = np.abs(np.diff(np.log(brightness[1]))) - np.abs(np.diff(np.log(brightness[0])))
+    assert min(steps[1], steps[3]) > 3 * max(steps[0], steps[2], steps[4])

@@ -36,7 +36,7 @@ def _set(**values: str) -> tuple[Option, ...]:
     return tuple(Option(names[name], value) for name, value in values.items())
 
 
-_SNAPSHOTS = (5, 10, 20, 40, 60, 90)
+_SNAPSHOTS = (2, 5, 10, 20, 40, 60, 90)
 """Seconds at which the map's error is measured on the way."""
 
 INITIALISATION = Benchmark(

@@ -105,7 +105,7 @@ def _is_papers(row: Variant) -> bool:
 
 
 def _small_cell(cell: Cell) -> Cell:
-    name = cell.name.replace("synthetic", "small")
+    name = cell.name.replace("synthetic", "synthetic-small")
     return replace(cell, name=name, frames=48, width=160, height=120)
 
 

@@ -75,17 +75,19 @@ def _provenance(records: Sequence[Record]) -> list[str]:
 
 
 def _sections(output: Path, chapter: Chapter) -> list[Section]:
-    """Tables, curves, notes, what papers printed, pictures."""
-    benchmark, records = chapter.benchmark, chapter.records
+    """Tables, curves, notes, what papers printed, pictures; among several benchmarks the notes
+    come first, under the benchmark's title."""
+    benchmark, prefix = chapter.benchmark, chapter.prefix
     sections: list[Section] = [_section(table) for table in chapter_tables(chapter)]
     curves = output / "report" / f"{benchmark.name}-convergence.png"
-    if plot_curves(curves, records):
-        sections.append(PictureSection(f"{chapter.prefix}Error over time", curves))
+    if plot_curves(curves, chapter.records):
+        sections.append(PictureSection(f"{prefix}Error over time", curves))
     if benchmark.notes:
-        sections.append(TextSection(f"{chapter.prefix}Notes", "\n".join(benchmark.notes)))
+        notes = TextSection(benchmark.title if prefix else "Notes", "\n".join(benchmark.notes))
+        sections.insert(0 if prefix else len(sections), notes)
     sections += [_section(table) for table in published_tables(benchmark)]
-    for record in records:
-        name = f"{record.scene} {record.variant}".strip()
+    for record in chapter.records:
+        name = f"{prefix}{record.scene} {record.variant}".strip()
         report = output / record.folder / "report"
         sections += [
             PictureSection(f"{name}: {title}", report / file) for file, title in PICTURES.items()
