@@ -67,26 +67,43 @@ def suite_parts(
         raise InputError(f"{data} is not a folder; {suite.name} needs {suite.needs}.")
     wanted = wanted_tables(suite, selection)
     found = [_scenes_below(data, table.benchmark) for table, _ in wanted]
-    cells = {c.name: c for (t, _), scenes in zip(wanted, found, strict=True) if not scenes
-             for c in t.cells}  # fmt: skip
+    cells = {
+        cell.name: cell
+        for (table, _), scenes in zip(wanted, found, strict=True)
+        if not scenes
+        for cell in table.cells
+    }
     known = [*dict.fromkeys(s.name for scenes in found for s in scenes), *cells]
     if missing := [name for name in selection.scenes if name not in known]:
         raise InputError(f"there is no scene {missing[0]}, only {', '.join(known)}.")
-    names = selection.scenes or known
-    folder = render_cells([c for c in cells.values() if c.name in names], output / "data", (), say)
+    asked = [c for c in cells.values() if c.name in (selection.scenes or known)]
+    folder = render_cells(asked, output / "data", (), say)
     parts = []
     for (table, chosen), scenes in zip(wanted, found, strict=True):
         if scenes:
-            test = table.benchmark
-            papers = [scene for scene in scenes if scene.name in test.scenes]
-            is_papers = bool(papers or not test.published)
-            test, scenes = test if is_papers else _marked(test, _OTHER), papers or scenes
+            own = _chosen(scenes, selection.scenes, table.benchmark.scenes)
+            test = _for_scenes(table.benchmark, own)
         else:
-            test, scenes = _marked(table.benchmark, _STAND_IN), _stand_ins(table, folder)
-        own = [scene for scene in scenes if scene.name in names]
+            own = _chosen(_stand_ins(table, folder), selection.scenes)
+            test = _marked(table.benchmark, _STAND_IN)
         if own:
             parts.append(SuitePart(test, make_jobs(test, own, output / test.name, chosen)))
     return parts
+
+
+def _chosen(
+    scenes: Sequence[BenchmarkScene], names: Sequence[str], papers: Sequence[str] = ()
+) -> list[BenchmarkScene]:
+    """Those that are named, else the paper's, else all."""
+    if names:
+        return [scene for scene in scenes if scene.name in names]
+    return [scene for scene in scenes if scene.name in papers] or list(scenes)
+
+
+def _for_scenes(benchmark: Benchmark, scenes: Sequence[BenchmarkScene]) -> Benchmark:
+    """Marked where papers printed something, and of none of the scenes."""
+    is_papers = any(scene.name in benchmark.scenes for scene in scenes)
+    return benchmark if is_papers or not benchmark.published else _marked(benchmark, _OTHER)
 
 
 def wanted_tables(suite: Suite, selection: Selection) -> list[tuple[SuiteTable, Selection]]:

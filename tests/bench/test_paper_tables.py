@@ -139,6 +139,10 @@ def test_the_papers_scenes_are_found_in_the_folders_that_a_user_has(tmp_path, st
         "light-stand-in": ["synthetic-0", "synthetic-0-light"],
     }  # fmt: skip
     assert sorted(stand_ins) == ["synthetic-0", "synthetic-0-light"]
+    asked = parts_of(tmp_path / "mine", tmp_path / "asked", scenes=("room0",))
+    names = ["replica", "convergence-other", "ablation-init", "ablation-update", "ablation-pose-lr",
+             "ablation-losses-other"]  # fmt: skip
+    assert scenes_of(asked) == {name: ["room0"] for name in names}
     for part in parts:
         is_real = not part.benchmark.name.endswith("stand-in")
         assert bool(part.benchmark.published) == is_real
@@ -154,6 +158,11 @@ def test_other_scenes_are_run_and_marked_without_the_papers_figures(tmp_path, sm
     assert published_columns(other.benchmark) == []
     assert "ablation-init-other" in parts
     assert "scannet-stand-in" in parts
+    write_data(tmp_path / "mine")
+    beside = scenes_of(parts_of(tmp_path / "mine", tmp_path / "beside"))
+    assert "den" not in beside["replica"]
+    named = parts_of(tmp_path / "mine", tmp_path / "named", scenes=("den",), variants=("default",))
+    assert scenes_of(named) == {"replica-other": ["den"], "convergence-other": ["den"]}
 
 
 def test_scenes_and_variants_that_are_asked_for_leave_tables_out(tmp_path, stand_ins):
