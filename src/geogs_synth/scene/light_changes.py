@@ -9,8 +9,8 @@ from jaxtyping import Float64
 LampKind = Literal["steady", "switched"]
 """As they are all the time, or others in each third of the sequence."""
 
-_DIM, _BRIGHT = 0.15, 1.8
-"""Gains of a lamp that is turned down, and of one that is turned up in its place."""
+_OFF, _BRIGHT = 0.0, 2.0
+"""Gains of a lamp that is off, and of one that is turned up in its place."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class LightChanges:
 
 
 def switched_by_thirds(lights: int, seconds: float) -> LightChanges:
-    """All lights as they are at first; then every other one is dim, and the rest bright; then
+    """All lights as they are at first; then every other one is off, and the rest bright; then
     the other way round."""
     is_even = np.arange(lights) % 2 == 0
-    first = np.where(is_even, _DIM, _BRIGHT)
-    second = np.where(is_even, _BRIGHT, _DIM)
+    first = np.where(is_even, _OFF, _BRIGHT)
+    second = np.where(is_even, _BRIGHT, _OFF)
     return LightChanges(
         np.array([1.0, 2.0]) * seconds / 3, np.stack([np.ones(lights), first, second])
     )
