@@ -25,7 +25,7 @@ class Row:
     """Whether it finds nothing compiled."""
 
 
-_SMALL = Size(80, 192, 144, stride=2)
+_SMALL = Size(72, 160, 120, stride=2)
 _FULL = Size(150, 400, 300)
 
 FOOTAGE = (
@@ -39,11 +39,11 @@ FOOTAGE = (
         "handheld-5hz",
         "phone",
         36,
-        Size(40, 192, 144),
+        Size(40, 160, 120),
         Size(80, 480, 360),
         gap=(0.5, 0.6),
     ),
-    Footage("dining", "dining", "clean", 37, Size(144, 192, 144, stride=4), Size(400, 600, 340)),
+    Footage("dining", "dining", "clean", 37, Size(96, 160, 120, stride=2), Size(400, 600, 340)),
     Footage("slow-stream", "handheld-5hz", "clean", 38, Size(40, 160, 120), Size(40, 160, 120)),
 )
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
