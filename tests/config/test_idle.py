@@ -43,6 +43,13 @@ def test_what_does_nothing_says_so(words: str) -> None:
     assert CASES[words] in sentence
 
 
+def test_a_live_run_says_that_it_refines_no_poses() -> None:
+    paper = preset("paper")
+    (sentence,) = idle_settings(paper, is_live=True)
+    assert sentence.startswith("mapping.pose-iterations does nothing: a live run")
+    assert idle_settings(preset("default"), is_live=True) == []
+
+
 ON_THE_WAY = {
     "mapping.lag": ["2"],
     "mapping.window": ["5"],

@@ -67,7 +67,7 @@ def run(
     if settings.offline and (scale is not None or config.input.depth != "none"):
         raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
     defers = maps_at_the_end(settings, observer)
-    for sentence in () if settings.offline else idle_settings(config, defers):
+    for sentence in () if settings.offline else idle_settings(config, defers, _is_live(settings)):
         progress.write(f"note: {sentence}")
     if (operator := operator_found(config.tracking)) is not None:
         progress.write(f"note: {operator}")
@@ -122,10 +122,15 @@ def _completed(driver: Driver, settings: RunSettings, work: TrackedOrPlaced) -> 
         raise TrackingLost(f"{lost} {help}") from lost
 
 
+def _is_live(settings: RunSettings) -> bool:
+    """Whether a source does not wait for the run."""
+    return any(map(live_address, settings.source))
+
+
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
     """Whether the map is made once, after the video; by default where nobody looks on."""
     mapping = settings.config.mapping
-    if not mapping.may_follow or any(map(live_address, settings.source)):
+    if not mapping.may_follow or _is_live(settings):
         return False
     is_shown = observer is not None or settings.online_results or settings.map is not None
     return mapping.when == "after" or not is_shown
@@ -242,7 +247,7 @@ def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSet
             f"outside of that folder is opened only where you name it: give {', '.join(missing)} "
             f"beside --resume {output}."
         )
-    if any(map(live_address, settings.source)):
+    if _is_live(settings):
         raise InputError(
             "A live source comes but once; give the video that the run was begun with."
         )

@@ -23,14 +23,17 @@ ON_THE_WAY = (
 """Settings of the mapping that act on nothing but a map that is made while frames come."""
 
 
-def idle_settings(config: Config | ReconstructConfig, maps_at_end: bool = False) -> list[str]:
+def idle_settings(
+    config: Config | ReconstructConfig, maps_at_end: bool = False, is_live: bool = False
+) -> list[str]:
     """A sentence for every setting that was changed and does nothing, with what it would need.
 
-    ``maps_at_end`` says that a run makes its map of all keyframes at once, after the video.
+    ``maps_at_end`` says that a run makes its map of all keyframes at once, after the video,
+    ``is_live`` that its frames do not wait.
     """
     if isinstance(config, ReconstructConfig):
         return [*_mapping(config.mapping)]
-    of_map = _deferred(config) if maps_at_end else _on_the_way(config.mapping)
+    of_map = _deferred(config) if maps_at_end else _on_the_way(config.mapping, is_live)
     return [*_run(config), *of_map, *_mapping(config.mapping)]
 
 
@@ -47,7 +50,12 @@ def _deferred(config: Config) -> Iterator[str]:
         )
 
 
-def _on_the_way(mapping: MappingConfig) -> Iterator[str]:
+def _on_the_way(mapping: MappingConfig, is_live: bool) -> Iterator[str]:
+    if is_live and mapping.pose_iterations not in (0, MappingConfig.pose_iterations):
+        yield (
+            "mapping.pose-iterations does nothing: a live run leaves poses to the tracker, which "
+            "does not wait for the map."
+        )
     if mapping.final_iterations == 0 and not mapping.final_depth:
         yield (
             "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "
