@@ -10,7 +10,7 @@ from geogs.config import Seed
 from geogs.config.setting import Positional, Range, Settings
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
 from geogs_synth.motion.motion_kinds import MotionKind
-from geogs_synth.scene.light_changes import LampKind
+from geogs_synth.scene.lamp_kinds import LampKind
 
 
 @dataclass(frozen=True)

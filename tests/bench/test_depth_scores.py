@@ -208,7 +208,8 @@ def test_an_earlier_result_is_scored_by_the_command(tmp_path) -> None:
     sequence = write_sequence(tmp_path / "hall")
     result = write_result(tmp_path / "out", *TRUTH)
     done = bench(BenchOptions("edges", sequence, tmp_path / "scores", result=result), print)
-    (record,) = done.records
+    (chapter,) = done.chapters
+    (record,) = chapter.records
     assert record.place("thin").within_5 > 99
     assert record.cost.seconds == 4.0
     (saved,) = json.loads((tmp_path / "scores" / "results.json").read_text())

@@ -199,16 +199,16 @@ def test_records_survive_json_and_damage(tmp_path):
 
 
 def test_markdown_has_our_means_beside_published_ones_of_the_same_scenes():
-    some = [record("room0", acc=1.0), record("room1", acc=2.0)]
+    some = [record("room0", "paper", acc=1.0), record("room1", "paper", acc=2.0)]
     text = markdown(REPLICA, some)
     assert "Acc, after final BA and map update (cm) | Acc (paper)" in text
-    row = [line for line in text.splitlines() if line.startswith("| room1 ")][1]
+    row = [line for line in text.splitlines() if line.startswith("| room1, ")][1]
     assert "| 2.00 | 1.47 |" in row
     mean = [line for line in text.splitlines() if line.startswith("| mean ")]
     assert "| 1.50 | 1.55 |" in mean[1]  # (1.63 + 1.47) / 2: not the paper's mean of eight
     assert "not measured here (tab:replica_recon)" in text
     assert "geogs abc123" in text
-    every = [record(scene, ate=0.3) for scene in paper.REPLICA_SCENES]
+    every = [record(scene, "paper", ate=0.3) for scene in paper.REPLICA_SCENES]
     mean = [line for line in markdown(REPLICA, every).splitlines() if line.startswith("| mean ")]
     assert "| 0.300 | 0.28 |" in mean[0]
     assert "| 2.09 |" in mean[1]
@@ -256,15 +256,15 @@ def test_published_figures_stand_beside_the_variant_they_belong_to():
     assert beside(both, rows, "alignment (cm)", "ATE") == {"default": "–", "paper": "0.28"}
     detail = beside(both, rows, "Splat-SLAM): every scene", "Acc")
     assert (detail["office4, paper"], detail["office4, default"]) == ("2.89", "–")
-    rows = [record("scene0000_00", name, benchmark="scannet") for name in ("rgb", "rgb-d")]
+    rows = [record("scene0000_00", name, benchmark="scannet") for name in ("paper", "rgb-d")]
     of_paper = paper.SCANNET.value("scene0000_00", "ATE")
     table = beside(SCANNET, rows, "Sim(3) alignment (cm)", "ATE")
-    assert table == {"rgb": f"{of_paper:.2f}", "rgb-d": "–"}
+    assert table == {"paper": f"{of_paper:.2f}", "rgb-d": "–"}
     score = StageScore("final", None, (surface("points", unit="mm"),))
-    names = ("60s", "120s", "colour-2dgs")
+    names = ("default-120s", "paper-60s", "paper-120s", "colour-2dgs")
     rows = [replace(record("scan24", name), stages=(score,)) for name in names]
     assert beside(DTU, rows, "DTU's protocol", "CD") == {
-        "60s": "–", "120s": "0.53", "colour-2dgs": "–"
+        "default-120s": "–", "paper-60s": "–", "paper-120s": "0.53", "colour-2dgs": "–"
     }  # fmt: skip
     # A column without a figure is left out.
     others = [record("attic", "default"), record("attic", "paper")]

@@ -11,7 +11,7 @@ from geogs_bench.data.benchmark_scene import BenchmarkScene, Truth
 from geogs_bench.data.scene_folders import folders_like
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
 from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
-from geogs_synth.scene.light_changes import LampKind
+from geogs_synth.scene.lamp_kinds import LampKind
 
 if TYPE_CHECKING:
     from geogs_synth.raycast.raycaster import Raycaster

@@ -1,13 +1,9 @@
 """Lamps of a scene that are switched while a sequence is taken."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
-
-LampKind = Literal["steady", "switched"]
-"""As they are all the time, or others in each third of the sequence."""
 
 _OFF, _BRIGHT = 0.0, 2.0
 """Gains of a lamp that is off, and of one that is turned up in its place."""

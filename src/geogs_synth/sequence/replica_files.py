@@ -25,7 +25,8 @@ from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.motion_kinds import MotionKind
 from geogs_synth.motion.room_motions import Motion
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.scene.light_changes import LampKind, switched_by_thirds
+from geogs_synth.scene.lamp_kinds import LampKind
+from geogs_synth.scene.light_changes import switched_by_thirds
 from geogs_synth.sequence.location import Location, make_location
 from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
 from geogs_synth.sequence.shooting import Shooting, Shot
