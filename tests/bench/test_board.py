@@ -125,6 +125,8 @@ def test_what_is_worse_and_better_exceeds_the_noise():
     # t = 4.6 times the pooled deviation 0.1 times the root of 2/3.
     assert worse.noise == pytest.approx(4.6 * 0.1 * (2 / 3) ** 0.5)
     assert str(worse) == "worse: room, ATE cm: 1.000 -> 2.000 (noise 0.376)"
+    another = replace(steady, command="geogs run {video}")
+    assert compare(a_board(another), a_board(with_ate(2.0, 2.1, 1.9))) == []
     (better,) = compare(a_board(with_ate(2.0, 2.1, 1.9)), a_board(steady))
     assert not better.is_worse
 

@@ -75,7 +75,7 @@ def compare(before: BoardRecord, now: BoardRecord) -> list[Difference]:
     found = [
         difference
         for row in now.rows
-        if (earlier := before.row(row.name)) is not None
+        if (earlier := before.row(row.name)) is not None and earlier.command == row.command
         for difference in _differences(earlier, row, _has_same_clock(before, now, row))
     ]
     return sorted(found, key=lambda difference: not difference.is_worse)
