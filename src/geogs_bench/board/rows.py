@@ -76,7 +76,11 @@ _WAYS = (
     Row("own", "handheld-kinect", "run {folder} --tracking.operator own"),
     Row("offline", "handheld-kinect", "run {folder} --offline"),
     Row("posed", "handheld-kinect", "reconstruct {folder}"),
-    Row("posed-paper", "handheld-kinect", "reconstruct {folder} --preset paper"),
+    Row(
+        "posed-paper",
+        "handheld-kinect",
+        "reconstruct {folder} --preset paper --search.most-views 12",
+    ),
     Row("first-command", "handheld-kinect", "run {folder}", has_empty_cache=True),
 )
 _KEPT = (
