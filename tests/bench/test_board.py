@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from geogs.cli import main as cli
-from geogs.errors import InputError
+from geogs.errors import InputError, OutputError
 from geogs.io.sources.sniff import open_source
 from geogs_bench.board import board as board_module
+from geogs_bench.board import footage as footage_module
 from geogs_bench.board.board_record import (
     BoardRecord,
     Outcome,
@@ -19,7 +20,7 @@ from geogs_bench.board.board_record import (
     write_board,
 )
 from geogs_bench.board.board_table import markdown
-from geogs_bench.board.commands import run_geogs
+from geogs_bench.board.commands import Spent, run_geogs
 from geogs_bench.board.comparison import FIGURES, compare
 from geogs_bench.board.footage import Footage, FootagePlace, KeptFootage, Size, find, render
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
@@ -59,7 +60,7 @@ def test_the_rows_hold_what_users_do():
     assert any(row.has_empty_cache for row in rows(False))
 
 
-def test_a_pause_of_the_camera_takes_frames_with_their_times(tmp_path):
+def test_a_pause_of_the_camera_takes_frames_with_their_times(tmp_path, monkeypatch):
     footage = Footage("weak", "handheld-5hz", "clean", 3, TINY, TINY, gap=(0.4, 0.7))
     said: list[str] = []
     place = render(footage, tmp_path, False, said.append)
@@ -69,8 +70,10 @@ def test_a_pause_of_the_camera_takes_frames_with_their_times(tmp_path):
     assert said == ["rendering weak"]
     assert render(footage, tmp_path, False, said.append) == place
     assert len(said) == 1  # what is there is not made again
-    render(replace(footage, seed=4), tmp_path, False, said.append)
-    assert len(said) == 2  # what is another by now is
+    (place.folder / "footage.txt").write_text("another by now")
+    monkeypatch.setattr(footage_module, "run_geogs", lambda *_: (Spent(2, 0.0, 0.0, 0), "error: no"))
+    with pytest.raises(OutputError, match="weak cannot be rendered: error: no"):
+        render(footage, tmp_path, False, said.append)
 
 
 def test_a_data_set_that_is_not_there_is_none(tmp_path):
@@ -204,21 +207,21 @@ def test_a_row_end_to_end(tmp_path, monkeypatch, capsys):
               Row("bad", "den", "run {folder} --stop 1", runs_alone=True))  # fmt: skip
     monkeypatch.setattr(board_module, "FOOTAGE", (footage,))
     monkeypatch.setattr(board_module, "rows", lambda on_gpu: listed)
-    monkeypatch.setattr(board_module, "SEEDS", SEEDS[:2])
+    monkeypatch.setattr(board_module, "SEEDS", SEEDS[1:2])
     monkeypatch.setattr(board_module, "program_version", lambda: "abc")
     output = tmp_path / "my out"
     call = ["bench", "board", "-o", str(output), "--device", "cpu"]
     assert cli.main(call) == 2
     shown = capsys.readouterr()
-    assert "[4/4] bad, seed 1: failed: error: " in shown.err
+    assert "[2/2] bad, seed 1: failed: error: " in shown.err
     board = read_board(output / "board.json")
     good, bad = board.rows
-    assert len(bad.failures) == 2
+    assert len(bad.failures) == 1
     assert not good.failures
-    assert good.values("placed") == pytest.approx([100.0, 100.0])
+    assert good.values("placed") == pytest.approx([100.0])
     assert all(0.005 < value < 2 for value in good.values("ate"))
     assert all(30 < value < 100 for value in good.values("f_score"))
-    assert len(good.values("online_f_score")) == 2
+    assert len(good.values("online_f_score")) == 1
     assert good.values("f_score") != good.values("online_f_score")
     assert all(value > 1 for value in good.values("cost"))
     # Done at this commit: nothing runs again, and nothing is worse than itself.
