@@ -71,7 +71,8 @@ def test_a_pause_of_the_camera_takes_frames_with_their_times(tmp_path, monkeypat
     assert render(footage, tmp_path, False, said.append) == place
     assert len(said) == 1  # what is there is not made again
     (place.folder / "footage.txt").write_text("another by now")
-    monkeypatch.setattr(footage_module, "run_geogs", lambda *_: (Spent(2, 0.0, 0.0, 0), "error: no"))
+    failed = Spent(2, 0.0, 0.0, 0), "error: no"
+    monkeypatch.setattr(footage_module, "run_geogs", lambda *_: failed)
     with pytest.raises(OutputError, match="weak cannot be rendered: error: no"):
         render(footage, tmp_path, False, said.append)
 
