@@ -8,14 +8,12 @@ from geogs.application.result_settings import EvalSettings
 from geogs.errors import InputError
 from geogs.evaluation.pages.evaluation_page import Evaluation
 from geogs.evaluation.surfaces.reconstruction_errors import ReconstructionScores
-from geogs.evaluation.trajectory_errors import extent_of
 from geogs_bench.board.board_record import Outcome
 from geogs_bench.results.result_folder import ResultFolder
+from geogs_bench.scoring.motion_scores import is_near
 
 _SAMPLES = 50_000
 """On each surface; the deviation of a ratio by them is below 0.2 points."""
-_MOST_OFF = 0.05
-"""ATE of a reliable run, of the extent of the true path."""
 
 
 def with_scores(outcome: Outcome, folder: Path, truth: Path, frames: int) -> Outcome:
@@ -28,7 +26,6 @@ def with_scores(outcome: Outcome, folder: Path, truth: Path, frames: int) -> Out
     found = _evaluated(folder, truth)
     errors = found.trajectory
     is_called_reliable = (summary.get("verdict") or {}).get("is_reliable")
-    extent_cm = 100 * extent_of(errors.truth)
     outcome = replace(
         outcome,
         placed=100 * errors.pairs / frames,
@@ -37,7 +34,7 @@ def with_scores(outcome: Outcome, folder: Path, truth: Path, frames: int) -> Out
         triangles=summary.get("mesh_faces"),
     )
     if is_called_reliable is not None:
-        is_off = errors.ate_rmse_cm > _MOST_OFF * extent_cm
+        is_off = not is_near(errors.ate_rmse_cm, errors.truth)
         outcome = replace(
             outcome,
             reliable=float(is_called_reliable),

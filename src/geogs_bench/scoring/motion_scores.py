@@ -73,8 +73,13 @@ def compare_motion(reference: Trajectory, tracked: Trajectory, oriented: Traject
         return score
     turned = len(oriented.timestamps) - len(i)
     followed = percentage + 100 * turned / len(reference.timestamps)
-    good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent_of(reference.T_wc[i])
+    good = followed >= _LEAST_FOLLOWED and is_near(ate, reference.T_wc[i])
     return replace(score, ate=ate, relative=ate / path, is_reliable=good)
+
+
+def is_near(ate_cm: float, T_wc: Float[np.ndarray, "n 4 4"]) -> bool:
+    """Whether an ATE is that of a reliable run; ``T_wc`` are the true poses, in metres."""
+    return ate_cm <= 100 * _MOST_OFF * extent_of(T_wc)
 
 
 def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
