@@ -29,7 +29,7 @@ _SMALL = Size(72, 160, 120, stride=2)
 _FULL = Size(150, 400, 300)
 
 FOOTAGE = (
-    Footage("handheld-kinect", "handheld", "kinect", 31, _SMALL, _FULL),
+    Footage("handheld-kinect", "handheld", "kinect", 31, _SMALL, Size(100, 400, 300)),
     Footage("turning-60", "turning-60", "clean", 32, _SMALL, _FULL),
     Footage("walking-phone", "walking", "phone", 33, _SMALL, _FULL),
     Footage("street", "driving", "clean", 34, Size(32, 256, 78), Size(120, 800, 242)),
@@ -43,17 +43,17 @@ FOOTAGE = (
         Size(80, 480, 360),
         gap=(0.5, 0.6),
     ),
-    Footage("dining", "dining", "clean", 37, Size(96, 160, 120, stride=2), Size(400, 600, 340)),
-    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(40, 160, 120), Size(40, 160, 120)),
+    Footage("dining", "dining", "clean", 37, Size(72, 160, 120, stride=2), Size(200, 480, 272)),
+    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(36, 160, 120), Size(40, 400, 300)),
 )
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
 
 KEPT = (
-    KeptFootage("staircase", "rooms/staircase", "--stop 40 --long-edge 160", "--stop 200"),
+    KeptFootage("staircase", "rooms/staircase", "--stop 40 --long-edge 160", "--stop 150"),
     KeptFootage(
-        "living-room-light", "rooms/living-room-2-light", "--stop 40 --long-edge 160", "--stop 200"
+        "living-room-light", "rooms/living-room-2-light", "--stop 40 --long-edge 160", "--stop 150"
     ),
-    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160", "--stop 200"),
+    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160", "--stop 150"),
     KeptFootage("horse", "objects/horse", "--long-edge 160", "--long-edge 800"),
 )
 """Sequences that the user may have."""
@@ -75,10 +75,10 @@ _WAYS = (
     Row("accurate", "handheld-kinect", "run {folder} --preset accurate"),
     Row("own", "handheld-kinect", "run {folder} --tracking.operator own"),
     Row("offline", "handheld-kinect", "run {folder} --offline"),
-    Row("posed", "handheld-kinect", "reconstruct {folder}"),
+    Row("posed", "slow-stream", "reconstruct {folder}"),
     Row(
         "posed-paper",
-        "handheld-kinect",
+        "slow-stream",
         "reconstruct {folder} --preset paper --search.most-views 12",
     ),
     Row("first-command", "handheld-kinect", "run {folder}", has_empty_cache=True),
@@ -89,10 +89,10 @@ _KEPT = (
     Row("kitchen", "kitchen", "run {folder}"),
     Row("horse", "horse", "reconstruct {folder}"),
 )
-_BUDGET = Row("posed-20s", "handheld-kinect", "reconstruct {folder} --budget 20s", runs_alone=True)
+_BUDGET = Row("posed-10s", "slow-stream", "reconstruct {folder} --budget 10s", runs_alone=True)
 _LIVE = "run play:{video} --intrinsics {camera}"
 _LIVE_ON_CPU = Row("live-5hz", "slow-stream", _LIVE, runs_alone=True)
-_LIVE_ON_GPU = Row("live-30hz", "handheld-kinect", _LIVE, runs_alone=True)
+_LIVE_ON_GPU = Row("live-30hz", "walking-phone", _LIVE, runs_alone=True)
 
 
 def rows(on_gpu: bool) -> tuple[Row, ...]:
