@@ -3,7 +3,6 @@
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +21,7 @@ from geogs_bench.board.board_record import (
 from geogs_bench.board.board_table import markdown
 from geogs_bench.board.commands import Spent, run_geogs
 from geogs_bench.board.comparison import FIGURES, compare
-from geogs_bench.board.footage import Footage, FootagePlace, KeptFootage, Size, find, render
+from geogs_bench.board.footage import Footage, KeptFootage, Size, find, frames_used, render
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
 
 TINY = Size(10, 96, 72)
@@ -87,7 +86,7 @@ def test_a_data_set_that_is_not_there_is_none(tmp_path):
     (folder / "groundtruth.txt").write_text(rows)
     place = find(footage, tmp_path, False)
     assert place is not None
-    assert (place.frames, place.options) == (2, "--stop 2 --long-edge 64")
+    assert (place.frames, place.options) == (4, "--stop 2 --long-edge 64")
 
 
 def test_what_a_command_took_is_that_of_its_process(tmp_path):
@@ -114,10 +113,12 @@ def test_an_empty_cache_is_a_folder_of_its_own(tmp_path):
     assert names == ["geogs_cache", "numba_cache_dir"]
 
 
-@pytest.mark.parametrize(("stride", "start", "used"), [(1, 0, 40), (3, 0, 14), (3, 2, 13)])
-def test_frames_that_are_used(stride, start, used):
-    options = f"--stride {stride}" if stride > 1 else ""
-    assert FootagePlace(Path(), 40, options).used(start) == used
+@pytest.mark.parametrize(
+    ("options", "used"),
+    [("", 40), ("--stride 3", 14), ("--stride 3 --start 2", 13), ("--start 1 --stop 9", 8)],
+)
+def test_frames_that_are_used(options, used):
+    assert frames_used(["run", "folder", *options.split(), "--seed", "0"], 40) == used
 
 
 def test_what_is_worse_and_better_exceeds_the_noise():

@@ -25,7 +25,7 @@ from geogs_bench.board.board_record import (
 from geogs_bench.board.board_table import markdown
 from geogs_bench.board.commands import run_geogs
 from geogs_bench.board.comparison import Difference, compare
-from geogs_bench.board.footage import FootagePlace, find, render
+from geogs_bench.board.footage import FootagePlace, find, frames_used, render
 from geogs_bench.board.reference import reference_seconds
 from geogs_bench.board.rows import FOOTAGE, KEPT, SEEDS, Row, rows
 from geogs_bench.board.scores import with_scores
@@ -168,7 +168,9 @@ class Board:
             return replace(outcome, error=last_line or f"exit code {spent.code}")
         with self._lock:  # an evaluation uses all cores
             try:
-                return with_scores(outcome, result, place.folder, place.used(start))
+                return with_scores(
+                    outcome, result, place.folder, frames_used(command, place.frames)
+                )
             except GeogsError as error:
                 return replace(outcome, error=str(error))
 

@@ -1,7 +1,8 @@
 """What the commands of the board see: synthetic sequences of fixed seeds, and data sets."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 from geogs.errors import OutputError
@@ -61,12 +62,6 @@ class FootagePlace:
     options: str = ""
     """What commands are given on it."""
 
-    def used(self, start: int) -> int:
-        """Frames that a command sees which begins with that one."""
-        words = self.options.split()
-        stride = int(words[words.index("--stride") + 1]) if "--stride" in words else 1
-        return len(range(start, self.frames, stride))
-
     @property
     def words(self) -> dict[str, str]:
         """What stands for the names in a command's template."""
@@ -115,11 +110,14 @@ def find(footage: KeptFootage, root: Path | None, on_gpu: bool) -> FootagePlace 
     if folder is None or not folder.is_dir():
         return None
     options = footage.on_gpu if on_gpu else footage.on_cpu
-    frames = len(read_true_scene(folder).trajectory.timestamps)
-    words = options.split()
-    if "--stop" in words:
-        frames = min(frames, int(words[words.index("--stop") + 1]))
-    return FootagePlace(folder, frames, options)
+    return FootagePlace(folder, len(read_true_scene(folder).trajectory.timestamps), options)
+
+
+def frames_used(command: Sequence[str], frames: int) -> int:
+    """Frames of a sequence of so many that a command sees, by its options."""
+    said = dict(pairwise(command))
+    start, stride = int(said.get("--start", 0)), int(said.get("--stride", 1))
+    return len(range(start, min(frames, int(said.get("--stop", frames))), stride))
 
 
 def _is_missing(moment: float, footage: Footage) -> bool:

@@ -40,7 +40,7 @@ FOOTAGE = (
         "phone",
         36,
         Size(40, 160, 120),
-        Size(80, 480, 360),
+        Size(80, 400, 300),
         gap=(0.5, 0.6),
     ),
     Footage("dining", "dining", "clean", 37, Size(72, 160, 120, stride=2), Size(200, 480, 272)),
@@ -53,8 +53,8 @@ KEPT = (
     KeptFootage(
         "living-room-light", "rooms/living-room-2-light", "--stop 40 --long-edge 160", "--stop 150"
     ),
-    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160", "--stop 150"),
-    KeptFootage("horse", "objects/horse", "--long-edge 160", "--long-edge 800"),
+    KeptFootage("kitchen", "7scenes-redkitchen/seq-01", "--stop 60 --long-edge 160", "--stop 120"),
+    KeptFootage("horse", "objects/horse", "--long-edge 160", "--long-edge 640"),
 )
 """Sequences that the user may have."""
 
@@ -74,11 +74,11 @@ _WAYS = (
     Row("fast", "handheld-kinect", "run {folder} --preset fast"),
     Row("accurate", "handheld-kinect", "run {folder} --preset accurate"),
     Row("own", "handheld-kinect", "run {folder} --tracking.operator own"),
-    Row("offline", "handheld-kinect", "run {folder} --offline"),
+    Row("offline", "handheld-kinect", "run {folder} --offline --stop 60"),
     Row("posed", "slow-stream", "reconstruct {folder}"),
     Row(
         "posed-paper",
-        "slow-stream",
+        "handheld-kinect",
         "reconstruct {folder} --preset paper --search.most-views 12",
     ),
     Row("first-command", "handheld-kinect", "run {folder}", has_empty_cache=True),
@@ -92,7 +92,7 @@ _KEPT = (
 _BUDGET = Row("posed-10s", "slow-stream", "reconstruct {folder} --budget 10s", runs_alone=True)
 _LIVE = "run play:{video} --intrinsics {camera}"
 _LIVE_ON_CPU = Row("live-5hz", "slow-stream", _LIVE, runs_alone=True)
-_LIVE_ON_GPU = Row("live-30hz", "walking-phone", _LIVE, runs_alone=True)
+_LIVE_ON_GPU = Row("live-30hz", "turning-60", _LIVE, runs_alone=True)
 
 
 def rows(on_gpu: bool) -> tuple[Row, ...]:
