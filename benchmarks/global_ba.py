@@ -28,8 +28,9 @@ import torch
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import FLOOR
 from geogs.geometry.lie import se3_inverse
-from geogs.loop import global_bundle as settings
-from geogs.loop.global_bundle import global_bundle, global_pairs
+from geogs.loop import keyframe_matches as settings
+from geogs.loop.global_bundle import global_bundle
+from geogs.loop.keyframe_matches import global_pairs
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.world.segments import TrackState
 from geogs_synth.sequence.location import centred_camera

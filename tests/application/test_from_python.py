@@ -20,6 +20,7 @@ from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
 from geogs.config import InputConfig
 from geogs.geometry.distortion import RESAMPLING, lens_maps
 from geogs.io.pose_files import read_tum_trajectory
+from geogs.loop.camera.found import FoundLenses
 from geogs.pose_estimate import PoseEstimate
 from geogs.types import FoundLens
 from posed_scene import vertices
@@ -200,11 +201,11 @@ def test_the_package_loads_nothing_before_it_is_used():
 @pytest.mark.usefixtures("no_report")
 def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, monkeypatch):
     found = FoundLens(0.1, -0.05, 0.002, 0.003)
-    patch = "geogs.loop.global_bundle.correct_lens"
+    patch = "geogs.loop.camera.adjustment.correct_lens"
     folder = tmp_path / "out"
     argv = [str(small_room), *RUN, "--device", "cpu"]
     with monkeypatch.context() as patched:
-        patched.setattr(patch, lambda *_args, before=None, **_more: None if before else found)
+        patched.setattr(patch, lambda *_, before=None, **__: FoundLenses(None if before else found))
         assert cli.main(["run", *argv, "-o", str(folder)]) == 0
     (said,) = re.findall(r"Lens, by all matches, .*", capfd.readouterr().err)
     assert "(none): k1 0.1000 +- 0.0020, k2 -0.0500 +- 0.0030" in said

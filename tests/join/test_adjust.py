@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from geogs.config import Config
-from geogs.loop import global_bundle
-from geogs.loop.global_bundle import GLOBAL_OPTIONS
+from geogs.loop import keyframe_matches
+from geogs.loop.keyframe_matches import GLOBAL_OPTIONS
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
@@ -108,7 +108,7 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path, monkeypatc
 
 
 def test_what_has_settled_is_not_matched_again(placed, tmp_path, monkeypatch):
-    monkeypatch.setattr(adjust, "ROUNDS", global_bundle.ROUNDS)
+    monkeypatch.setattr(adjust, "ROUNDS", keyframe_matches.ROUNDS)
     parts, files, placements, gauge, _ = placed
     matched = []
 

@@ -10,9 +10,12 @@ from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes
 from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.loop import frame_lenses, lens_correction
-from geogs.loop.frame_lenses import VaryingLens, correct_frame_lenses
-from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
+from geogs.loop.camera import frame_lenses
+from geogs.loop.camera import lens as lens_correction
+from geogs.loop.camera.found import FoundLenses
+from geogs.loop.camera.frame_lenses import correct_frame_lenses
+from geogs.loop.global_bundle import global_bundle
+from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.scene_mask import SceneMask
 from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
 from geogs.tracking.frames.frame_recorder import sparse_cells
@@ -115,7 +118,7 @@ def tracker_of(sizes: Tensor) -> tuple[Tracker, Tensor]:
 
 @pytest.fixture(autouse=True)
 def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 4)
+    monkeypatch.setattr("geogs.loop.keyframe_matches.PAIRS", 4)
 
 
 @pytest.mark.system
@@ -156,13 +159,11 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
 def test_what_frames_have_of_their_own_is_taken_off_beside_the_lens_of_all(monkeypatch):
     """The lens of all takes the place of what frames were corrected by."""
     order = []
-    shift_lens, shift = lens_correction.shift_lens, frame_lenses.VaryingLens.shift
+    shift_lens, shift = lens_correction.shift_lens, FoundLenses.shift
     monkeypatch.setattr(
         lens_correction, "shift_lens", lambda *a: (order.append("all"), shift_lens(*a))
     )
-    monkeypatch.setattr(
-        frame_lenses.VaryingLens, "shift", lambda *a: (order.append("own"), shift(*a))
-    )
+    monkeypatch.setattr(FoundLenses, "shift", lambda *a: (order.append("own"), shift(*a)))
     tracker, _ = tracker_of(sizes_of(0.02, 0.0))
     tracker.keyframes.table.focal_deviation = 0.01
     global_bundle(tracker, ends=True)
@@ -186,11 +187,12 @@ def test_what_does_not_settle_leaves_everything_as_it_was(monkeypatch):
     graph = tracker.map.graph
     pairs = [(a, b) for a in ids for b in range(a + 1, min(a + 4, COUNT))]
     graph.measure(pairs, packed=True)
-    graph.adjust(list(graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    matches = KeyframeMatches(tracker, ids[1:], ids)
+    matches.adjust()
     before = tracker.keyframes.poses(ids), tracker.keyframes.inverse_depths(ids)
     edges = dict(graph.edges)
     monkeypatch.setattr(frame_lenses, "ROUNDS", 1)
-    assert correct_frame_lenses(tracker, ids[1:], ids, GLOBAL_OPTIONS) is None
+    assert not correct_frame_lenses(matches)
     after = tracker.keyframes.poses(ids), tracker.keyframes.inverse_depths(ids)
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
     assert graph.edges.keys() == edges.keys()
@@ -202,23 +204,23 @@ def test_what_is_ambiguous_is_left_to_the_verdict_where_rows_may_be_why(monkeypa
     tracker, _ = tracker_of(sizes_of(0.0, 0.012))
     ids, graph = list(range(COUNT)), tracker.map.graph
     graph.measure([(a, b) for a in ids for b in range(a + 1, min(a + 4, COUNT))], packed=True)
-    graph.adjust(list(graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    matches = KeyframeMatches(tracker, ids[1:], ids)
+    matches.adjust()
     monkeypatch.setattr(frame_lenses, "AMBIGUOUS", -1.0)
     if has_rows:
         rows = SeenRows(torch.zeros(14, 18, 2).half(), torch.zeros(14, 18).half())
         tracker.map.recorder.log.rows = dict.fromkeys(ids, rows)
-    found = correct_frame_lenses(tracker, ids[1:], ids, GLOBAL_OPTIONS)
-    assert (found is not None) == has_rows
+    assert bool(correct_frame_lenses(matches)) == has_rows
 
 
 def test_where_matches_tell_nothing_of_straight_images_nothing_is_found(monkeypatch):
     tracker, _ = tracker_of(torch.zeros(COUNT, SHAPES))
     ids = list(range(COUNT))
     tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
-    before = VaryingLens(FoundLens(0.0, 0.0, 0.0, 0.0), {}, VaryingPrior((0.0, 0.01, 0.01)))
+    before = FoundLenses(FoundLens(0.0, 0.0, 0.0, 0.0), {}, VaryingPrior((0.0, 0.01, 0.01)))
     monkeypatch.setattr(frame_lenses, "said_of_frame_lenses", lambda *a: [])
-    found = correct_frame_lenses(tracker, ids[1:], ids, GLOBAL_OPTIONS, before)
-    assert found is not None
+    found = correct_frame_lenses(KeyframeMatches(tracker, ids[1:], ids), before)
+    assert found
     assert all(max(map(abs, own.sizes)) < 1e-6 for own in found.own.values())
 
 

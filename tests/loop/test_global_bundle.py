@@ -5,7 +5,8 @@ from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
-from geogs.loop import global_bundle as adjustment
+from geogs.loop import keyframe_matches
+from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import Tracker
 from planted_walk import drift, planted_tracker
 
@@ -23,11 +24,11 @@ def error(tracker: Tracker, truth: Tensor) -> float:
 
 def test_slow_drift_of_scale_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     """3 mm are left of 39, where a damping of 1e-4 of the diagonal leaves 19."""
-    monkeypatch.setattr(adjustment, "PAIRS", 3)  # neighbours alone, as on a street
+    monkeypatch.setattr(keyframe_matches, "PAIRS", 3)  # neighbours alone, as on a street
     tracker, truth = planted_tracker(2 * WAY, sigma=0.03)
     drift(tracker, 0.2)
     assert error(tracker, truth) > 0.03
     for id in range(WAY, 2 * WAY):
         tracker.keyframes.remove(id)
-    adjustment.global_bundle(tracker)
+    global_bundle(tracker)
     assert error(tracker, truth) < 0.006

@@ -9,9 +9,10 @@ from geogs.bundle.projection import project
 from geogs.bundle.uncertainty.lens_error import lens_shapes
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.loop import lens_correction
-from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
-from geogs.loop.straightening import BentImages
+from geogs.loop.camera import lens as lens_correction
+from geogs.loop.camera.straightening import BentImages
+from geogs.loop.global_bundle import global_bundle
+from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.tracking.tracker import Tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
@@ -106,7 +107,7 @@ def tracker_of(
 
 @pytest.fixture(autouse=True)
 def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("geogs.loop.global_bundle.PAIRS", 3)
+    monkeypatch.setattr("geogs.loop.keyframe_matches.PAIRS", 3)
 
 
 @pytest.mark.system
@@ -129,8 +130,9 @@ def test_the_bend_is_told_as_it_is():
     tracker.map.graph.measure(
         [(a, b) for a in ids for b in range(a + 1, min(a + 4, COUNT))], packed=True
     )
-    tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
-    bend = lens_correction.correct_lens(tracker, ids[1:], ids, GLOBAL_OPTIONS)
+    matches = KeyframeMatches(tracker, ids[1:], ids)
+    matches.adjust()
+    bend = lens_correction.correct_lens(matches).lens
     assert bend is not None
     assert (bend.k1, bend.k2) == pytest.approx(BEND, rel=0.1)
 
@@ -143,8 +145,9 @@ def test_deviations_are_the_standard_errors_that_those_before_the_run_are(monkey
         tracker, _ = tracker_of(BEND)
         ids = list(range(COUNT))
         tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
-        tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
-        said.append(lens_correction.correct_lens(tracker, ids[1:], ids, GLOBAL_OPTIONS))
+        matches = KeyframeMatches(tracker, ids[1:], ids)
+        matches.adjust()
+        said.append(lens_correction.correct_lens(matches).lens)
     one, three = said
     assert (three.k1, three.k2) == (one.k1, one.k2)
     assert three.deviation_k1 == pytest.approx(3 * one.deviation_k1)
@@ -280,7 +283,7 @@ def test_a_guess_that_is_far_off_is_found_by_all_matches():
 def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeypatch, is_found):
     tracker, _ = tracker_of((0.02, -0.03), -0.03)
     if not is_found:
-        monkeypatch.setattr("geogs.loop.lens_correction.said_of_lens", lambda *_: None)
+        monkeypatch.setattr("geogs.loop.camera.lens.said_of_lens", lambda *_: None)
     matched: list[tuple[bool, bool]] = []
     measure = tracker.map.operator.measure
 
@@ -314,8 +317,9 @@ def test_a_lens_that_is_known_is_left_alone():
     tracker, _ = tracker_of((0.0, 0.0))
     ids = list(range(COUNT))
     tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
-    tracker.map.graph.adjust(list(tracker.map.graph.edges), ids[1:], ids, GLOBAL_OPTIONS)
+    matches = KeyframeMatches(tracker, ids[1:], ids)
+    matches.adjust()
     before = {e: v.position.clone() for e, v in tracker.map.graph.edges.items()}
-    assert lens_correction.correct_lens(tracker, ids[1:], ids, GLOBAL_OPTIONS) is None
+    assert not lens_correction.correct_lens(matches)
     for pair, edge in tracker.map.graph.edges.items():
         assert torch.equal(edge.position, before[pair])

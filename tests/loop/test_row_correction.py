@@ -13,14 +13,15 @@ from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.geometry.umeyama import umeyama
-from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
-from geogs.loop.row_correction import (
+from geogs.loop.camera.rows import (
     FIRST_STEP,
     _readout_gradient,
     _Search,
     correct_rows,
     let_lenses_move,
 )
+from geogs.loop.global_bundle import global_bundle
+from geogs.loop.keyframe_matches import GLOBAL_OPTIONS, KeyframeMatches
 from geogs.tracking.frame_uncertainty import frame_uncertainty
 from geogs.tracking.frames.pose_filling import row_errors, rows_in_doubt
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
@@ -108,7 +109,7 @@ def as_read(factor: float = 1.0, doubt: float = 0.0) -> SeenRows:
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     options = replace(GLOBAL_OPTIONS, iterations=5)
     for name, value in (("ROUNDS", 1), ("PAIRS", 4), ("GLOBAL_OPTIONS", options)):
-        monkeypatch.setattr(f"geogs.loop.global_bundle.{name}", value)
+        monkeypatch.setattr(f"geogs.loop.keyframe_matches.{name}", value)
 
 
 def tracker_of_rows(rows: SeenRows) -> Tracker:
@@ -136,11 +137,11 @@ def error(T_cw: Tensor) -> float:
 def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch):
     tracker, bent = tracker_of_rows(as_read()), []
 
-    def settle(tracker, *others, **more):
-        bent.append(error(tracker.keyframes.poses(tracker.keyframes.ids)))
-        return correct_rows(tracker, *others, **more)
+    def settle(matches, **more):
+        bent.append(error(matches.keyframes.poses(matches.keyframes.ids)))
+        return correct_rows(matches, **more)
 
-    monkeypatch.setattr("geogs.loop.global_bundle.correct_rows", settle)
+    monkeypatch.setattr("geogs.loop.camera.adjustment.correct_rows", settle)
     global_bundle(tracker)
     assert bent[0] > 0.05
     assert error(tracker.keyframes.poses(tracker.keyframes.ids)) < 0.4 * bent[0]
@@ -164,7 +165,7 @@ def test_rows_tell_whether_a_lens_moved_while_they_were_read(monkeypatch, moves)
     moving = still.with_lenses(own)
     part = part_seen(still, moving, tracker.keyframes, graph.edges, log)
     assert part == pytest.approx(float(moves), abs=0.3)
-    let_lenses_move(tracker, own)
+    let_lenses_move(KeyframeMatches(tracker, [], []), own)
     assert log.lenses == (own if moves else {})
     errors = row_errors(log, tracker.keyframes)
     for pairs, (shift, _) in edge_shifts(errors, tracker.keyframes, graph.packed):
@@ -233,8 +234,9 @@ def test_the_gradient_falls_to_zero_at_the_true_readout():
     graph.measure(pairs, packed=True)
     errors = row_errors(tracker.segment.frames, tracker.keyframes)
     assert errors.doubt == 10.0
+    matches = KeyframeMatches(tracker, [], [], options=BundleOptions())
     at = [
-        _readout_gradient(graph, graph.edges, errors, factor, BundleOptions())
+        _readout_gradient(matches, graph.edges, errors.with_readout(factor), factor)
         for factor in (0.8, 1 / 1.15, 1.0)
     ]
     assert at[0] < 0 < at[2]
@@ -268,7 +270,7 @@ def test_a_readout_that_was_told_is_kept_and_one_that_is_not_to_be_found(
 
     monkeypatch.setattr(RowErrors, "with_readout", noted)
     tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
-    correct_rows(tracker, [1, 2], [0, 1, 2], BundleOptions(), finds_readout)
+    correct_rows(KeyframeMatches(tracker, [1, 2], [0, 1, 2]), finds_readout)
     assert (factors == {1.0}) == kept
 
 
@@ -291,7 +293,7 @@ def test_nothing_happens_to_a_global_shutter():
     tracker.segment.frames.rows.clear()
     tracker.map.graph.measure([(0, 1)], packed=True)
     before = tracker.map.graph.edges[0, 1].position.clone()
-    correct_rows(tracker, [1], [0, 1], BundleOptions())
+    correct_rows(KeyframeMatches(tracker, [1], [0, 1]))
     assert torch.equal(tracker.map.graph.edges[0, 1].position, before)
     assert torch.equal(tracker.keyframes[1].T_cw, pose(np.arange(COUNT))[1])
 
@@ -311,11 +313,11 @@ def test_only_the_last_adjustment_is_a_long_one(monkeypatch, doubt, best, steps)
 
     monkeypatch.setattr(FrameGraph, "adjust", noted)
     monkeypatch.setattr(
-        "geogs.loop.row_correction._readout_gradient",
-        lambda graph, measured, errors, factor, options: 40 * (factor - best) ** 3,
+        "geogs.loop.camera.rows._readout_gradient",
+        lambda matches, measured, errors, factor: 40 * (factor - best) ** 3,
     )
     tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
-    correct_rows(tracker, [1, 2], [0, 1, 2], GLOBAL_OPTIONS)
+    correct_rows(KeyframeMatches(tracker, [1, 2], [0, 1, 2]))
     assert taken == steps
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.loop.straightening import (
+from geogs.loop.camera.straightening import (
     BentImages,
     straight_rows,
     straighten_cells,

@@ -6,7 +6,7 @@ import torch
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.loop.straightening import BentImages
+from geogs.loop.camera.straightening import BentImages
 from geogs.mapping.view_arrays import MapCameras
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid

@@ -24,7 +24,7 @@ from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.least_squares import Step, minimise
 from geogs.geometry.lie import move
-from geogs.loop.global_bundle import CONVERGED, GLOBAL_OPTIONS, ROUNDS
+from geogs.loop.keyframe_matches import CONVERGED, GLOBAL_OPTIONS, ROUNDS
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph

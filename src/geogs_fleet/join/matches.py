@@ -13,7 +13,7 @@ from geogs.application.results.saved_result import SavedResult
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.loop.global_bundle import (
+from geogs.loop.keyframe_matches import (
     MATCHED_TOGETHER,
     MAX_DISTANCE,
     PAIRS,

@@ -9,7 +9,8 @@ import torch
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
-from geogs.loop.global_bundle import GLOBAL_OPTIONS, global_bundle
+from geogs.loop.global_bundle import global_bundle
+from geogs.loop.keyframe_matches import GLOBAL_OPTIONS
 from geogs.tracking.graph import frame_graph
 from geogs.world.edges import PackedEdge, edge_matches, position_step
 from planted_walk import SMALL, drift, planted_tracker
@@ -67,7 +68,7 @@ def test_a_walk_of_a_thousand_keyframes_is_adjusted_in_little_memory(monkeypatch
     tiny = Camera(fx=45.0, fy=45.0, cx=23.5, cy=19.5, width=48, height=40)
     options = replace(GLOBAL_OPTIONS, iterations=1)
     for name, value in (("ROUNDS", 1), ("GLOBAL_OPTIONS", options), ("PAIRS", 4)):
-        monkeypatch.setattr(f"geogs.loop.global_bundle.{name}", value)
+        monkeypatch.setattr(f"geogs.loop.keyframe_matches.{name}", value)
     tracker, truth = planted_tracker(1000, tiny, 0.02)
     drift(tracker, scale=0.004)
     before, held = error_cm(tracker, truth), peak_mib()

@@ -305,25 +305,35 @@ class RowErrors:
         )
 
 
+def row_shifts(
+    errors: RowErrors,
+    keyframes: KeyframeSet,
+    part: Sequence[Pair],
+    measured: Mapping[Pair, Edge],
+    frame_of: Callable[[int], int] | None = None,
+) -> RowShifts:
+    """Pixels by which the matches of some edges are to be corrected.
+
+    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame, if not its own.
+    """
+    frame_of = frame_of or (lambda id: keyframes[id].frame_index)
+    pixels, _ = edge_matches(keyframes.grid, [measured[pair] for pair in part])
+    return errors.of_matches(
+        [frame_of(i) for i, _ in part], [frame_of(j) for _, j in part],
+        keyframes.relative_poses(part), keyframes.grid.rays,
+        keyframes.inverse_depths([i for i, _ in part]), pixels,
+    )  # fmt: skip
+
+
 def edge_shifts(
     errors: RowErrors,
     keyframes: KeyframeSet,
     measured: Mapping[Pair, Edge],
     frame_of: Callable[[int], int] | None = None,
 ) -> Iterator[tuple[list[Pair], RowShifts]]:
-    """Pixels by which the matches of edges are to be corrected, some edges at a time.
-
-    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame, if not its own.
-    """
-    frame_of = frame_of or (lambda id: keyframes[id].frame_index)
-    grid = keyframes.grid
-    for part in in_parts(sorted(measured), grid.on_gpu):
-        pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
-        yield part, errors.of_matches(
-            [frame_of(i) for i, _ in part], [frame_of(j) for _, j in part],
-            keyframes.relative_poses(part), grid.rays,
-            keyframes.inverse_depths([i for i, _ in part]), pixels,
-        )  # fmt: skip
+    """The same (:func:`row_shifts`) of all edges, some at a time."""
+    for part in in_parts(sorted(measured), keyframes.grid.on_gpu):
+        yield part, row_shifts(errors, keyframes, part, measured, frame_of)
 
 
 def in_parts(items: list[T], on_gpu: bool) -> Iterator[list[T]]:

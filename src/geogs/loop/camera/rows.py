@@ -7,20 +7,22 @@ was found in the video, and may be off by some percent, is found once more on th
 where all matches together would become neither better nor worse with another.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from functools import partial
+
+from jaxtyping import Float
+from torch import Tensor
 
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
-from geogs.bundle.protocols import BundleOptions
+from geogs.loop.keyframe_matches import KeyframeMatches, Measured
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
-from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
+from geogs.tracking.frames.row_errors import RowErrors, edge_shifts, row_shifts
 from geogs.tracking.graph.dynamic_cells import static_weight
-from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.row_twists import EVIDENCE, part_seen, row_twists
-from geogs.tracking.tracker import Tracker
 from geogs.types import FrameLens
-from geogs.world.edges import PackedEdge, Pair, edge_matches
+from geogs.world.edges import Pair, edge_matches
+from geogs.world.keyframes import KeyframeSet
 
 ROUNDS = 2
 """Where the readout is not searched for: the first takes most of it."""
@@ -36,23 +38,15 @@ FIRST_STEP, FARTHEST = 0.04, 0.25
 """Fraction of the readout that is tried first, and by which it changes at most."""
 
 
-def correct_rows(
-    tracker: Tracker,
-    free_pose: Sequence[int],
-    free_depth: Sequence[int],
-    options: BundleOptions,
-    finds_readout: bool = True,
-) -> float:
+def correct_rows(matches: KeyframeMatches, finds_readout: bool = True) -> float:
     """Correct all matches for their rows and adjust again; nothing where no rows were rectified.
 
     What was measured of the frames between the keyframes is corrected, too. ``finds_readout`` says
     whether the readout is found once more, where it was found in the video. Returns how many times
     the readout it is.
     """
-    graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
-    measured = graph.packed
-    search, grid, last = _Search(), keyframes.grid, ROUNDS - 1
-    between = replace(options, iterations=min(options.iterations, BETWEEN))
+    keyframes, log, measured = matches.keyframes, matches.log, matches.graph.packed
+    search, last = _Search(), ROUNDS - 1
     for n in range(1 + READOUTS):
         errors = row_errors(log, keyframes) if measured else None
         if errors is None:
@@ -62,35 +56,39 @@ def correct_rows(
             last = READOUTS
         if searches and n > 0:
             before = search.factor
-            search.step(_readout_gradient(graph, measured, errors, before, options))
+            search.step(_readout_gradient(matches, measured, errors.with_readout(before), before))
             if abs(search.factor - before) < SETTLED:
                 last = n
         present = errors.with_readout(search.factor)
         found = row_twists(present, keyframes, measured, log)
         present = present.with_twists(found.frames, found.twist)
-        for part, (shift, _) in edge_shifts(present, keyframes, measured):
-            graph.edges.update(
-                {e: measured[e].moved(grid.camera, s) for e, s in zip(part, shift, strict=True)}
-            )
-        graph.adjust(list(graph.edges), free_pose, free_depth, options if n == last else between)
+        shifts = partial(_shifts, present, keyframes, measured)
+        matches.correct(measured, shifts, None if n == last else BETWEEN)
         shift_rows(log, keyframes, present)
         if n == last:
             break
     return search.factor
 
 
-def let_lenses_move(tracker: Tracker, lenses: Mapping[int, FrameLens]) -> None:
+def _shifts(
+    errors: RowErrors, keyframes: KeyframeSet, measured: Measured, part: list[Pair]
+) -> Float[Tensor, "e p 2"]:
+    """What brings the matches of some edges to where they would be if all rows were right."""
+    return row_shifts(errors, keyframes, part, measured).shift
+
+
+def let_lenses_move(matches: KeyframeMatches, lenses: Mapping[int, FrameLens]) -> None:
     """Let the principal points of frames' lenses move while rows are read, if the matches say so.
 
     A stabilised lens moves all the time, a crop is put elsewhere after an image was read. Images
     and matches are straight by these lenses, and not corrected for the rows yet.
     """
-    keyframes, log = tracker.keyframes, tracker.map.recorder.log
-    still = row_errors(log, keyframes)
+    keyframes, log = matches.keyframes, matches.log
+    still = row_errors(log, keyframes) if lenses else None
     if still is None:
         return
     moving = still.with_lenses(lenses)
-    if part_seen(still, moving, keyframes, tracker.map.graph.edges, log) > MOVES:
+    if part_seen(still, moving, keyframes, matches.graph.edges, log) > MOVES:
         log.lenses = dict(lenses)
 
 
@@ -116,20 +114,18 @@ class _Search:
 
 
 def _readout_gradient(
-    graph: FrameGraph,
-    measured: dict[Pair, PackedEdge],
-    errors: RowErrors,
-    factor: float,
-    options: BundleOptions,
+    matches: KeyframeMatches, measured: Measured, errors: RowErrors, factor: float
 ) -> float:
-    """Half the derivative of the cost by the factor on the readout, and of what was known of it."""
+    """Half the derivative of the cost by the factor on the readout, at that of ``errors``, and of
+    what was known of it."""
     total = (factor - 1) / errors.doubt**2
-    grid, keyframes = graph.keyframes.grid, graph.keyframes
-    for part, (shift, slope) in edge_shifts(errors.with_readout(factor), keyframes, measured):
+    keyframes, huber = matches.keyframes, matches.options.huber
+    grid = keyframes.grid
+    for part, (shift, slope) in edge_shifts(errors, keyframes, measured):
         T, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
         weight = static_weight(keyframes, part, pixels, weight)
         p = project(grid.camera, grid.rays, T, depth)
-        residual, weight = weighed_residuals(p, pixels + shift, weight, options.huber)
+        residual, weight = weighed_residuals(p, pixels + shift, weight, huber)
         total += EVIDENCE * float((weight * residual * slope).double().sum())
     return total

@@ -9,15 +9,13 @@ what the matches have left (forward selection): a depth that is wrong as yet ask
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.uncertainty.lens_error import SHAPES, lens_prior, shifts_of_edges
 from geogs.bundle.uncertainty.varying_intrinsics import (
     EXPLAINED,
@@ -26,15 +24,14 @@ from geogs.bundle.uncertainty.varying_intrinsics import (
     VaryingEvidence,
     VaryingPrior,
 )
-from geogs.geometry.camera import Camera
-from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
-from geogs.tracking.frames.row_errors import in_parts
-from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.loop.camera.found import FoundLenses
+from geogs.loop.keyframe_matches import KeyframeMatches
+from geogs.tracking.frame_lenses import sizes_of_frames
 from geogs.tracking.keyframe_uncertainty import said_of_frame_lenses
-from geogs.tracking.tracker import Tracker
 from geogs.types import FoundLens, FrameLens
-from geogs.world.edges import PackedEdge, Pair
-from geogs.world.straight_view import FrameViews, StraightView
+from geogs.world.edges import Pair
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import KeyframeSet
 
 ROUNDS = 12
 """At most."""
@@ -56,76 +53,31 @@ Said = Sequence[tuple[list[int], VaryingEvidence]]
 """What matches say of the lenses of some keyframes, and of others."""
 
 
-@dataclass(frozen=True)
-class VaryingLens:
-    """What was found of a lens that changes."""
-
-    lens: FoundLens
-    """Of all frames."""
-    own: Mapping[int, FrameLens]
-    """By the indices of the frames that have a place."""
-    prior: VaryingPrior | None = None
-    """By which they vary, where they do."""
-
-    def followed_by(self, camera: Camera, other: "VaryingLens") -> "VaryingLens":
-        """With what was found on images that are straight by this."""
-        lens = StraightView(camera, self.lens).followed_by(other.lens)
-        none = FrameLens()
-        own = {
-            n: self.own.get(n, none).plus(other.own.get(n, none))
-            for n in sorted(self.own.keys() | other.own.keys())
-        }
-        return VaryingLens(lens, own, other.prior or self.prior)
-
-    def shift(self, tracker: Tracker) -> None:
-        """Correct what was found of frames, beside what it was corrected by. After the lens of all
-        (``shift_lens``), which takes the place of what was there."""
-        lens, each = self.lens, list(OWN)
-        common = torch.tensor([math.log(lens.focal), lens.k1, lens.k2, lens.right, lens.down])
-        sizes = {
-            n: common.double().index_add(0, torch.tensor(each), torch.tensor(o.sizes).double())
-            for n, o in self.own.items()
-        }
-        shift_frames(tracker.map.recorder.log, tracker.keyframes, sizes)
-
-    def views(self, camera: Camera) -> FrameViews:
-        """How its frames are straightened."""
-        each = torch.tensor([o.sizes for o in self.own.values()] or [FrameLens().sizes])
-        focal, right, down = each.double().square().mean(0).sqrt().tolist()
-        lens = replace(self.lens, varies_focal=focal, varies_centre=math.hypot(right, down))
-        return FrameViews(StraightView(camera, lens), self.own)
-
-
 def correct_frame_lenses(
-    tracker: Tracker,
-    free_pose: Sequence[int],
-    free_depth: Sequence[int],
-    options: BundleOptions,
-    before: VaryingLens | None = None,
-) -> VaryingLens | None:
+    matches: KeyframeMatches, before: FoundLenses | None = None
+) -> FoundLenses:
     """Correct all matches for what the lens of each keyframe has of its own, and adjust again.
 
-    None where matches do not ask for it, it does not settle, or what does not change would do
+    Nothing where matches do not ask for it, it does not settle, or what does not change would do
     nearly as well: then everything is as it was.
     ``before`` was found already, images are straight by it, and what is left is asked for. What was
-    found of the frames between the keyframes stays (:meth:`VaryingLens.shift`). Not in the world of
+    found of the frames between the keyframes stays (:meth:`FoundLenses.shift`). Not in the world of
     a saved map. Of a lens that somebody told of, what all frames share stays.
     """
-    graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
-    if not graph.edges or tracker.segment.fixed:
-        return None
+    graph, keyframes, log = matches.graph, matches.keyframes, matches.log
+    if not graph.edges or matches.tracker.segment.fixed:
+        return FoundLenses()
     kept = [(k, k.T_cw.clone(), k.inverse_depth.clone(), k.information.clone()) for k in keyframes]
     measured = graph.packed
     prior = None if before is None else before.prior
-    sizes = _Sizes(tracker, prior or VaryingPrior())
-    said = said_of_frame_lenses(tracker, tracker.segment.ids)
+    sizes = _Sizes(keyframes, prior or VaryingPrior())
+    said = said_of_frame_lenses(matches.tracker, matches.tracker.segment.ids)
     if prior is None and not sizes.grow(said):
-        return None
+        return FoundLenses()
     for _ in range(ROUNDS):
         last = sizes.step(said)
-        _shift(graph, measured, sizes)
-        graph.adjust(list(graph.edges), free_pose, free_depth, options)
-        said = said_of_frame_lenses(tracker, tracker.segment.ids)
+        matches.correct(measured, sizes.shifts)
+        said = said_of_frame_lenses(matches.tracker, matches.tracker.segment.ids)
         if last < SETTLED and not sizes.grow(said):
             break
     if last > UNSETTLED or sizes.left > (AMBIGUOUS_ROWS if log.rows else AMBIGUOUS):
@@ -133,28 +85,19 @@ def correct_frame_lenses(
         for keyframe, T_cw, depth, information in kept:
             keyframe.T_cw, keyframe.inverse_depth = T_cw, depth
             keyframe.information = information
-        return None
-    known = {k.frame_index: sizes.of(k.id) for k in keyframes}
-    found = sizes_of_frames(log, keyframes, known, sizes.prior)
-    varies = torch.tensor(sizes.prior.jitter) > 0
-    own = {
-        n: FrameLens(*torch.where(varies, (s - sizes.common)[list(OWN)], 0.0).tolist())
-        for n, s in found.items()
-    }
-    focal, k1, k2, right, down = sizes.common.tolist()
-    lens = FoundLens(k1, k2, 0.0, 0.0, math.exp(focal), right=right, down=down)
-    return VaryingLens(lens, own, sizes.prior)
+        return FoundLenses()
+    return sizes.found(log)
 
 
 class _Sizes:
     """Errors of the lens of all keyframes and of each, as far as they are taken off the matches."""
 
-    def __init__(self, tracker: Tracker, prior: VaryingPrior) -> None:
+    def __init__(self, keyframes: KeyframeSet, prior: VaryingPrior) -> None:
         self.prior, self.common = prior, torch.zeros(SHAPES, dtype=torch.float64)
         self.left = 0.0
         """Part of the cost that what does not change would take off, when that was asked last."""
-        self._tracker, self._own = tracker, dict[int, Tensor]()
-        deviation = tracker.keyframes.table.focal_deviation
+        self._keyframes, self._own = keyframes, dict[int, Tensor]()
+        deviation = keyframes.table.focal_deviation
         self._is_open = deviation > 0
         expected = lens_prior(deviation) if self._is_open else SHAPES * (TOLD,)
         self._shared = torch.tensor(expected, dtype=torch.float64)
@@ -197,7 +140,7 @@ class _Sizes:
         which they do most to."""
         steps, explained = [], 0.0
         for frames, evidence in said:
-            times = [self._tracker.keyframes[k].timestamp for k in frames]
+            times = [self._keyframes[k].timestamp for k in frames]
             taken = torch.cat([*(self._of(k) for k in frames), self.common])
             at = torch.tensor(times, dtype=torch.float64)
             step, prior = evidence.told(at, taken, prior, self._shared)
@@ -208,14 +151,23 @@ class _Sizes:
     def _of(self, id: int) -> Float[Tensor, "3"]:
         return self._own.get(id, torch.zeros(len(OWN), dtype=torch.float64))
 
-
-def _shift(graph: FrameGraph, measured: Mapping[Pair, PackedEdge], sizes: _Sizes) -> None:
-    """Have the measured edges with their matches where the pinhole would have them."""
-    grid, keyframes = graph.keyframes.grid, graph.keyframes
-    for part in in_parts(sorted(measured), grid.on_gpu):
+    def shifts(self, part: list[Pair]) -> Float[Tensor, "e p 2"]:
+        """What brings the matches of some edges to where the pinhole would have them."""
+        grid, keyframes = self._keyframes.grid, self._keyframes
         T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         at = project(grid.camera, grid.rays, T_ji, depth)
-        both = torch.stack([torch.stack([sizes.of(k) for k in pair]) for pair in part])
-        shifts = shifts_of_edges(grid.camera, grid.rays, T_ji, at, both.to(at.pixels))
-        for pair, shift in zip(part, shifts, strict=True):
-            graph.edges[pair] = measured[pair].moved(grid.camera, shift)
+        both = torch.stack([torch.stack([self.of(k) for k in pair]) for pair in part])
+        return shifts_of_edges(grid.camera, grid.rays, T_ji, at, both.to(at.pixels))
+
+    def found(self, log: FrameLog) -> FoundLenses:
+        """The lens of all frames, and what each has of its own."""
+        known = {k.frame_index: self.of(k.id) for k in self._keyframes}
+        sizes = sizes_of_frames(log, self._keyframes, known, self.prior)
+        varies = torch.tensor(self.prior.jitter) > 0
+        own = {
+            n: FrameLens(*torch.where(varies, (s - self.common)[list(OWN)], 0.0).tolist())
+            for n, s in sizes.items()
+        }
+        focal, k1, k2, right, down = self.common.tolist()
+        lens = FoundLens(k1, k2, 0.0, 0.0, math.exp(focal), right=right, down=down)
+        return FoundLenses(lens, own, self.prior)

@@ -1,0 +1,138 @@
+"""Matches between all keyframes of a tracker: measured, corrected for the camera, adjusted to."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.protocols import BundleOptions
+from geogs.tracking.frames.row_errors import in_parts
+from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
+from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
+from geogs.tracking.tracker import Tracker
+from geogs.world.edges import PackedEdge, Pair
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import KeyframeSet
+
+ROUNDS = 4
+"""Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
+REMEASURE = 0.25
+"""A pair is matched again when its reprojection has moved by this many pixels."""
+MAX_DISTANCE = 0.5
+"""Largest frame distance of a pair, of the long edge."""
+SUPPRESSION = 3
+"""Pairs within this many keyframes of a chosen one are left out, as they say the same."""
+PAIRS = 10
+"""Most pairs per keyframe: time against precision."""
+MATCHED_TOGETHER = 16, 48
+"""Pairs that are matched in one go, on the CPU and on a GPU."""
+CONVERGED = 0.02
+"""The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
+GLOBAL_OPTIONS = BundleOptions(
+    iterations=10, huber=HUBER, damping=1e-6, least_damping=1e-8, depth_damping=1e-5, tolerance=1e-5
+)
+"""How each round is solved; it ends with a step that moves no pose by more, in units and radians.
+A drift of scale along many keyframes has a curvature far below 1e-4 of the diagonal, the less the
+more they are, and carries all depths along: with the usual damping of either the steps end long
+before it is gone (docs/adjustment.md)."""
+
+Progress = Callable[[float, str], None]
+Measured = Mapping[Pair, PackedEdge]
+Shifts = Callable[[list[Pair]], Float[Tensor, "e p 2"]]
+"""Pixels to be added to the matches of some edges."""
+
+
+def _unwatched(done: float, message: str) -> None:
+    """Nobody follows the progress."""
+
+
+@dataclass(frozen=True)
+class KeyframeMatches:
+    """Matches between the keyframes of a tracker, and what an adjustment to them moves."""
+
+    tracker: Tracker
+    free_pose: Sequence[int]
+    free_depth: Sequence[int]
+    pairs: Sequence[Pair] = ()
+    """That are matched."""
+    progress: Progress = _unwatched
+    """Called with the fraction done and a message."""
+    options: BundleOptions = GLOBAL_OPTIONS
+
+    @staticmethod
+    def of(tracker: Tracker, progress: Progress | None = None) -> "KeyframeMatches":
+        """Those of all keyframes. The first pose stays, or, in the world of a saved map, all that
+        is of the keyframes it holds."""
+        segment = tracker.segment
+        free_pose = segment.free if segment.fixed else segment.ids[1:]
+        return KeyframeMatches(
+            tracker, free_pose, segment.free, global_pairs(tracker), progress or _unwatched,
+            GLOBAL_OPTIONS,
+        )  # fmt: skip
+
+    @property
+    def keyframes(self) -> KeyframeSet:
+        """Which are matched."""
+        return self.tracker.keyframes
+
+    @property
+    def graph(self) -> FrameGraph:
+        """Which has the edges."""
+        return self.tracker.map.graph
+
+    @property
+    def log(self) -> FrameLog:
+        """Frames between the keyframes."""
+        return self.tracker.map.recorder.log
+
+    def measure(self, fine: bool) -> None:
+        """Measure all pairs and adjust everything, from round to round those that have moved.
+
+        At full resolution where it is ``fine``, else at half of it; small images always at full.
+        """
+        graph, odometry = self.graph, self.tracker.map.odometry
+        batch = MATCHED_TOGETHER[self.keyframes.grid.on_gpu]
+        graph.edges.clear()
+        for n in range(ROUNDS if self.pairs else 0):
+            # Pairs of a keyframe one after the other: images of old ones are read from a file.
+            stale = sorted(graph.stale(self.pairs, REMEASURE))
+            if len(stale) <= CONVERGED * len(self.pairs):
+                break
+            for start in range(0, len(stale), batch):
+                graph.measure(stale[start : start + batch], fine=fine, packed=True)
+                self.progress((n + start / len(stale)) / ROUNDS, "matching all keyframes")
+            self.adjust()
+            graph.update_dynamic(set(self.free_depth), self.tracker.config.moving)
+            odometry.update_scale_by_all()
+
+    def adjust(self, most: int | None = None) -> None:
+        """Solve for the free poses and depths, by that many steps at most."""
+        steps = min(self.options.iterations, most or self.options.iterations)
+        options = replace(self.options, iterations=steps)
+        self.graph.adjust(list(self.graph.edges), self.free_pose, self.free_depth, options)
+
+    def correct(self, measured: Measured, shifts: Shifts, most: int | None = None) -> None:
+        """Have edges as they were measured, with their matches shifted, and adjust again."""
+        grid = self.keyframes.grid
+        for part in in_parts(sorted(measured), grid.on_gpu):
+            for pair, shift in zip(part, shifts(part), strict=True):
+                self.graph.edges[pair] = measured[pair].moved(grid.camera, shift)
+        self.adjust(most)
+
+
+def global_pairs(tracker: Tracker) -> list[Pair]:
+    """Neighbours in time and all places seen again, thinned evenly; not within a saved map."""
+    grid, ids = tracker.keyframes.grid, tracker.segment.ids
+    pairs = proximity_pairs(
+        tracker.keyframes,
+        ids,
+        ids,
+        [],
+        RADIUS,
+        SUPPRESSION,
+        MAX_DISTANCE * max(grid.camera.width, grid.camera.height),
+        PAIRS * len(ids),
+    )
+    wanted, fixed = set(ids), set(tracker.segment.fixed)
+    return [p for p in pairs if wanted.issuperset(p) and not fixed.issuperset(p)]
