@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from geogs.camera.distortion import LensModel, undistorted_rays
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel, undistorted_rays
 from geogs.geometry.lie import so3_exp
 from geogs.types import Frame
 from tracking_scenes import CAMERA, render, seen

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from geogs.camera.shutter.angular_motion import rotated
+from geogs.camera.shutter.clip_tracks import ClipTracks
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.geometry.camera import Camera
-from geogs.shutter.angular_motion import rotated
-from geogs.shutter.clip_tracks import ClipTracks
-from geogs.shutter.rolling_camera import RollingCamera
 
 WIDE = RollingCamera(Camera(420.0, 420.0, 255.5, 191.5, 512, 384))
 FOCAL = 420.0

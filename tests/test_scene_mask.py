@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 
+from geogs.camera.straight_view import StraightView
 from geogs.geometry.camera import Camera
 from geogs.scene_mask import SceneMask
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
-from geogs.world.straight_view import StraightView
 
 CAMERA = Camera(fx=110.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 WIDE = FoundLens(0.1, 0.1, 0.001, 0.001)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
+from geogs.camera.straight_view import StraightView
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.masked import valid_pixels
 from geogs.types import FoundLens
 from geogs.world.keyframes import Keyframe
-from geogs.world.straight_view import StraightView
 
 
 @functools.lru_cache(maxsize=1)

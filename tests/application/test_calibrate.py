@@ -16,14 +16,14 @@ from geogs.application.calibrate import (
     with_shutter_found,
 )
 from geogs.application.interrupt import Interruption
+from geogs.camera.distortion import distorted_pixels
+from geogs.camera.shutter import readout
+from geogs.camera.shutter.readout import FoundReadout
 from geogs.config import CalibrationConfig, Config, InputConfig
-from geogs.geometry.distortion import distorted_pixels
 from geogs.io.sources.calibration import GUESS, Calibration
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
-from geogs.shutter import readout
-from geogs.shutter.readout import FoundReadout
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.self_calibration import SelfCalibration

@@ -15,10 +15,10 @@ import geogs
 from geogs.application.interrupt import Interruption
 from geogs.application.run import opened_for, run
 from geogs.application.run_settings import RunSettings
+from geogs.camera.distortion import RESAMPLING, lens_maps
 from geogs.cli import main as cli
 from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
 from geogs.config import InputConfig
-from geogs.geometry.distortion import RESAMPLING, lens_maps
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.loop.camera.found import FoundLenses
 from geogs.pose_estimate import PoseEstimate

@@ -11,12 +11,12 @@ from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
 from geogs.application.results.summary import source_summary
 from geogs.application.run_settings import RunSettings
+from geogs.camera.shutter import readout
+from geogs.camera.shutter.readout import FoundReadout
+from geogs.camera.shutter.shutter import Shutter
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
-from geogs.shutter import readout
-from geogs.shutter.readout import FoundReadout
-from geogs.shutter.shutter import Shutter
 from geogs.tracking.calibration import self_calibration
 from geogs.tracking.calibration.self_calibration import SelfCalibration
 from io_samples import write_images

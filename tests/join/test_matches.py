@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from geogs.application.results.saved_result import load_result
+from geogs.camera.shutter.rows import CELL
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse, sim3_scale
 from geogs.io.writers.keyframe_folder import rows_path, write_rows
-from geogs.shutter.rows import CELL
 from geogs.tracking.frames.row_errors import RowErrors
 from geogs.types import SeenRows
 from geogs.world.edges import position_step, unpacked_positions

@@ -8,6 +8,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes
 from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
+from geogs.camera.straight_view import StraightView
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.camera import frame_lenses
@@ -25,7 +26,6 @@ from geogs.types import FlowMatch, FoundLens, SeenRows
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameRecord, Observation
 from geogs.world.grid import SampleGrid
-from geogs.world.straight_view import StraightView
 from planted_walk import PlantedFlow, centre_error, true_inverse_depth, walked_tracker
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)

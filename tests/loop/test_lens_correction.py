@@ -7,6 +7,7 @@ from torch import Tensor
 
 from geogs.bundle.projection import project
 from geogs.bundle.uncertainty.lens_error import lens_shapes
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.camera import lens as lens_correction
@@ -16,7 +17,6 @@ from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.tracking.tracker import Tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.straight_view import FrameViews, StraightView
 from planted_walk import PlantedFlow, centre_error, true_inverse_depth, walked_tracker
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)

@@ -5,6 +5,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from geogs.camera.shutter.rows import CELL, node_count
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.loop.camera.straightening import (
@@ -14,7 +16,6 @@ from geogs.loop.camera.straightening import (
     straighten_frames,
 )
 from geogs.priors.monocular_prior import DepthKind
-from geogs.shutter.rows import CELL, node_count
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.types import FoundLens, SeenRows
 from geogs.world.cell_depths import KeyframePrior, MeasuredCells
@@ -22,7 +23,6 @@ from geogs.world.edges import pack_matches, unpacked_positions
 from geogs.world.frames import FrameLog, FrameRecord, Observation
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
-from geogs.world.straight_view import FrameViews, StraightView
 
 CAMERA = Camera(fx=110.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 GRID = SampleGrid(CAMERA)

@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
@@ -11,7 +12,6 @@ from geogs.mapping.view_arrays import MapCameras
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
-from geogs.world.straight_view import FrameViews, StraightView
 from keyframe_samples import views_of
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)

@@ -15,6 +15,7 @@ from geogs.application.results.output_folder import free_folder
 from geogs.application.results.remesh import mesh_settings
 from geogs.application.results.result_page import shown_model, shown_views, write_page_anew
 from geogs.application.results.saved_result import load_result
+from geogs.camera.shutter.rows import CELL
 from geogs.evaluation.pages.lengths import lengths
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source
@@ -29,7 +30,6 @@ from geogs.io.writers.keyframe_folder import (
 )
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mapping.rendered import SurfaceMaps
-from geogs.shutter.rows import CELL
 from geogs.types import SeenRows, Uncertainty
 from parsers.base import Damage, Parser
 from saved_results import CAMERA, make_result

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from geogs.application.structure_from_motion.completion import as_seen
+from geogs.camera.straight_view import StraightView
 from geogs.config import InputConfig
 from geogs.io.sources.sniff import open_source
-from geogs.world.straight_view import StraightView
 from geogs_photos import incremental_mapping
 from geogs_photos.completion import place_lost
 from geogs_synth.sequence.replica_files import write_sequence

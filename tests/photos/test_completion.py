@@ -5,10 +5,10 @@ import pytest
 
 from geogs.application.structure_from_motion import completion
 from geogs.application.structure_from_motion.completion import LostFrames, about, as_seen
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.types import FoundFrames, FoundLens, Frame, FrameLens, Trajectory, Uncertainty
-from geogs.world.straight_view import FrameViews, StraightView
 from geogs_photos.completion import place_lost
 from handheld_walk import handheld_trajectory
 from io_samples import write_image

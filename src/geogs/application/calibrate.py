@@ -12,15 +12,15 @@ import torch
 
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
+from geogs.camera.distortion import with_bend
+from geogs.camera.shutter.shutter import Shutter
 from geogs.config import Config
-from geogs.geometry.distortion import with_bend
 from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.frame_source import Source
-from geogs.shutter.shutter import Shutter
 from geogs.types import FoundLens
 
 if TYPE_CHECKING:
-    from geogs.shutter.readout import FoundReadout
+    from geogs.camera.shutter.readout import FoundReadout
     from geogs.tracking.calibration.self_calibration import SelfCalibration
 
 F = TypeVar("F")
@@ -270,8 +270,8 @@ def _with_rows_rectified(
 
 
 def _readout(source: Source, report: Report) -> "FoundReadout":
-    from geogs.geometry.distortion import USUAL_BEND
-    from geogs.shutter.readout import find_readout
+    from geogs.camera.distortion import USUAL_BEND
+    from geogs.camera.shutter.readout import find_readout
 
     calibration = source.calibration
     focal = max(calibration.focal_deviation, 1e-4)  # 0 where somebody said it

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from geogs.camera.shutter.rows import node_count
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import to_device
-from geogs.shutter.rows import node_count
 
 STRIDE = 8
 """Pixels of the working image between two cells of the grid."""

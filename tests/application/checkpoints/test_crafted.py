@@ -16,12 +16,12 @@ from crafted_checkpoints import Crafted, crafted
 from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, SavedRun
 from geogs.application.run_settings import RunSettings
+from geogs.camera.shutter.rows import CELL
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
 from geogs.priors.monocular_prior import DepthKind, PriorMaps
-from geogs.shutter.rows import CELL
 from geogs.slam import Slam
 from geogs.types import MeasuredPose, SeenRows
 from geogs.world.world import World

@@ -8,12 +8,12 @@ import torch
 
 from geogs.application.structure_from_motion import chosen_frames, offline_plan
 from geogs.application.structure_from_motion.offline import beginning_with
+from geogs.camera.shutter.shutter import Shutter
 from geogs.cli.main import main
 from geogs.config import InputConfig
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_source
-from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
 from geogs_photos.localise import Localiser
 from io_samples import write_image, write_video

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from geogs.camera.shutter.shutter import Shutter
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources import readout_clips as clips
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
-from geogs.shutter.shutter import Shutter
 from io_samples import write_image, write_video
 from rolling_scenes import RATE, READOUT, global_image, hand_held, rolling_frames, rolling_image
 

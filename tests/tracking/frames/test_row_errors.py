@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from geogs.bundle.projection import carried_over, project
+from geogs.camera.shutter.angular_motion import AngularMotion
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.rows import RowOffsets
+from geogs.camera.shutter.shutter import Shutter
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.shutter.angular_motion import AngularMotion
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.rows import RowOffsets
-from geogs.shutter.shutter import Shutter
 from geogs.tracking.frames.row_errors import LONGEST_INTERVAL, RowErrors, lagrange
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid

@@ -10,11 +10,11 @@ import torch
 from geogs.application.checkpoints.checkpoint import SavedState
 from geogs.application.named_files import without_files_outside
 from geogs.application.run_settings import RunSettings
+from geogs.camera.shutter.shutter import Shutter
 from geogs.errors import InputError
 from geogs.io.sources.address import live_address
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import ReadingPlace, Source
-from geogs.shutter.shutter import Shutter
 from geogs.slam import Slam
 from geogs.world.world import World
 

@@ -9,6 +9,11 @@ from jaxtyping import Float, UInt8
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, solve_shared
+from geogs.camera.shutter.angular_motion import AngularMotion, rotated
+from geogs.camera.shutter.rates import FlowMeter, angular_velocity
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.rows import RowOffsets
+from geogs.camera.shutter.shutter import Shutter
 from geogs.config import MeshConfig, ReconstructConfig
 from geogs.depth.depth_view import DenseDepth, KeyframeDepth, ViewPose
 from geogs.depth.revision.segment_planes import on_planes
@@ -20,11 +25,6 @@ from geogs.mapping.known_poses import expect_depths
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.reconstruction import Reconstruction
-from geogs.shutter.angular_motion import AngularMotion, rotated
-from geogs.shutter.rates import FlowMeter, angular_velocity
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.rows import RowOffsets
-from geogs.shutter.shutter import Shutter
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.frames.row_errors import RowErrors

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, UInt8
 
 from geogs.application.results.output_folder import claimed, read_summary
+from geogs.camera.shutter.rows import CELL
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -34,7 +35,6 @@ from geogs.mapping.rendered import MapRenderer, RenderedView, SurfaceRules
 from geogs.mesh.mesh_file import read_mesh
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.on_demand import OnDemand
-from geogs.shutter.rows import CELL
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.application.scale.measurable_scene import MeasurableScene
+from geogs.camera.distortion import undistorted_rays
 from geogs.errors import InputError
-from geogs.geometry.distortion import undistorted_rays
 from geogs.io.sources.calibration import Calibration
 from geogs.types import MetricScale
 

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from geogs.application.driver import Driver
 from geogs.application.results.verdict import MAX_POSITION_DEVIATION
 from geogs.application.structure_from_motion.photos import SECONDS_PER_FRAME, place_lost
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.errors import InputError
 from geogs.evaluation.duration import duration
 from geogs.evaluation.trajectory_errors import extent_of
@@ -21,7 +22,6 @@ from geogs.io.sources.frame_source import Source
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.threads import worker_count
 from geogs.types import FoundFrames, Frame, Trajectory, Uncertainty
-from geogs.world.straight_view import FrameViews, StraightView
 
 NEIGHBOURS = 10
 """Frames with a place before each lost one, and as many after it, about which it is looked for."""

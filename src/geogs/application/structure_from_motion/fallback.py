@@ -22,12 +22,12 @@ from geogs.application.structure_from_motion.completion import LostFrames
 from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.errors import InputError, TrackingLost
 from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
 from geogs.slam import Slam
 from geogs.types import FoundFrames
-from geogs.world.straight_view import FrameViews, StraightView
 
 if TYPE_CHECKING:
     from geogs.application.structure_from_motion.offline import PlacedOffline

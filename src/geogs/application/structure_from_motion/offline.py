@@ -20,6 +20,7 @@ from geogs.application.structure_from_motion.photos import (
     place_frames,
     seconds_to_place,
 )
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import Config, ReconstructConfig
 from geogs.evaluation.duration import duration
 from geogs.geometry.camera import Camera
@@ -29,7 +30,6 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import StageProgress, Stopwatch
 from geogs.tracking.frames.interpolation import bridged
 from geogs.types import FoundFrames, Trajectory, Uncertainty
-from geogs.world.straight_view import FrameViews, StraightView
 
 MIN_CLIP_FPS = 8.0
 """Images a second, as recorded, below which a readout that nobody gave is not searched in clips:

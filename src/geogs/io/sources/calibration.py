@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass, replace
 
+from geogs.camera.distortion import LensModel, with_bend
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel, with_bend
 from geogs.types import FoundLens
 
 _LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from geogs.camera.distortion import LensModel
 from geogs.documents import (
     LARGEST_SETTINGS,
     UNUSABLE,
@@ -21,7 +22,6 @@ from geogs.documents import (
     yaml_value,
 )
 from geogs.errors import InputError
-from geogs.geometry.distortion import LensModel
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.data_set_cameras import (
     arkit_camera,

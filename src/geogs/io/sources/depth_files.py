@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
+from geogs.camera.distortion import distorted_pixels
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import distorted_pixels
 from geogs.io.pictures import decoded
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.undistort import Rectifier

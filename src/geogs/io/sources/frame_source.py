@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from geogs.camera.shutter.clip_tracks import FollowedClips
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.shutter import Shutter
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.live.live_reader import LiveReader
 from geogs.io.sources.reader import RawFrame, fingerprint_of
 from geogs.io.sources.working_images import WorkingImages
-from geogs.shutter.clip_tracks import FollowedClips
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.shutter import Shutter
 from geogs.types import FoundLens, Frame
 
 _log = logging.getLogger(__name__)

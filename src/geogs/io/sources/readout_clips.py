@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Generator
 
+from geogs.camera.shutter.readout import CLIP, CLIPS, LEAST_CLIPS, SPAN
 from geogs.config import InputConfig
 from geogs.io.sources.reader import RawFrame, Reader, read_side_by_side
-from geogs.shutter.readout import CLIP, CLIPS, LEAST_CLIPS, SPAN
 
 MINUTE = 60.0
 """Seconds of a video that are looked at for its readout."""

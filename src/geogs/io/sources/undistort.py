@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
+from geogs.camera.distortion import RESAMPLING, LensModel, distorted_pixels, lens_maps
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import RESAMPLING, LensModel, distorted_pixels, lens_maps
 from geogs.io.sources.calibration import Calibration
-from geogs.shutter.rolling_camera import RollingCamera
 
 FieldOfView = float | Literal["auto"]
 """Degrees along the longer side of the working image."""

@@ -10,6 +10,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geogs.camera.shutter.angular_motion import AngularMotion
+from geogs.camera.shutter.clip_tracks import FollowedClips
+from geogs.camera.shutter.neighbours import with_angular_motion
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.rows import RowOffsets
+from geogs.camera.shutter.shutter import Shutter
 from geogs.config import InputConfig
 from geogs.documents import expanded
 from geogs.errors import InputError
@@ -31,12 +37,6 @@ from geogs.io.sources.reader import (
 )
 from geogs.io.sources.readout_clips import read_clips
 from geogs.io.sources.undistort import Rectifier, mask_as_image
-from geogs.shutter.angular_motion import AngularMotion
-from geogs.shutter.clip_tracks import FollowedClips
-from geogs.shutter.neighbours import with_angular_motion
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.rows import RowOffsets
-from geogs.shutter.shutter import Shutter
 from geogs.threads import Each
 from geogs.types import MeasuredDepth, SeenRows
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.geometry.camera import Camera
 from geogs.tracking.frame_lenses import shift_frames
 from geogs.types import FoundLens, FrameLens
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
-from geogs.world.straight_view import FrameViews, StraightView
 
 
 @dataclass(frozen=True)

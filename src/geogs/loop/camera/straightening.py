@@ -13,8 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
+from geogs.camera.shutter.rows import CELL
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.geometry.lie import se3_inverse
-from geogs.shutter.rows import CELL
 from geogs.threads import ordered_map, thread_map, worker_count
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import seen_by_keyframes, solved_poses
@@ -25,7 +26,6 @@ from geogs.world.archive import Archived
 from geogs.world.edges import pack_matches, unpacked_positions
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
-from geogs.world.straight_view import FrameViews, StraightView
 
 FARTHEST = 0.1
 """Fraction of the long edge; what seems to lie farther off straight has no match."""

@@ -17,8 +17,8 @@ from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
+from geogs.camera.distortion import USUAL_BEND
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import USUAL_BEND
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.two_view import best_two_view, without
 from geogs.types import FlowMatch

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.bundle.lens import RadialLens
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
-from geogs.geometry.distortion import USUAL_BEND
+from geogs.camera.distortion import USUAL_BEND
 from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
 

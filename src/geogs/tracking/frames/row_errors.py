@@ -17,8 +17,8 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from geogs.bundle.projection import MIN_Z, carried_over, project, seen_from_targets
+from geogs.camera.shutter.rows import CELL
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
-from geogs.shutter.rows import CELL
 from geogs.types import FrameLens, SeenRows, Trajectory
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
+from geogs.camera.distortion import RESAMPLING, lens_maps
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import RESAMPLING, lens_maps
 from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.known_intrinsics import resolve_intrinsics

@@ -6,10 +6,15 @@ from functools import partial
 import numpy as np
 import pytest
 
-from geogs.shutter import row_adjustment
-from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.first_reconstruction import first_reconstruction
-from geogs.shutter.row_adjustment import NODES, interpolation, interpolation_slope, readout_equation
+from geogs.camera.shutter import row_adjustment
+from geogs.camera.shutter.clip_reconstruction import ClipReconstruction
+from geogs.camera.shutter.first_reconstruction import first_reconstruction
+from geogs.camera.shutter.row_adjustment import (
+    NODES,
+    interpolation,
+    interpolation_slope,
+    readout_equation,
+)
 from row_by_row import FOCAL, clip_of, scattered, shaken
 
 READOUT, TOLERANCE = 0.02, 0.5 / FOCAL

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from geogs.bundle.uncertainty.lens_error import lens_shapes
+from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.geometry.camera import Camera
 from geogs.types import FoundLens, FrameLens
-from geogs.world.straight_view import FrameViews, StraightView
 from geogs_synth.camera.radial_camera import RadialCamera
 from lit_rooms import lit_room
 

@@ -7,9 +7,9 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from geogs.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between
-from geogs.shutter.rates import FlowMeter, angular_velocity, parallax
-from geogs.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between
+from geogs.camera.shutter.rates import FlowMeter, angular_velocity, parallax
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.threads import Each
 
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
+from geogs.camera.distortion import RESAMPLING, distorted_pixels, lens_maps
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import RESAMPLING, distorted_pixels, lens_maps
 from geogs.types import FoundLens, FrameLens
 
 FARTHEST, ENTRIES = 4.0, 1 << 14

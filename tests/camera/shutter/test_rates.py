@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geogs.camera.shutter.angular_motion import rotated
+from geogs.camera.shutter.rates import FlowMeter, RayFlow, angular_velocity, parallax
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.geometry.camera import Camera
-from geogs.shutter.angular_motion import rotated
-from geogs.shutter.rates import FlowMeter, RayFlow, angular_velocity, parallax
-from geogs.shutter.rolling_camera import RollingCamera
 from rolling_scenes import RATE, READOUT, global_image, rolling_image, turning
 from tracking_scenes import CAMERA
 

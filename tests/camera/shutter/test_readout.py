@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geogs.geometry.distortion import USUAL_BEND
-from geogs.shutter.clip_tracks import FollowedClips
-from geogs.shutter.first_reconstruction import first_reconstruction
-from geogs.shutter.readout import (
+from geogs.camera.distortion import USUAL_BEND
+from geogs.camera.shutter.clip_tracks import FollowedClips
+from geogs.camera.shutter.first_reconstruction import first_reconstruction
+from geogs.camera.shutter.readout import (
     CLIP,
     LONGEST,
     SHORTEST,
@@ -20,7 +20,7 @@ from geogs.shutter.readout import (
     _verdict,
     find_readout,
 )
-from geogs.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.types import Frame
 from rolling_scenes import RATE, hand_held, rolling_frames, rolling_image
 from row_by_row import FOCAL, clip_of, scattered, shaken, steady

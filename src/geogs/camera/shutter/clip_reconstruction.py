@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from geogs.shutter.angular_motion import rotated
+from geogs.camera.shutter.angular_motion import rotated
 
 _NEAREST = 1e-3
 """Depth, in the unit of the points, below which a point is taken to be there."""

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from geogs.shutter.angular_motion import rotated
-from geogs.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.angular_motion import rotated
+from geogs.camera.shutter.rolling_camera import RollingCamera
 
 LONG_EDGE = 256
 """Pixels, at most, of the images that flow is measured on."""
@@ -102,7 +102,7 @@ def angular_velocity(
     Returns:
         the velocity; none where too few cells agree with any.
     """
-    from geogs.shutter.turning_kernels import turning_between
+    from geogs.camera.shutter.turning_kernels import turning_between
 
     first_time, second_time = readout * flow.first_time, readout * flow.second_time
     rate, error = turning_between(

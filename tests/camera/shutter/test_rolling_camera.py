@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.geometry.camera import Camera
 from geogs.io.sources.formats.video_file import turn_upright
-from geogs.shutter.rolling_camera import RollingCamera
 
 LANDSCAPE = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 PORTRAIT = Camera(50.0, 50.0, 23.5, 31.5, 48, 64)

@@ -5,10 +5,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from geogs.camera.shutter.angular_motion import AngularMotion, rotated
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.shutter import Shutter
 from geogs.geometry.camera import Camera
-from geogs.shutter.angular_motion import AngularMotion, rotated
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.shutter import Shutter
 from geogs.types import SeenRows
 
 CELL = 8

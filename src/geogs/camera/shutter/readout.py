@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
+from geogs.camera.shutter.clip_reconstruction import ClipReconstruction
+from geogs.camera.shutter.clip_tracks import ClipTracks, FollowedClips
+from geogs.camera.shutter.first_reconstruction import first_reconstruction
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.row_adjustment import NODES, ReadoutEquation, readout_equation
 from geogs.geometry.least_squares import Policy, Step, minimise
-from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.clip_tracks import ClipTracks, FollowedClips
-from geogs.shutter.first_reconstruction import first_reconstruction
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.row_adjustment import NODES, ReadoutEquation, readout_equation
 from geogs.threads import thread_map
 
 CLIP, SPAN = 30, 3.0

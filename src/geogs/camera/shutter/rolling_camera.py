@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from geogs.camera.distortion import LensModel, distorted_pixels, undistorted_rays
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import LensModel, distorted_pixels, undistorted_rays
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geogs.camera.shutter.clip_reconstruction import ClipReconstruction
+from geogs.camera.shutter.clip_tracks import LEAST_POINTS, ClipTracks
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.robust import geman_mcclure_weight
-from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.clip_tracks import LEAST_POINTS, ClipTracks
 
 ROUNDS = 5
 """Gauss-Newton steps to the pose of an image."""

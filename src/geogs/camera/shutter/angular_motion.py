@@ -37,7 +37,7 @@ def rotated(
     vectors: Float[np.ndarray, "n 3"], by: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Each vector turned by its own rotation vector, radians."""
-    from geogs.shutter.turning_kernels import turn
+    from geogs.camera.shutter.turning_kernels import turn
 
     turned = np.empty((len(vectors), 3))
     turn(np.ascontiguousarray(vectors), np.ascontiguousarray(by), turned)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from geogs.camera.shutter.clip_reconstruction import ClipReconstruction
+from geogs.camera.shutter.clip_tracks import ClipTracks
 from geogs.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
-from geogs.shutter.clip_reconstruction import ClipReconstruction
-from geogs.shutter.clip_tracks import ClipTracks
 
 POWERS = 0, 2, 4
 """Powers of the distance from the axis that scale the shift of a point by a longer focal length,

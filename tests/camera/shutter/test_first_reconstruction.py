@@ -3,8 +3,12 @@
 import numpy as np
 import torch
 
+from geogs.camera.shutter.first_reconstruction import (
+    first_reconstruction,
+    inverse_depths,
+    relative_pose,
+)
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.first_reconstruction import first_reconstruction, inverse_depths, relative_pose
 from row_by_row import FOCAL, clip_of, scattered, shaken
 
 TURN, MOVE = np.array([0.05, -0.1, 0.03]), np.array([0.6, 0.2, -0.1])

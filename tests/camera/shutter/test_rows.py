@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.camera.shutter.angular_motion import AngularMotion
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.rows import RowOffsets
+from geogs.camera.shutter.shutter import Shutter
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.angular_motion import AngularMotion
-from geogs.shutter.rolling_camera import RollingCamera
-from geogs.shutter.rows import RowOffsets
-from geogs.shutter.shutter import Shutter
 
 CAMERA = Camera(420.0, 415.0, 255.0, 190.0, 512, 384)
 FAST = AngularMotion(np.array([1.2, -1.5, 0.8]), np.array([10.0, -12.0, 8.0]))

@@ -3,10 +3,15 @@
 import numpy as np
 import torch
 
+from geogs.camera.shutter.angular_motion import (
+    AngularMotion,
+    AngularStep,
+    angular_motion_between,
+    rotated,
+)
+from geogs.camera.shutter.turning_kernels import nearest_turn
 from geogs.geometry.lie import so3_exp
 from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between, rotated
-from geogs.shutter.turning_kernels import nearest_turn
 
 
 def test_vectors_are_rotated_as_by_the_matrix_exponential():

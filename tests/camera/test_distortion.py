@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import (
+from geogs.camera.distortion import (
     FISHEYE_LIMIT,
     RESAMPLING,
     distorted_pixels,
@@ -15,6 +14,7 @@ from geogs.geometry.distortion import (
     undistorted_rays,
     with_bend,
 )
+from geogs.geometry.camera import Camera
 
 CAMERA = Camera(500.0, 490.0, 321.0, 237.0, 640, 480)
 RAYS = np.array([[0.0, 0.0], [0.3, 0.2], [-0.35, 0.1], [0.1, -0.3], [0.55, 0.4]])

@@ -5,16 +5,16 @@ from collections.abc import Generator
 import cv2
 import numpy as np
 
-from geogs.geometry.camera import Camera
-from geogs.shutter import clip_tracks as clip_tracks_module
-from geogs.shutter.clip_tracks import (
+from geogs.camera.shutter import clip_tracks as clip_tracks_module
+from geogs.camera.shutter.clip_tracks import (
     LEAST_SEEN,
     FollowedClips,
     even,
     followed_clip,
     followed_points,
 )
-from geogs.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.rolling_camera import RollingCamera
+from geogs.geometry.camera import Camera
 from geogs.types import Frame
 
 SIZE = 160, 120

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from geogs.shutter.neighbours import Image
-from geogs.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.neighbours import Image
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.threads import thread_map
 
 MOST_POINTS = 160

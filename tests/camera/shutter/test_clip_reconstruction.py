@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from geogs.camera.shutter.clip_reconstruction import ClipReconstruction
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.clip_reconstruction import ClipReconstruction
 
 
 def sample() -> ClipReconstruction:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geogs.shutter.neighbours import with_angular_motion
-from geogs.shutter.rolling_camera import RollingCamera
+from geogs.camera.shutter.neighbours import with_angular_motion
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from rolling_scenes import RATE, READOUT, hand_held, rolling_frames
 from tracking_scenes import CAMERA
 
