@@ -91,6 +91,7 @@ class Board:
         measured = tuple(
             RowRecord(
                 row.name,
+                places[row.footage].result().title,
                 f"geogs {row.command}",
                 row.runs_alone,
                 tuple(outcomes[_Job(row, seed)] for seed in SEEDS),

@@ -48,6 +48,8 @@ class RowRecord:
     """A row."""
 
     name: str
+    footage: str
+    """What the command saw, in words."""
     command: str
     runs_alone: bool
     outcomes: tuple[Outcome, ...]

@@ -31,7 +31,7 @@ class Figure:
 
 FIGURES = (
     Figure("placed", "placed %", 0, "more", least=1.0),
-    Figure("ate", "ATE cm", 3, "less", least_ratio=0.05),
+    Figure("ate", "ATE cm", 3, "less", least=0.001, least_ratio=0.05),
     Figure("error_per_sigma", "error/σ", 2, "neither"),
     Figure("reliable", "reliable", 2, "neither"),
     Figure("misjudged", "misjudged", 2, "less", least=0.3),
@@ -41,7 +41,7 @@ FIGURES = (
     Figure("online_accuracy", "online Acc", 3, "less", least_ratio=0.02),
     Figure("online_completeness", "online Comp.Rat", 1, "more", least=0.2),
     Figure("online_f_score", "online F", 1, "more", least=0.2),
-    Figure("cost", "cost", 1, "less", least_ratio=0.05),
+    Figure("cost", "cost", 1, "less", least_ratio=0.15),
     Figure("seconds", "s", 1, "less", least_ratio=0.1),
     Figure("memory", "MB", 0, "less", least_ratio=0.05),
     Figure("disks", "disks", 0, "neither"),
@@ -75,16 +75,21 @@ def compare(before: BoardRecord, now: BoardRecord) -> list[Difference]:
     found = [
         difference
         for row in now.rows
-        if (earlier := before.row(row.name)) is not None and earlier.command == row.command
+        if (earlier := before.row(row.name)) is not None and _are_alike(earlier, row)
         for difference in _differences(earlier, row, _has_same_clock(before, now, row))
     ]
     return sorted(found, key=lambda difference: not difference.is_worse)
 
 
+def _are_alike(before: RowRecord, now: RowRecord) -> bool:
+    """Whether a row is of the same command on the same footage."""
+    return before.command == now.command and before.footage == now.footage
+
+
 def _has_same_clock(before: BoardRecord, now: BoardRecord, row: RowRecord) -> bool:
-    """Whether seconds on the wall can be compared."""
-    is_alike = before.side_by_side == now.side_by_side or row.runs_alone
-    return before.machine == now.machine and before.device == now.device and is_alike
+    """Whether seconds on the wall can be compared: beside others a command waits for these."""
+    is_same = before.machine == now.machine and before.device == now.device
+    return is_same and row.runs_alone
 
 
 def _differences(before: RowRecord, now: RowRecord, same_clock: bool) -> Iterator[Difference]:

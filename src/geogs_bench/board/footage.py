@@ -57,6 +57,8 @@ class FootagePlace:
     """Where a sequence lies."""
 
     folder: Path
+    title: str
+    """What it is, in words: results of another are not compared."""
     frames: int
     """That are there."""
     options: str = ""
@@ -82,7 +84,11 @@ def render(footage: Footage, root: Path, on_gpu: bool, say: Callable[[str], None
     folder, made_of = root / footage.name, repr(replace(footage, on_cpu=size, on_gpu=size))
     missing = [i for i in range(size.frames) if _is_missing(i / size.frames, footage)]
     used = f"--stride {size.stride}" if size.stride > 1 else ""
-    place = FootagePlace(folder, size.frames - len(missing), used)
+    title = (
+        f"{footage.motion}, {footage.camera}, seed {footage.seed}: {size.frames - len(missing)} "
+        f"images of {size.width} x {size.height} {used}"
+    )
+    place = FootagePlace(folder, title.rstrip(), size.frames - len(missing), used)
     if (folder / _MARK).is_file() and (folder / _MARK).read_text() == made_of:
         return place
     say(f"rendering {footage.name}")
@@ -110,7 +116,8 @@ def find(footage: KeptFootage, root: Path | None, on_gpu: bool) -> FootagePlace 
     if folder is None or not folder.is_dir():
         return None
     options = footage.on_gpu if on_gpu else footage.on_cpu
-    return FootagePlace(folder, len(read_true_scene(folder).trajectory.timestamps), options)
+    frames = len(read_true_scene(folder).trajectory.timestamps)
+    return FootagePlace(folder, f"{footage.folder} {options}".rstrip(), frames, options)
 
 
 def frames_used(command: Sequence[str], frames: int) -> int:

@@ -44,7 +44,7 @@ FOOTAGE = (
         gap=(0.5, 0.6),
     ),
     Footage("dining", "dining", "clean", 37, Size(72, 160, 120, stride=2), Size(200, 480, 272)),
-    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(36, 160, 120), Size(40, 400, 300)),
+    Footage("slow-stream", "handheld-5hz", "clean", 38, Size(32, 160, 120), Size(40, 400, 300)),
 )
 """Rooms, a street and a corridor, each of a seed of its own, filmed by cameras with flaws."""
 
@@ -74,7 +74,7 @@ _WAYS = (
     Row("fast", "handheld-kinect", "run {folder} --preset fast"),
     Row("accurate", "handheld-kinect", "run {folder} --preset accurate"),
     Row("own", "handheld-kinect", "run {folder} --tracking.operator own"),
-    Row("offline", "handheld-kinect", "run {folder} --offline --stop 60"),
+    Row("offline", "weak-link", "run {folder} --offline"),
     Row("posed", "slow-stream", "reconstruct {folder}"),
     Row(
         "posed-paper",
