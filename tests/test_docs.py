@@ -10,7 +10,8 @@ from geogs.config import Config, ReconstructConfig
 from geogs.config.leaves import leaves
 
 ROOT = Path(__file__).parents[1]
-TEXTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
+PAGES = "*.md", "docs/*.md", "docs/notebook/*.md", "benchmarks/README.md"
+TEXTS = sorted(chain.from_iterable(map(ROOT.glob, PAGES)))
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.stem)

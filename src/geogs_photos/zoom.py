@@ -18,8 +18,8 @@ PARTS = 6
 MAX_ERROR_RATIO, LEAST_CHANGE = 0.93, 0.03
 """Reprojection error with these over that with one lens, at most, and the least relative difference
 of their focal lengths: 0.78 and 7 % where somebody zooms by four fifths,
-0.90 and 14 % where by a half in five images, 0.97 and more where nobody does (docs/uncertainty.md
-has what that leaves)."""
+0.90 and 14 % where by a half in five images, 0.97 and more where nobody does
+(docs/notebook/uncertainty.md has what that leaves)."""
 
 
 def zooms(model: Any, images: Sequence[Any]) -> bool:

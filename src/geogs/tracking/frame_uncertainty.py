@@ -24,7 +24,7 @@ EXPECTED_RESIDUAL = math.sqrt(2 * math.log(2))
 """Median length of an error in two dimensions, in its deviations."""
 CAUTION = 4 / 3
 """Ratio of the errors of frames between keyframes to those foretold: the matches of a frame err
-alike. Read off rendered videos (docs/uncertainty.md has the table)."""
+alike. Read off rendered videos (docs/notebook/uncertainty.md has the table)."""
 
 
 def frame_uncertainty(tracker: Tracker) -> Uncertainty:

@@ -40,7 +40,7 @@ TOGETHER = 300
 """Keyframes whose poses are solved jointly; of longer videos the parts follow each other."""
 USUAL_RESIDUAL = 0.23
 """Median residual, in deviations of a match, where the scene is as modelled: read off rendered
-videos (docs/uncertainty.md has the table)."""
+videos (docs/notebook/uncertainty.md has the table)."""
 FLAWLESS_RESIDUAL = 0.26
 """The same where nothing is wrong, at most: 0.21 to 0.26."""
 MIN_SHARED = 0.2

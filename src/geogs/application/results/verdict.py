@@ -18,18 +18,19 @@ MAX_DEPTH_DEVIATION = 0.2
 """Relative deviation of the best known depths."""
 MAX_FOCAL_DEVIATION = 0.15
 """Relative deviation of the focal length, by which all that is seen is too wide or too narrow: 14 %
-and less in rendered videos where it was right (docs/lens.md)."""
+and less in rendered videos where it was right (docs/notebook/lens.md)."""
 MAX_MISFIT = 1.35
 """Residual of a tenth of the keyframes over that of the others: up to 1.29 in rendered videos that
-were followed rightly, from 1.41 on where tracking had failed (docs/uncertainty.md)."""
+were followed rightly, from 1.41 on where tracking had failed (docs/notebook/uncertainty.md)."""
 MAX_FOCAL_CHANGE = 0.05
-"""Relative difference of the focal lengths that parts of a video want (docs/uncertainty.md)."""
+"""Relative difference of the focal lengths that parts of a video want
+(docs/notebook/uncertainty.md)."""
 MAX_LENS_CHANGE = 0.1
 """Part of the matches' cost that lenses of the frames' own would take off; below 0.06 where none
-has one (docs/lens.md)."""
+has one (docs/notebook/lens.md)."""
 MAX_LENS_CHANGE_LEFT = 0.03
 """The same where such lenses were found: up to 0.024 where they are right, from 0.046 on where the
-map was wrong from its start (docs/lens.md)."""
+map was wrong from its start (docs/notebook/lens.md)."""
 MIN_JOINED = 0.95
 """Fraction of the keyframes that one structure holds; of the others a few may be out of place."""
 NO_SHAPE = 0.5

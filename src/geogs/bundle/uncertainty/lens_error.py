@@ -38,7 +38,7 @@ Rows = Callable[[BundleProblem, Float[Tensor, "p 3"], CellProjection], Float[Ten
 by a part of it: one shape more."""
 LEAST, LEAST_OF_READOUT = (0.0005, 0.0005, 0.001, 0.001, 0.002), 0.005
 """No size is known better, however many matches agree: half of what they say of lenses that have no
-error (docs/lens.md)."""
+error (docs/notebook/lens.md)."""
 PRIOR = 0.03, 0.05, 0.1
 """Deviations of the radial sizes before any match is asked."""
 CENTRE, GIVEN_CENTRE = 0.03, 0.002
@@ -48,7 +48,7 @@ STANDARD_ERRORS = 3.0
 of different keyframes err alike, too. Errors are 1 to 7 of them in rendered rooms."""
 FOCAL_LEFT = 0.05
 """What the focal length is off by after its correction, of the correction, whatever matches say: 0
-to 9 % where it was corrected by a fifth to a half (docs/lens.md)."""
+to 9 % where it was corrected by a fifth to a half (docs/notebook/lens.md)."""
 PARTS, SURE = 6, 5.0
 """Parts of a video whose focal lengths are compared; deviations by which they differ by chance."""
 

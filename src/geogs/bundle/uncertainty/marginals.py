@@ -31,7 +31,7 @@ at their upper tenth."""
 DEPTHS_ALIKE = 0.56
 """The same of what is said of depths, for the path as long as it is: errors of cells among the best
 known are 0.3 to 0.7 of what ``ALIKE`` foretells, and less what they have in common, in 20 rendered
-clips of one to two seconds (docs/uncertainty.md)."""
+clips of one to two seconds (docs/notebook/uncertainty.md)."""
 BEST_KNOWN = 0.15
 """Part of a keyframe's cells that stands for its depths, half again as many as frames are followed
 by. Of bare walls matches tell nothing, however far the camera has moved; what stands before them is

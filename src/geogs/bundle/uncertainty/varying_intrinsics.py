@@ -40,7 +40,7 @@ OWN = 0, RADIAL, RADIAL + 1
 length, and the principal point along either side."""
 EXPLAINED = 0.1
 """Part of the matches' cost that has to go where something of a lens changes: 0.33 where the focal
-length does by 1 %, below 0.06 where nothing does (docs/lens.md)."""
+length does by 1 %, below 0.06 where nothing does (docs/notebook/lens.md)."""
 LEAST = 2e-4
 """Smallest deviation of a size, that of one which does not vary, too."""
 FIRST_DEVIATION = 0.02

@@ -58,7 +58,7 @@ FEWER, BETWEEN = 3, 4.0
 """Poses by which the readout is asked for once more, in one step, and what the square of the
 fraction by which it changes then is worth of error. Of a wave, θ radians from image to image, three
 poses miss θ²/6 of the velocity, five θ⁴/30: the one is seen, the other goes with its square. As
-much more as waves of 2.2 Hz want at 4 to 10 images a second (docs/shutter.md)."""
+much more as waves of 2.2 Hz want at 4 to 10 images a second (docs/notebook/shutter.md)."""
 
 LONGEST, SHORTEST = 0.036, 0.002
 """Seconds of a readout that is believed; less is nothing to care about."""

@@ -19,11 +19,11 @@ from geogs.world.grid import SampleGrid
 
 MAX_COST = 1.5
 """Mean cost of a match, in variances, above which no lens explains the flow from one view: 0.1 to
-1.0 where it is about right (docs/calibration.md)."""
+1.0 where it is about right (docs/notebook/calibration.md)."""
 MAX_RESIDUAL = 1.0
 """Median residual of a match, in its deviations, above which no camera explains all pairs: 0.3 to
 0.75 where the lens comes out right, people over a third of what is seen or not, of which the mean
-tells nothing (docs/calibration.md)."""
+tells nothing (docs/notebook/calibration.md)."""
 PLANAR_FRACTION = 0.9
 """Where one homography explains this fraction of the matches in all views, they show a plane."""
 _TOLERANCE = 1 / 1000

@@ -21,7 +21,7 @@ from geogs.world.grid import SampleGrid
 
 LONG_EDGE = 512
 """Pixels of the images that are matched, at most, whatever the run tracks on: what the limits of
-parallax and of matched cells were chosen at (docs/calibration.md)."""
+parallax and of matched cells were chosen at (docs/notebook/calibration.md)."""
 STRETCHES = 3
 """Stretches of the video that are asked, at most, each after the one before it: bounds the time."""
 

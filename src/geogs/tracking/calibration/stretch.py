@@ -17,14 +17,14 @@ KEYFRAMES = 24
 """Most keyframes of a stretch; they are added until the focal length is known well enough."""
 ENOUGH_DEVIATION = 0.01
 """Relative deviation of the focal length from which no more keyframes of a stretch are used: all
-matches of the run are asked again at its end (docs/lens.md)."""
+matches of the run are asked again at its end (docs/notebook/lens.md)."""
 SMALL_IMAGE = 400
 """Pixels of the long edge of images that are matched at full resolution from the start, larger ones
 at half of it first."""
 MIN_PARALLAX = 0.003
 """Motion that rotation does not explain, needed between two keyframes, of the long edge: some
 deviations of a match, from which on views can be placed. Whether they tell the focal length their
-adjustment says (docs/calibration.md)."""
+adjustment says (docs/notebook/calibration.md)."""
 MIN_VIEWS = 4
 
 Report = Callable[[float], None]

@@ -29,7 +29,7 @@ NODES = 5
 LONGEST_INTERVAL = 0.3
 """Seconds between two frames; over more, their poses say nothing of the rows. At a fifth of a
 second they say little, but with what matches add (``row_twists``) the error is a third to two
-thirds (docs/shutter.md)."""
+thirds (docs/notebook/shutter.md)."""
 TOGETHER = 64, 512
 """Edges, or frames, that are looked at together, on the CPU and on a GPU; bounds memory."""
 MAX_SHIFT = 0.01
