@@ -305,6 +305,33 @@ def test_what_an_open_lens_is_found_by_is_matched_at_half_the_resolution(monkeyp
     assert all(fine for _, fine in matched)
 
 
+class UnsteadyFlow(BentFlow):
+    """Matches that err alike for a while, as if the lens bent one way, and then the other."""
+
+    def _match(self, source, target) -> FlowMatch:
+        found = super()._match(source, target)
+        sizes = torch.tensor(ERRORS) * (1 if min([*source, *target]) < COUNT // 2 else -1)
+        off = torch.einsum("k,k...->...", sizes, lens_shapes(CAMERA, found.pixels))
+        return FlowMatch(found.pixels + off, found.weight)
+
+
+ERRORS = 0.0, 0.02, -0.03, 0.0, 0.0
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_a_given_lens_is_changed_only_where_halves_of_the_video_agree(monkeypatch, agree):
+    """However sure all matches together are."""
+    T = forward(count=COUNT)
+    flow = BentFlow(T, ERRORS[1:3]) if agree else UnsteadyFlow(T, (0.0, 0.0))
+    tracker = walked_tracker(CAMERA, flow, image_of)
+    ids = list(range(COUNT))
+    tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
+    matches = KeyframeMatches(tracker, ids[1:], ids)
+    matches.adjust()
+    monkeypatch.setattr(lens_correction, "EVIDENCE", 0.0)
+    assert bool(lens_correction.correct_lens(matches)) is agree
+
+
 def test_while_tracking_goes_on_the_focal_length_stays(monkeypatch):
     monkeypatch.setattr(lens_correction, "FOCAL_EVIDENCE", 1.0)
     monkeypatch.setattr(lens_correction, "FOCAL_DOUBT", 1.0)

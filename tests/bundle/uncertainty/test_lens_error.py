@@ -163,6 +163,34 @@ def test_the_change_of_the_focal_length_is_that_of_parts_beyond_their_deviations
     assert said.focal_change < 1e-9
 
 
+def test_halves_agree_by_how_far_either_lowers_the_cost_of_the_other():
+    """Against the costs themselves, as quadratics of all sizes."""
+    g = torch.Generator().manual_seed(5)
+    A = torch.randn(4, SHAPES, SHAPES, generator=g, dtype=torch.float64)
+    H = A @ A.mT
+    true = torch.tensor([0.0, 0.03, -0.05, 0.0, 0.0]).double()
+    noise = 0.01 * torch.randn(4, SHAPES, generator=g).double()
+
+    def half(of: slice, sign: float) -> LensEvidence:
+        gradient = H[of] @ (sign * true) + noise[of]
+        return LensEvidence(H[of], gradient, torch.zeros(0, SHAPES), torch.zeros(0, 0, SHAPES))
+
+    def cost(evidence: LensEvidence, size: Tensor) -> float:
+        size = torch.cat([size.new_zeros(1), size, size.new_zeros(2)])
+        information, gradient = evidence.information.sum(0), evidence.gradient.sum(0)
+        return float(size @ information @ size - 2 * gradient @ size)
+
+    first, same, opposite = half(slice(2), 1), half(slice(2, 4), 1), half(slice(2, 4), -1)
+    for other, least, most in ((same, 0.8, 1.0), (opposite, -10.0, -1.0)):
+        fractions = [
+            cost(a, b.bend.size) / cost(a, a.bend.size) for a, b in ((first, other), (other, first))
+        ]
+        assert first.agreement(other) == pytest.approx(min(fractions), rel=1e-6)
+        assert first.agreement(other) == other.agreement(first)
+        assert least < first.agreement(other) <= most
+    assert first.agreement(first) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("bend", [(0.0, 0.0, 0.0), (0.05, 0.01, -0.02)])
 def test_one_lens_that_is_another_than_was_said_is_no_zoom(bend):
     assert evidence(*walk(bend)).focal_change < 0.01

@@ -169,6 +169,25 @@ class LensEvidence:
         """Estimate of k1 and k2, focal length and principal point being right."""
         return self._of(range(1, RADIAL))
 
+    def agreement(self, other: "LensEvidence") -> float:
+        """Cross-validation of k1 and k2 between two parts of a video, 1 at most.
+
+        The estimate of either part lowers the cost of the other by a fraction of what that part's
+        own estimate does, negative where the cost rises; the lesser of both fractions.
+        """
+        return min(self._validated(other), other._validated(self))
+
+    def _validated(self, other: "LensEvidence") -> float:
+        """Fraction of the largest decrease of the cost that the other's k1 and k2 reach."""
+        information = self.information.sum(0)[1:RADIAL, 1:RADIAL]
+        gradient = self.gradient.sum(0)[1:RADIAL]
+
+        def decrease(size: Float[Tensor, "2"]) -> float:
+            return float(2 * gradient @ size - size @ information @ size)
+
+        best = decrease(_estimate(information[None], gradient[None]).size)
+        return decrease(other.bend.size) / best if best > 0 else 0.0
+
     @property
     def focal_change(self) -> float:
         """Difference of the focal lengths that parts of the video want, as a fraction of them,

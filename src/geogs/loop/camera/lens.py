@@ -37,13 +37,14 @@ CONVERGED = 0.2
 """Standard deviations by which the last round may change a parameter."""
 MOST_AT_ONCE = 0.3
 """Largest step of the logarithm of the focal length in a round, as steps are to first order."""
-EVIDENCE = 81.0
-"""Squared Mahalanobis distance from zero at which the k1 and k2 of a given lens are accepted.
-Matches of different keyframes err alike: of a right lens it is 1 to 10, of one that was withheld
-hundreds (docs/notebook/lens.md)."""
-FOCAL_EVIDENCE = 4.0
-"""Standard deviations at which a given focal length is corrected beside k1 and k2. Of a right one
-it is 0 to 2.2 (docs/notebook/lens.md)."""
+EVIDENCE, AGREEMENT = 49.0, 0.8
+"""Squared Mahalanobis distance from zero at which k1 and k2 beside a given lens are accepted, if
+they agree so far between the halves of the video (:meth:`LensEvidence.agreement`). Matches of
+different keyframes err alike and their evidence adds up: only what they err in differs from half to
+half (docs/notebook/lens.md)."""
+FOCAL_EVIDENCE = 6.0
+"""Standard errors at which a given focal length is corrected beside k1 and k2. Of a right one it is
+0 to 2.6, once 4.0, which halves of that video agreed on (docs/notebook/lens.md)."""
 CENTRE_EVIDENCE = 64.0
 """Squared Mahalanobis distance at which the principal point of a lens that is not given is taken
 off the middle. It is below 1 where it is there, above 80 where it is 3 % of the height off. With 36
@@ -64,10 +65,10 @@ def correct_lens(
 ) -> FoundLenses:
     """Estimate the lens from all matches, correct them for it and adjust again.
 
-    Matches of the frames between the keyframes are corrected, too. Of a given lens k1 and k2 are
-    accepted from ``EVIDENCE`` on. All is estimated, however small, where images are straight by
-    ``before``, and where tracking ``ends`` and the focal length was found or guessed
-    (``KeyframeTable.focal_deviation``; the prior is
+    Matches of the frames between the keyframes are corrected, too. Beside a given lens k1 and k2
+    are accepted by ``EVIDENCE`` and ``AGREEMENT``. All is estimated, however small, where images
+    are straight by ``before``, and where tracking ``ends`` and the focal length was found or
+    guessed (``KeyframeTable.focal_deviation``; the prior is
     :func:`~geogs.bundle.uncertainty.lens_error.lens_prior`); then the principal point is, too. The
     focal length is corrected at the end alone, as what is matched afterwards would be of another;
     so is a readout that was found: rows were corrected for ``readout`` times it. Not in the world
@@ -104,8 +105,8 @@ class _LensSearch:
         evidence = said_of_lens(self._matches.tracker, list(self._matches.free_depth), self._rows)
         if evidence is None:
             return False
-        asks = self._before is not None or self._is_open or self._said is not None
-        if not asks and evidence.bend.evidence < EVIDENCE:
+        is_accepted = self._before is not None or self._is_open or self._said is not None
+        if not is_accepted and not self._contradicts_given(evidence):
             return False
         self.left -= 1
         self._said = said = self._chosen(evidence)
@@ -124,6 +125,21 @@ class _LensSearch:
         if not self.left and self._frees_centre and not self._before:
             self._leave_centre_unless_sure(said)
         return True
+
+    def _contradicts_given(self, evidence: LensEvidence) -> bool:
+        """Whether matches say, and independent halves of the video agree, that a given lens has
+        another k1 and k2."""
+        if evidence.bend.evidence < EVIDENCE:
+            return False
+        halves = self._halves()
+        return len(halves) == 2 and halves[0].agreement(halves[1]) >= AGREEMENT
+
+    def _halves(self) -> list[LensEvidence]:
+        """Evidence of the keyframes of either half of the video by itself, where there is any."""
+        ids = list(self._matches.free_depth)
+        halves = ids[: len(ids) // 2 + 1], ids[len(ids) // 2 :]
+        found = (said_of_lens(self._matches.tracker, half, self._rows) for half in halves)
+        return [evidence for evidence in found if evidence is not None]
 
     @property
     def _shapes(self) -> int:
