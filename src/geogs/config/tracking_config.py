@@ -19,7 +19,8 @@ from geogs.config.setting import (
 class CalibrationConfig(Settings, group="calibration"):
     """How intrinsics that nobody gave are found from the video itself.
 
-    Intrinsics that the user or a data set gives are never changed.
+    Intrinsics that the user or a data set gives stay before the run, and at its end unless all
+    matches, and both halves of the video, clearly contradict them.
     """
 
     refine: Annotated[bool, Basic()] = True
