@@ -37,7 +37,7 @@ CONVERGED = 0.2
 """Standard deviations by which the last round may change a parameter."""
 MOST_AT_ONCE = 0.3
 """Largest step of the logarithm of the focal length in a round, as steps are to first order."""
-EVIDENCE, AGREEMENT = 49.0, 0.8
+EVIDENCE, AGREEMENT = 49.0, 0.5
 """Squared Mahalanobis distance from zero at which k1 and k2 beside a given lens are accepted, if
 they agree so far between the halves of the video (:meth:`LensEvidence.agreement`). Matches of
 different keyframes err alike and their evidence adds up: only what they err in differs from half to
