@@ -26,6 +26,7 @@ from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
+from geogs.tracking.calibration.growing_bundle import PlacedViews
 from geogs.tracking.calibration.self_calibration import SelfCalibration
 from geogs.types import FoundLens
 from progress_listener import Listener
@@ -130,17 +131,18 @@ class Telling:
         self.lenses = iter(lenses)
         self.rows: list[float] = []
         """Pixels by which rows were rectified at most, each time."""
-        self.near: list[bool] = []
-        """Whether it was said that the lens is about right."""
+        self.again: list[bool] = []
+        """Whether the views of the round before were asked."""
 
-    def __call__(self, frames, camera, radial, device, report, mask, black, is_near):
+    def __call__(self, frames, camera, radial, device, report, mask, black, before):
         self.rows.append(max(float(f.rows.offset.abs().max()) if f.rows else 0.0 for f in frames))
-        self.near.append(is_near)
+        self.again.append(before is not None)
         factor, k1, k2 = next(self.lenses, (0.0, 0.0, 0.0))
         if not factor:
             return SelfCalibration(camera, failure="it is a test")
         found = camera.with_focal(factor * camera.fx)
-        return SelfCalibration(found, (k1, k2), 0.01, (0.01, 0.01), 12, 14)
+        views = PlacedViews((), [], [], [])
+        return SelfCalibration(found, (k1, k2), 0.01, (0.01, 0.01), 12, 14, placed=views)
 
 
 def asked(video: Path, monkeypatch, lens: Telling, **given) -> tuple[Source, Calibration]:
@@ -154,7 +156,7 @@ def test_the_lens_is_asked_of_rows_rectified_by_it_until_it_stays(video, monkeyp
     lens = Telling((0.8, -0.2, 0.05), (1.05, 0.04, -0.02), (1.005, 0.0, 0.0))
     found, before = asked(video, monkeypatch, lens, readout=0.03)
     after = found.calibration
-    assert lens.near == [False, True, True]
+    assert lens.again == [False, True, True]
     assert lens.rows[0] > 1
     assert abs(lens.rows[1] / lens.rows[0] - 1) > 0.05  # a lens that bends sees another turn
     assert after.fx == pytest.approx(0.8 * 1.05 * 1.005 * before.fx)
@@ -172,7 +174,7 @@ def test_the_lens_is_asked_of_rows_rectified_by_it_until_it_stays(video, monkeyp
 def test_the_lens_of_a_global_shutter_is_asked_for_once(video, monkeypatch):
     lens = Telling((0.8, -0.2, 0.05))
     found, _ = asked(video, monkeypatch, lens, readout=0.0)
-    assert lens.near == [False]
+    assert lens.again == [False]
     assert found.calibration.distortion == pytest.approx((-0.2, 0.05, 0, 0), abs=1e-9)
     looked_for = []
     monkeypatch.setattr(
@@ -186,14 +188,14 @@ def test_the_lens_of_a_global_shutter_is_asked_for_once(video, monkeypatch):
 def test_of_a_lens_that_its_images_do_not_bear_out_any_is_asked(video, monkeypatch):
     lens = Telling((0.8, -0.2, 0.05), (0.0, 0.0, 0.0), (1.1, 0.0, 0.0), (1.0, 0.0, 0.0))
     found, before = asked(video, monkeypatch, lens, readout=0.03)
-    assert lens.near == [False, True, False, True]
+    assert lens.again == [False, True, False, True]
     assert found.calibration.fx == pytest.approx(0.88 * before.fx)
 
 
 def test_what_is_told_once_is_kept_where_nothing_is_told_afterwards(video, monkeypatch):
     lens = Telling((0.8, -0.2, 0.05))
     found, before = asked(video, monkeypatch, lens, readout=0.03)
-    assert lens.near == [False, True, False]
+    assert lens.again == [False, True, False]
     assert found.calibration.fx == pytest.approx(0.8 * before.fx)
     assert found.calibration.refinement.failure is None
 

@@ -21,6 +21,7 @@ from geogs.types import FoundLens
 
 if TYPE_CHECKING:
     from geogs.camera.shutter.readout import FoundReadout
+    from geogs.tracking.calibration.growing_bundle import PlacedViews
     from geogs.tracking.calibration.self_calibration import SelfCalibration
 
 F = TypeVar("F")
@@ -93,7 +94,7 @@ def _by_rectified_rows(
     lens stays. What the images do not tell then is as before.
     """
     radial = radial and not source.calibration.is_distorted
-    calibrated, rolled = source, False
+    calibrated, rolled, placed = source, False, None
     for n in range(LENS_ROUNDS):
         known = calibrated if n else None
         rectified = _with_rows_rectified(calibrated, progress, stop, n)
@@ -103,10 +104,11 @@ def _by_rectified_rows(
         if n and not (rolls or rolled):
             return rectified
         images = rectified if rolls else calibrated
-        ask = partial(_self_calibration, images, radial, device, n)
+        ask = partial(_self_calibration, images, radial, device, n, placed)
         found = _found("calibration", progress, stop, ask)
         if found is None or (n and found.failure is not None):
             return known
+        placed = found.placed
         before, found = calibrated.calibration, _of_stored(found, calibrated, source)
         after = refined(source.calibration, source.camera.fx, found)
         calibrated, rolled = source.with_calibration(after), rolls
@@ -139,21 +141,26 @@ def _of_stored(found: "SelfCalibration", straight: Source, source: Source) -> "S
 
 
 def _self_calibration(
-    source: Source, radial: bool, device: str | torch.device, n: int, report: Report
+    source: Source,
+    radial: bool,
+    device: str | torch.device,
+    n: int,
+    placed: "PlacedViews | None",
+    report: Report,
 ) -> "SelfCalibration":
-    """What the images tell in round ``n``: after the first one of a lens near the one before, and
-    where they do not bear that out, of any."""
+    """What the images tell in round ``n``: after the first one the views of the round before, and
+    where these do not bear out a lens near that one, all."""
     from geogs.tracking.calibration.self_calibration import part_of, self_calibrate
 
-    def told(is_near: bool) -> "SelfCalibration":
+    def told(before: "PlacedViews | None") -> "SelfCalibration":
         with closing(source.linked_frames()) as frames:
             return self_calibrate(
                 frames, source.camera, radial, device, part_of(report, n), source.mask,
-                source.black_is_masked, is_near,
+                source.black_is_masked, before,
             )  # fmt: skip
 
-    found = told(n > 0)
-    return told(False) if n > 0 and found.failure is not None else found
+    found = told(placed)
+    return told(None) if placed is not None and found.failure is not None else found
 
 
 def refined(

@@ -45,7 +45,7 @@ def swung(views: int, degrees: float) -> list[FlowMatch]:
 
 def test_a_barrel_is_found():
     flows = swung(8, 20.0)
-    tried = candidates(GUESS, radial=True, is_near=False)
+    tried = candidates(GUESS, radial=True)
     starts = [try_candidate(lens, flows, 3.0, radial=True) for lens in tried]
     for lens, start in zip(tried, starts, strict=True):
         if start is not None:
@@ -81,12 +81,8 @@ def test_from_both_sides_of_a_flat_valley_an_adjustment_comes_to_the_same_lens()
 
 
 def test_of_a_known_distortion_only_pinholes_are_tried():
-    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False, is_near=False))
-    assert {lens.camera.fx for lens in candidates(GUESS, radial=False, is_near=False)} > {GUESS.fx}
-
-
-def test_near_what_was_found_no_other_is_tried():
-    assert candidates(GUESS, radial=True, is_near=True) == [RadialLens(GUESS)]
+    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False))
+    assert {lens.camera.fx for lens in candidates(GUESS, radial=False)} > {GUESS.fx}
 
 
 def test_of_two_minima_the_lens_that_bends_as_lenses_do_counts():

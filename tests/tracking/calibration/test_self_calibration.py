@@ -52,6 +52,24 @@ def test_finds_the_focal_length_of_a_rendered_room(factor):
     assert shares[-1] == 1.0
 
 
+def test_views_that_were_placed_are_asked_again_from_there():
+    """As when rows are rectified by the lens that they told: of images that were read anew."""
+    video = list(frames(swinging(22)))
+    first = self_calibrate(iter(video), CAMERA.with_focal(0.8 * CAMERA.fx))
+    assert first.placed is not None
+    assert len(first.placed.frames) == first.keyframes > 4
+    near = CAMERA.with_focal(1.04 * CAMERA.fx)
+    again = self_calibrate(iter(video), near, before=first.placed)
+    assert again.failure is None
+    assert again.keyframes == first.keyframes
+    assert again.frames == max(first.placed.frames)  # no more of the video is read
+    assert abs(again.camera.fx / CAMERA.fx - 1) < 0.01
+    assert again.camera.fx == pytest.approx(first.camera.fx, rel=0.005)
+    short = self_calibrate(iter(video[:3]), near, before=first.placed)
+    assert short.failure == "the video has fewer images than before"
+    assert short.camera == near
+
+
 @pytest.mark.long
 def test_the_distortion_of_a_pinhole_is_about_none():
     found = self_calibrate(frames(swinging(22)), CAMERA.with_focal(200.0), radial=True)

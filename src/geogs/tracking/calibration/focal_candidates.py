@@ -55,12 +55,9 @@ class Start:
         return self.cost + BEND_COST * sum((k / usual) ** 2 for k, usual in bends)
 
 
-def candidates(camera: Camera, radial: bool, is_near: bool) -> list[RadialLens]:
-    """The guess, and where it is not known to be near, pinholes of other fields of view, and
-    barrels if lenses are ``radial``."""
+def candidates(camera: Camera, radial: bool) -> list[RadialLens]:
+    """The guess, pinholes of other fields of view, and barrels if lenses are ``radial``."""
     guess = camera.with_focal(camera.fx)
-    if is_near:
-        return [RadialLens(guess)]
     pinholes = [guess, *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
     wide = [guess, camera.with_field_of_view(OF_BARREL)] if radial else []
     return [*map(RadialLens, pinholes), *(RadialLens(c, *BARREL) for c in wide)]

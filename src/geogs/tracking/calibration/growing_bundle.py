@@ -5,10 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
-from geogs.bundle.lens import LensBlock
+from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
 from geogs.geometry.lie import scaled
@@ -37,33 +38,64 @@ class _Edge:
     fine: bool
 
 
+@dataclass(frozen=True)
+class PlacedViews:
+    """Views of a video as they were adjusted, from which another adjustment may begin."""
+
+    frames: tuple[int, ...]
+    """Which images of the video they are."""
+    T_cw: list[Float[Tensor, "4 4"]]
+    inverse_depth: list[Float[Tensor, "p"]]
+    information: list[Float[Tensor, "p"]]
+
+
 class GrowingBundle:
     """Views placed so far, and the edges between them; mutable. Poses are on the CPU."""
 
     def __init__(
-        self, grid: SampleGrid, operator: FlowOperator, views: list[View], start: Start
+        self,
+        grid: SampleGrid,
+        operator: FlowOperator,
+        views: list[View],
+        lens: RadialLens,
+        placed: PlacedViews,
     ) -> None:
         self.grid = grid
         """Grid of the guess: of its camera nothing but the size is used."""
         self._operator = operator
-        self.lens = start.lens
-        self._views = views[: len(start.T_cw)]
-        device = grid.device
-        depth, known = start.inverse_depth.to(device), start.information.to(device)
-        self._T = list(start.T_cw)
-        self._depth = [grid_fields(grid).fill(depth, known)]
-        self._information = [known]
-        for T in self._T[1:]:
-            d, i = grid_fields(self._pinhole).transfer(T, self._depth[0], known)
-            self._depth.append(d)
-            self._information.append(i)
+        self.lens = lens
+        self._views = list(views)
+        self._T = list(placed.T_cw)
+        self._depth = list(placed.inverse_depth)
+        self._information = list(placed.information)
         self._edges: dict[tuple[int, int], _Edge] = {}
         self.result: SharedResult | None = None
         self.residual = math.inf
         """Median residual of the matches, in their own deviations, as last adjusted."""
 
+    @staticmethod
+    def begun(
+        grid: SampleGrid, operator: FlowOperator, views: list[View], start: Start
+    ) -> "GrowingBundle":
+        """The views that a candidate has placed, with the depth of the first one."""
+        views, pinhole = views[: len(start.T_cw)], SampleGrid(start.lens.camera, grid.device)
+        known = start.information.to(grid.device)
+        first = grid_fields(grid).fill(start.inverse_depth.to(grid.device), known)
+        each = [(first, known)]
+        each += [grid_fields(pinhole).transfer(T, first, known) for T in start.T_cw[1:]]
+        depth, information = map(list, zip(*each, strict=True))
+        frames = tuple(view.frame for view in views)
+        placed = PlacedViews(frames, list(start.T_cw), depth, information)
+        return GrowingBundle(grid, operator, views, start.lens, placed)
+
     def __len__(self) -> int:
         return len(self._views)
+
+    @property
+    def placed(self) -> PlacedViews:
+        """The views as they are now."""
+        frames = tuple(view.frame for view in self._views)
+        return PlacedViews(frames, self._T, self._depth, self._information)
 
     @property
     def _pinhole(self) -> SampleGrid:

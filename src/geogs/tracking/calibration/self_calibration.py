@@ -13,6 +13,7 @@ from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
+from geogs.tracking.calibration.growing_bundle import PlacedViews
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.view_gatherer import ViewGatherer
 from geogs.tracking.flow.operator_choice import build_operator
@@ -44,6 +45,8 @@ class SelfCalibration:
     """Frames that were used."""
     failure: str | None = None
     """Why the video does not tell; "the camera only turns", for the middle of a sentence."""
+    placed: PlacedViews | None = None
+    """The views that told it."""
 
 
 @on_one_torch_thread
@@ -55,15 +58,16 @@ def self_calibrate(
     report: Report = lambda fraction: None,
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
-    is_near: bool = False,
+    before: PlacedViews | None = None,
 ) -> SelfCalibration:
     """Estimate the focal length, k1 and k2 if ``radial``, of the camera that took ``frames``.
 
     ``camera`` is that of the frames. Its aspect and principal point are believed, its focal length
-    is only one of several to start from, unless it is known to be about right (``is_near``). Flow
-    is measured by the operator without a network. Stretch after stretch of the video is asked until
-    one tells. ``report`` is called with the fraction done; what it raises passes through. Outside a
-    ``mask`` nothing is matched, nor what is quite black where ``black_is_masked``.
+    is only one of several to start from. Flow is measured by the operator without a network.
+    Stretch after stretch of the video is asked until one tells. Of frames that were straightened by
+    what an earlier call found, only the views that it placed, ``before``, are asked again.
+    ``report`` is called with the fraction done; what it raises passes through. Outside a ``mask``
+    nothing is matched, nor what is quite black where ``black_is_masked``.
     """
     small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
     size = small.width, small.height
@@ -74,9 +78,10 @@ def self_calibrate(
     images = (cv2.resize(f.image, size, interpolation=cv2.INTER_AREA) for f in frames)
     gatherer = ViewGatherer(images, grid, operator)
     failures: list[str] = []
-    while len(failures) < STRETCHES and not (failures and gatherer.is_over):
-        part = part_of(report, len(failures))
-        found = Stretch(grid, operator, gatherer, radial, is_near, part).ask()
+    tries = 1 if before else STRETCHES
+    while len(failures) < tries and not (failures and gatherer.is_over):
+        stretch = Stretch(grid, operator, gatherer, radial, part_of(report, len(failures)))
+        found = stretch.ask() if before is None else stretch.ask_again(before)
         if isinstance(found, str):
             failures.append(found)
             continue
@@ -87,6 +92,7 @@ def self_calibrate(
             camera.with_focal(camera.fx * lens.camera.fx / small.fx),
             (lens.k1, lens.k2) if bends else None, found.deviation,
             found.deviations[1:] if bends else None, found.keyframes, gatherer.frames,
+            placed=stretch.placed,
         )  # fmt: skip
     # That nothing explains a stretch weighs more than what the others lack.
     failure = min(failures, key=lambda said: said != Degeneracy.UNEXPLAINED.value)

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 
+from geogs.bundle.lens import RadialLens
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate
-from geogs.tracking.calibration.growing_bundle import GrowingBundle
+from geogs.tracking.calibration.growing_bundle import GrowingBundle, PlacedViews
 from geogs.tracking.calibration.view_gatherer import View, ViewGatherer, flows_from_first
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
@@ -39,14 +40,14 @@ class Stretch:
         operator: FlowOperator,
         gatherer: ViewGatherer,
         radial: bool,
-        is_near: bool,
         report: Report,
     ) -> None:
-        """``radial``: whether k1 and k2 are found, too; ``is_near``: whether the grid's camera is
-        known to be about right, so that no other is tried."""
-        self.grid, self.operator, self.radial, self.is_near = grid, operator, radial, is_near
+        """``radial``: whether k1 and k2 are found, too."""
+        self.grid, self.operator, self.radial = grid, operator, radial
         self._gatherer, self._report = gatherer, report
         self._views: list[View] = []
+        self.placed: PlacedViews | None = None
+        """The views as they were adjusted last."""
         self._done = 0.0
         self._min_parallax = MIN_PARALLAX * grid.camera.long_edge
 
@@ -66,7 +67,7 @@ class Stretch:
         start = self._start()
         if isinstance(start, Degeneracy):
             return start.value
-        bundle = GrowingBundle(self.grid, self.operator, self._views, start)
+        bundle = GrowingBundle.begun(self.grid, self.operator, self._views, start)
         said: Estimate | str = "its motion could not be followed"
         while True:
             for view in self._views[len(bundle) :]:
@@ -75,8 +76,7 @@ class Stretch:
                     return said
             # Matches are searched again from where the first adjustment has them.
             for fine in (self.grid.camera.long_edge <= SMALL_IMAGE, True):
-                bundle.measure(fine, self._tick)
-                if not bundle.adjust(self.radial):
+                if not self._adjusted(bundle, fine):
                     return said
             said = estimate(bundle, self.radial)
             self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
@@ -84,6 +84,25 @@ class Stretch:
                 return said
             if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
                 return said
+
+    def ask_again(self, before: PlacedViews) -> Estimate | str:
+        """What views that were placed before say of the lens of images that are nearly straight:
+        they are matched from there, and adjusted."""
+        views = self._gatherer.again(before.frames, self._tick)
+        if len(views) < len(before.frames):
+            return "the video has fewer images than before"
+        lens = RadialLens(self.grid.camera)
+        bundle = GrowingBundle(self.grid, self.operator, views, lens, before)
+        if not self._adjusted(bundle, fine=True):
+            return "its motion could not be followed"
+        return estimate(bundle, self.radial)
+
+    def _adjusted(self, bundle: GrowingBundle, fine: bool) -> bool:
+        """Whether views were matched and adjusted."""
+        bundle.measure(fine, self._tick)
+        is_adjusted = bundle.adjust(self.radial)
+        self.placed = bundle.placed
+        return is_adjusted
 
     def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
@@ -109,7 +128,7 @@ class Stretch:
         # One after the other: beside each other their many small operations wait for Python.
         starts = (
             try_candidate(lens, flows, self._min_parallax, self.radial)
-            for lens in candidates(camera, self.radial, self.is_near)
+            for lens in candidates(camera, self.radial)
         )
         found = [s for s in starts if s is not None]
         if not found:

@@ -1,6 +1,6 @@
 """Keyframes of a camera about which nothing is known, and the flow between them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,8 @@ FRAMES = 600
 class View:
     """A keyframe without a pose."""
 
+    frame: int
+    """Which image of the video it is."""
     encoded: Any
     step: ChainedMatch | None
     """Flow between the keyframe before it and this one; None for the first."""
@@ -84,7 +86,20 @@ class ViewGatherer:
                 else:
                     step = match
             self._chain.reset()
-            views.append(View(encoded, step))
+            views.append(View(self.frames, encoded, step))
+        return views
+
+    def again(self, frames: Sequence[int], tick: Callable[[], None]) -> list[View]:
+        """Views of images that were chosen before, of another reading of the video; fewer where it
+        ends before."""
+        wanted, views = set(frames), list[View]()
+        for image in self._images:
+            self.frames += 1
+            tick()
+            if self.frames in wanted:
+                views.append(View(self.frames, self._operator.encode(image), None))
+            if len(views) == len(wanted):
+                break
         return views
 
 
