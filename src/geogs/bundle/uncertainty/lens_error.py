@@ -170,11 +170,8 @@ class LensEvidence:
         return self._of(range(1, RADIAL))
 
     def agreement(self, other: "LensEvidence") -> float:
-        """Cross-validation of k1 and k2 between two parts of a video, 1 at most.
-
-        The estimate of either part lowers the cost of the other by a fraction of what that part's
-        own estimate does, negative where the cost rises; the lesser of both fractions.
-        """
+        """Cross-validation of k1 and k2 between two parts of a video: by what fraction of the most
+        that is possible either's estimate lowers the other's cost, at least; 1 at most."""
         return min(self._validated(other), other._validated(self))
 
     def _validated(self, other: "LensEvidence") -> float:
