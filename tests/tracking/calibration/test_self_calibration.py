@@ -13,6 +13,7 @@ from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
+from geogs.tracking.calibration.growing_bundle import GrowingBundle
 from geogs.tracking.calibration.self_calibration import self_calibrate
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
@@ -68,6 +69,27 @@ def test_views_that_were_placed_are_asked_again_from_there():
     short = self_calibrate(iter(video[:3]), near, before=first.placed)
     assert short.failure == "the video has fewer images than before"
     assert short.camera == near
+
+
+def test_views_that_cannot_be_placed_are_not_asked_again(monkeypatch):
+    """Those before them, by which the lens is known, are."""
+    monkeypatch.setattr(stretch, "ENOUGH_DEVIATION", 0.0)
+    monkeypatch.setattr(stretch, "START_KEYFRAMES", 6)
+    place, more = GrowingBundle.place, []
+
+    def one_more_at_most(bundle, view):
+        if len(bundle) >= 6:
+            more.append(view)
+        return len(more) < 2 and place(bundle, view)
+
+    monkeypatch.setattr(GrowingBundle, "place", one_more_at_most)
+    found = self_calibrate(frames(swinging(22)), CAMERA.with_focal(0.8 * CAMERA.fx))
+    assert len(more) == 2
+    assert found.failure is None
+    views = found.placed
+    assert len(views.frames) == len(views.T_cw) == len(views.inverse_depth) == found.keyframes
+    again = self_calibrate(frames(swinging(22)), found.camera, before=views)
+    assert again.failure is None
 
 
 @pytest.mark.long

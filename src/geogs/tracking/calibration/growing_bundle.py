@@ -93,9 +93,9 @@ class GrowingBundle:
 
     @property
     def placed(self) -> PlacedViews:
-        """The views as they are now."""
+        """The views as they are now, whatever is placed later."""
         frames = tuple(view.frame for view in self._views)
-        return PlacedViews(frames, self._T, self._depth, self._information)
+        return PlacedViews(frames, list(self._T), list(self._depth), list(self._information))
 
     @property
     def _pinhole(self) -> SampleGrid:
