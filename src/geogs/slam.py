@@ -159,9 +159,7 @@ class Slam(SlamOutput):
         if not main.segment.ids:
             return
         with self.stopwatch("global bundle adjustment"):
-            global_bundle(
-                main, lambda f, _: progress("bundle adjustment", f), ends=self.world.is_ended
-            )
+            global_bundle(main, progress, ends=self.world.is_ended)
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
                 self.world.uncertainty = frame_uncertainty(main)

@@ -107,7 +107,7 @@ def test_global_bundle_improves_and_reports_the_correction(ended):
     truth = np.stack(SHORT)[:, :3, 3]
     seen = []
     online = error_cm(tracker.trajectory().T_wc[:, :3, 3], truth)
-    correction = global_bundle(tracker, lambda share, message: seen.append(share))
+    correction = global_bundle(tracker, lambda stage, share: seen.append(share))
     final = error_cm(tracker.trajectory().T_wc[:, :3, 3], truth)
     assert final < max(online, 0.15)
     assert final < 0.25

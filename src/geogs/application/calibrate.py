@@ -148,19 +148,19 @@ def _self_calibration(
     placed: "PlacedViews | None",
     report: Report,
 ) -> "SelfCalibration":
-    """What the images tell in round ``n``: after the first one the views of the round before, and
-    where these do not bear out a lens near that one, all."""
+    """Lens of the images in round ``n``: estimated from the views that the round before ``placed``,
+    and from all where there are none, or where these fail."""
     from geogs.tracking.calibration.self_calibration import part_of, self_calibrate
 
-    def told(before: "PlacedViews | None") -> "SelfCalibration":
+    def estimate(before: "PlacedViews | None") -> "SelfCalibration":
         with closing(source.linked_frames()) as frames:
             return self_calibrate(
                 frames, source.camera, radial, device, part_of(report, n), source.mask,
                 source.black_is_masked, before,
             )  # fmt: skip
 
-    found = told(placed)
-    return told(None) if placed is not None and found.failure is not None else found
+    found = estimate(placed)
+    return estimate(None) if placed is not None and found.failure is not None else found
 
 
 def refined(

@@ -1,7 +1,8 @@
 """Bundle adjustment over all keyframes, with flow measured anew from round to round."""
 
 from geogs.loop.camera.adjustment import adjust_camera
-from geogs.loop.keyframe_matches import KeyframeMatches, Progress
+from geogs.loop.keyframe_matches import STAGE, KeyframeMatches
+from geogs.stopwatch import StageProgress, unwatched
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 
@@ -10,17 +11,17 @@ PRIORS_TOGETHER = 32
 
 
 def global_bundle(
-    tracker: Tracker, progress: Progress | None = None, ends: bool = False
+    tracker: Tracker, progress: StageProgress = unwatched, ends: bool = False
 ) -> PoseCorrection:
     """Refine all keyframes of a tracker on a fresh graph that also joins places seen again.
 
     The pose of the first of them stays, or, in the world of a saved map, all that is of those it
     holds. Poses, inverse depth and information of the tracker are updated, and its graph holds the
     fresh edges alone: one that goes on tracking needs only those that ``FrameGraph.retire`` leaves
-    of them. ``progress`` is called with the fraction done and a message. Returns the poses before
-    and after; scales are 1. Where it ``ends`` the tracking, images are straightened by what matches
-    say of the camera (:func:`~geogs.loop.camera.adjustment.adjust_camera`). A tracker without a map
-    is left alone, and one whose images are straight already.
+    of them. Returns the poses before and after; scales are 1. Where it ``ends`` the tracking,
+    images are straightened by what matches say of the camera
+    (:func:`~geogs.loop.camera.adjustment.adjust_camera`). A tracker without a map is left alone,
+    and one whose images are straight already.
     """
     store, ids = tracker.keyframes, tracker.segment.ids
     if not ids or store.table.lens is not None:
@@ -32,7 +33,7 @@ def global_bundle(
     free = matches.free_depth
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
-    matches.progress(1.0, "all keyframes adjusted")
+    progress(STAGE, 1.0)
     after = {k: store[k].T_cw for k in ids}
     correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
     store.correct(correction)

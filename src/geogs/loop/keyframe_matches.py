@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.protocols import BundleOptions
+from geogs.stopwatch import StageProgress, unwatched
 from geogs.tracking.frames.row_errors import in_parts
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
 from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
@@ -15,6 +16,8 @@ from geogs.world.edges import PackedEdge, Pair
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
 
+STAGE = "bundle adjustment"
+"""What progress is reported of."""
 ROUNDS = 4
 """Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
 REMEASURE = 0.25
@@ -37,14 +40,9 @@ A drift of scale along many keyframes has a curvature far below 1e-4 of the diag
 more they are, and carries all depths along: with the usual damping of either the steps end long
 before it is gone (docs/adjustment.md)."""
 
-Progress = Callable[[float, str], None]
 Measured = Mapping[Pair, PackedEdge]
 Shifts = Callable[[list[Pair]], Float[Tensor, "e p 2"]]
 """Pixels to be added to the matches of some edges."""
-
-
-def _unwatched(done: float, message: str) -> None:
-    """Nobody follows the progress."""
 
 
 @dataclass(frozen=True)
@@ -56,20 +54,18 @@ class KeyframeMatches:
     free_depth: Sequence[int]
     pairs: Sequence[Pair] = ()
     """That are matched."""
-    progress: Progress = _unwatched
-    """Called with the fraction done and a message."""
+    progress: StageProgress = unwatched
     options: BundleOptions = GLOBAL_OPTIONS
 
     @staticmethod
-    def of(tracker: Tracker, progress: Progress | None = None) -> "KeyframeMatches":
+    def of(tracker: Tracker, progress: StageProgress = unwatched) -> "KeyframeMatches":
         """Those of all keyframes. The first pose stays, or, in the world of a saved map, all that
         is of the keyframes it holds."""
         segment = tracker.segment
         free_pose = segment.free if segment.fixed else segment.ids[1:]
         return KeyframeMatches(
-            tracker, free_pose, segment.free, global_pairs(tracker), progress or _unwatched,
-            GLOBAL_OPTIONS,
-        )  # fmt: skip
+            tracker, free_pose, segment.free, global_pairs(tracker), progress, GLOBAL_OPTIONS
+        )
 
     @property
     def keyframes(self) -> KeyframeSet:
@@ -101,7 +97,7 @@ class KeyframeMatches:
                 break
             for start in range(0, len(stale), batch):
                 graph.measure(stale[start : start + batch], fine=fine, packed=True)
-                self.progress((n + start / len(stale)) / ROUNDS, "matching all keyframes")
+                self.progress(STAGE, (n + start / len(stale)) / ROUNDS)
             self.adjust()
             graph.update_dynamic(set(self.free_depth), self.tracker.config.moving)
             odometry.update_scale_by_all()
@@ -131,7 +127,7 @@ def global_pairs(tracker: Tracker) -> list[Pair]:
         [],
         RADIUS,
         SUPPRESSION,
-        MAX_DISTANCE * max(grid.camera.width, grid.camera.height),
+        MAX_DISTANCE * grid.camera.long_edge,
         PAIRS * len(ids),
     )
     wanted, fixed = set(ids), set(tracker.segment.fixed)

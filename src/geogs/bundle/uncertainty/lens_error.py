@@ -182,7 +182,7 @@ class LensEvidence:
         def decrease(size: Float[Tensor, "2"]) -> float:
             return float(2 * gradient @ size - size @ information @ size)
 
-        best = decrease(_estimate(information[None], gradient[None]).size)
+        best = decrease(self.bend.size)
         return decrease(other.bend.size) / best if best > 0 else 0.0
 
     @property

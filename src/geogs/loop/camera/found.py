@@ -55,9 +55,8 @@ class FoundLenses:
         shift_frames(log, keyframes, sizes)
 
     def views(self, camera: Camera) -> FrameViews:
-        """How its frames are straightened."""
-        if self.lens is None:
-            return FrameViews(StraightView.of_pinhole(camera))
+        """How frames of a lens that was found are straightened."""
+        assert self.lens is not None
         each = torch.tensor([o.sizes for o in self.own.values()] or [FrameLens().sizes])
         focal, right, down = each.double().square().mean(0).sqrt().tolist()
         lens = replace(self.lens, varies_focal=focal, varies_centre=math.hypot(right, down))

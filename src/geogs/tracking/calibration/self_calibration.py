@@ -78,7 +78,7 @@ def self_calibrate(
     images = (cv2.resize(f.image, size, interpolation=cv2.INTER_AREA) for f in frames)
     gatherer = ViewGatherer(images, grid, operator)
     failures: list[str] = []
-    tries = 1 if before else STRETCHES
+    tries = STRETCHES if before is None else 1
     while len(failures) < tries and not (failures and gatherer.is_over):
         stretch = Stretch(grid, operator, gatherer, radial, part_of(report, len(failures)))
         found = stretch.ask() if before is None else stretch.ask_again(before)

@@ -27,6 +27,7 @@ MIN_PARALLAX = 0.003
 deviations of a match, from which on views can be placed. Whether they tell the focal length their
 adjustment says (docs/notebook/calibration.md)."""
 MIN_VIEWS = 4
+NOT_FOLLOWED = "its motion could not be followed"
 
 Report = Callable[[float], None]
 
@@ -68,7 +69,7 @@ class Stretch:
         if isinstance(start, Degeneracy):
             return start.value
         bundle = GrowingBundle.begun(self.grid, self.operator, self._views, start)
-        said: Estimate | str = "its motion could not be followed"
+        said: Estimate | str = NOT_FOLLOWED
         while True:
             for view in self._views[len(bundle) :]:
                 self._tick()
@@ -86,23 +87,24 @@ class Stretch:
                 return said
 
     def ask_again(self, before: PlacedViews) -> Estimate | str:
-        """What views that were placed before say of the lens of images that are nearly straight:
-        they are matched from there, and adjusted."""
+        """Estimate by views that were placed before, of images that are nearly straight since: they
+        are matched from there, and adjusted."""
         views = self._gatherer.again(before.frames, self._tick)
         if len(views) < len(before.frames):
             return "the video has fewer images than before"
         lens = RadialLens(self.grid.camera)
         bundle = GrowingBundle(self.grid, self.operator, views, lens, before)
         if not self._adjusted(bundle, fine=True):
-            return "its motion could not be followed"
+            return NOT_FOLLOWED
         return estimate(bundle, self.radial)
 
     def _adjusted(self, bundle: GrowingBundle, fine: bool) -> bool:
         """Whether views were matched and adjusted."""
         bundle.measure(fine, self._tick)
-        is_adjusted = bundle.adjust(self.radial)
+        if not bundle.adjust(self.radial):
+            return False
         self.placed = bundle.placed
-        return is_adjusted
+        return True
 
     def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
