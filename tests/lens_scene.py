@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
@@ -14,9 +14,7 @@ CAMERA = Camera(fx=70.0, fy=72.0, cx=39.0, cy=29.0, width=80, height=60)
 GRID = SampleGrid(CAMERA)
 
 
-def lens_problem(
-    lens: RadialLens, frames: int = 5, noise: float = 0.0, seed: int = 0
-) -> BundleProblem:
+def lens_problem(lens: Camera, frames: int = 5, noise: float = 0.0, seed: int = 0) -> BundleProblem:
     """Views of smooth random depth about 2 units away; noise in pixels, weights to match."""
     g = torch.Generator().manual_seed(7)
     size = torch.tensor([0.25, 0.25, 0.25, 0.12, 0.12, 0.12], dtype=torch.float64)

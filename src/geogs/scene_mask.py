@@ -1,22 +1,13 @@
 """Mask of the pixels that may show the scene."""
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool
 
 from geogs.camera.straight_view import StraightView
-from geogs.geometry.camera import Camera
 from geogs.tracking.flow.masked import valid_pixels
-from geogs.types import FoundLens
 from geogs.world.keyframes import Keyframe
-
-
-@functools.lru_cache(maxsize=1)
-def _view(camera: Camera, lens: FoundLens) -> StraightView:
-    """One view for all keyframes, which keeps what it has computed."""
-    return StraightView(camera, lens)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +23,9 @@ class SceneMask:
 
         Pixels of a straightened image that the lens did not see are not valid.
         """
-        table = keyframe.table
-        fixed = self.fixed
-        if table.lens is not None:
-            view = _view(table.camera, table.lens)
-            own = table.frame_lenses.get(keyframe.id)
-            fixed = self._straight(view if own is None else view.of_frame(own))
+        view, fixed = keyframe.table.view_of(keyframe.id), self.fixed
+        if view is not None:
+            fixed = self._straight(view)
         if not self.black_is_masked:
             return fixed
         valid = valid_pixels(keyframe.image)

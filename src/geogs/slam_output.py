@@ -19,6 +19,7 @@ from geogs.mapping.rendered import MapRenderer, RenderedView
 from geogs.pose_estimate import PoseEstimate
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.frames.straight_rows import straight_rows
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.segment_trackers import Segments
 from geogs.types import (
@@ -48,7 +49,7 @@ class SlamOutput:
     @property
     def camera(self) -> Camera:
         """Pinhole of all images."""
-        return self.world.keyframes.grid.camera
+        return self.world.keyframes.camera
 
     @property
     def frames(self) -> int:
@@ -155,8 +156,10 @@ class SlamOutput:
     def rows(self) -> dict[int, SeenRows]:
         """When and where the rows of keyframes, by id, were seen, for those that were rectified."""
         segment = self.segments.main.segment
-        known = segment.frames.rows
-        return {k.id: known[k.frame_index] for k in segment.keyframes if k.frame_index in known}
+        known, view_of = segment.frames.rows, segment.keyframes.table.view_of
+        seen = [(k.id, known[k.frame_index]) for k in segment.keyframes if k.frame_index in known]
+        views = {id: view for id, _ in seen if (view := view_of(id)) is not None}
+        return {id: straight_rows(r, views[id]) if id in views else r for id, r in seen}
 
     # --- the map -------------------------------------------------------------------------------
 

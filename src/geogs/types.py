@@ -189,11 +189,6 @@ class FrameLens:
         """All three."""
         return self.focal, self.right, self.down
 
-    def plus(self, other: "FrameLens") -> "FrameLens":
-        """The sum of two deviations."""
-        right, down = self.right + other.right, self.down + other.down
-        return FrameLens(self.focal + other.focal, right, down)
-
 
 FrameState = Literal["tracked", "orientation only", "lost"]
 """What is known of a frame: its pose, its orientation alone, or nothing."""

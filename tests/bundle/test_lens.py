@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.lens import LensBlock, RadialLens, lens_rays
+from geogs.bundle.lens import LensBlock, lens_rays
 from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import retract
 from lens_scene import CAMERA, GRID, lens_problem
@@ -15,10 +15,10 @@ from oracles.lens_reference import linearised
 
 @pytest.mark.parametrize("distortion", [(0.0, 0.0), (0.15, -0.2), (-0.2, 0.05)])
 def test_jacobians_match_autograd(distortion):
-    p = lens_problem(RadialLens(CAMERA, *distortion))
+    p = lens_problem(CAMERA.moved(0.0, *distortion))
     T = relative_motion(p.T_cw, p.source, p.target)[:1]
     pixels, d = GRID.pixels.double(), p.inverse_depth[:1].double()
-    block = LensBlock(RadialLens(CAMERA, *distortion), pixels)
+    block = LensBlock(CAMERA.moved(0.0, *distortion), pixels)
     seen, by, by_depth = linearised(block, p.T_cw, p.source[:1], p.target[:1], d)
 
     def moved(xi, unknowns, delta):
@@ -38,7 +38,7 @@ def test_jacobians_match_autograd(distortion):
 
 
 def test_the_lens_is_that_of_opencv():
-    lens = RadialLens(CAMERA, -0.12, 0.03)
+    lens = CAMERA.moved(0.0, -0.12, 0.03)
     K, distortion = CAMERA.matrix().numpy(), np.array([-0.12, 0.03, 0, 0])
     pixels = GRID.pixels.double()
     rays = lens_rays(lens, pixels).rays

@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
+from geogs.geometry.camera import Camera
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
 from oracles import lens_reference
 from oracles.pinhole_flow import PinholeFlow
@@ -18,7 +19,7 @@ HUBER = 2.0
 OPTIONS = BundleOptions(huber=HUBER, depth_damping=0.0)
 
 
-def problem_of(lens: RadialLens) -> BundleProblem:
+def problem_of(lens: Camera) -> BundleProblem:
     """One of whose cells some are behind their targets and some have no match."""
     problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.05, 0.1)
     T, d, weight = (x.clone() for x in (problem.T_cw, problem.inverse_depth, problem.weight))
@@ -37,7 +38,7 @@ def close(found: torch.Tensor, wanted: torch.Tensor) -> bool:
 @pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
 @pytest.mark.parametrize("shared", ["lens", "lens and more", "more", "nothing"])
 def test_equations_are_those_of_plain_pytorch(distortion, shared):
-    lens = RadialLens(CAMERA, *distortion)
+    lens = CAMERA.moved(0.0, *distortion)
     problem, block = problem_of(lens), LensBlock(lens, GRID.pixels)
     g = torch.Generator().manual_seed(2)
     e, *cells = problem.pixels.shape
@@ -70,7 +71,7 @@ def test_equations_are_those_of_plain_pytorch(distortion, shared):
 @pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
 @pytest.mark.parametrize("huber", [0.3, 30.0])
 def test_the_cost_is_that_of_plain_pytorch(distortion, huber):
-    lens = RadialLens(CAMERA, *distortion)
+    lens = CAMERA.moved(0.0, *distortion)
     problem, block = problem_of(lens), LensBlock(lens, GRID.pixels)
     state = BundleState(problem.T_cw, problem.inverse_depth, block)
     found = LensFlow().cost(problem, state, huber)
@@ -78,10 +79,10 @@ def test_the_cost_is_that_of_plain_pytorch(distortion, huber):
 
 
 def test_depths_after_a_step_are_those_of_plain_pytorch():
-    problem, g = problem_of(RadialLens(CAMERA)), torch.Generator().manual_seed(3)
+    problem, g = problem_of(CAMERA), torch.Generator().manual_seed(3)
     xi = 0.01 * torch.randn(len(problem.T_cw), 6, generator=g, dtype=torch.float64)
     options = replace(OPTIONS, depth_damping=1e-3)
-    sources = LensFlow.of_pinhole(GRID).sources(problem, problem.start, options)
+    sources = LensFlow.of(GRID).sources(problem, problem.start, options)
     plain = PinholeFlow(GRID.camera, GRID.rays).depths_after(problem, problem.start, xi, options)
     for source, (frame, wanted) in zip(sources, plain, strict=True):
         assert source.frame == frame

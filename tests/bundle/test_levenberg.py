@@ -67,7 +67,7 @@ def costs(grid: SampleGrid, problem: BundleProblem, device: torch.device) -> dic
     there = on(problem, device)
     steps = cuda_dense._DenseSteps(bundle, there, options)
     many = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
-    flow = LensFlow.of_pinhole(grid)
+    flow = LensFlow.of(grid)
     state = problem.start
     return {
         "dense": DenseSchur(problem, flow, options).cost(state),
@@ -95,7 +95,7 @@ def test_cost_is_that_of_the_reference(behind, device, monkeypatch):
 def test_cost_falls_as_the_equations_say():
     """Along a step s the cost changes by -2 g s, g being the right-hand sides."""
     grid, problem = told(0.01, 0.02)
-    schur = DenseSchur(problem, LensFlow.of_pinhole(grid), LEVENBERG)
+    schur = DenseSchur(problem, LensFlow.of(grid), LEVENBERG)
     state, small = problem.start, 2e-3
     linear = schur.linearise(state)
     step = schur.step(state, linear, 1e-4)
@@ -138,7 +138,7 @@ def solvers(grid: SampleGrid, problem: BundleProblem, device: torch.device):
 
 def cost_of(grid: SampleGrid, problem: BundleProblem, T: Tensor, d: Tensor) -> float:
     moved = replace(problem, T_cw=T, inverse_depth=d.cpu())
-    return DenseSchur(moved, LensFlow.of_pinhole(grid), LEVENBERG).cost(moved.start)
+    return DenseSchur(moved, LensFlow.of(grid), LEVENBERG).cost(moved.start)
 
 
 def test_steps_from_afar_never_raise_the_cost(device):
@@ -199,7 +199,7 @@ class Indefinite:
 def test_what_has_no_solution_is_damped_until_it_has(device):
     grid, truth = scene()
     problem = disturbed(truth, 0.02, 0.05)
-    schur = DenseSchur(problem, LensFlow.of_pinhole(grid), LEVENBERG)
+    schur = DenseSchur(problem, LensFlow.of(grid), LEVENBERG)
     size = float(schur.linearise(problem.start).system.hessian.diagonal().max())
     problem = replace(problem, pose_terms=(Indefinite(torch.tensor([2, 3]), 3e-3 * size),))
     before = cost_of(grid, problem, problem.T_cw, problem.inverse_depth)

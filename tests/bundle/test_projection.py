@@ -1,5 +1,6 @@
 """Projection and its derivatives against autograd and finite differences."""
 
+import pytest
 import torch
 
 from bundle_scenes import CAMERA, scene
@@ -8,14 +9,15 @@ from geogs.geometry.lie import retract
 from oracles.bundle_reference import reproject
 
 
-def test_jacobians_match_autograd_and_finite_differences():
-    grid, p = scene()
+@pytest.mark.parametrize("bend", [(0.0, 0.0), (0.1, -0.15), (-0.2, 0.05)])
+def test_jacobians_match_autograd_and_finite_differences(bend):
+    camera, (grid, p) = CAMERA.moved(0.0, *bend), scene()
     T = relative_motion(p.T_cw, p.source, p.target)[:1]
     rays, d = grid.rays.double(), p.inverse_depth[:1].double()
-    fast = linearise(CAMERA, rays, T, d)
+    fast = linearise(camera, rays, T, d)
 
     def moved(xi, delta):
-        return reproject(CAMERA, rays, retract(xi, T[0]), d[0] + delta)[0]
+        return reproject(camera, rays, retract(xi, T[0]), d[0] + delta)[0]
 
     zero = torch.zeros(6, dtype=torch.float64), torch.zeros(grid.size, dtype=torch.float64)
     Jx, Jd = torch.autograd.functional.jacobian(moved, zero)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from geogs.bundle.flow_term import linearised_sources
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.shared import OPTIONS, SharedSchur, solve_shared
@@ -19,7 +19,7 @@ from oracles.pinhole_flow import PinholeFlow
 
 
 def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
-    lens = RadialLens(CAMERA)
+    lens = CAMERA
     problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.01, 0.03)
     options = BundleOptions(huber=1.0, depth_damping=1e-3)
     state = BundleState(problem.T_cw, problem.inverse_depth, LensBlock(lens, GRID.pixels))
@@ -40,7 +40,7 @@ def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
 
 @pytest.mark.parametrize("huber", [0.5, 50.0])
 def test_one_step_matches_the_dense_equations(huber):
-    lens = RadialLens(CAMERA, 0.05, -0.03)
+    lens = CAMERA.moved(0.0, 0.05, -0.03)
     problem = disturbed(lens_problem(lens.moved(0.02, 0.01, 0.01), frames=3), 0.01, 0.03)
     xi, unknowns, delta = gauss_newton_step(
         problem, CAMERA, GRID.pixels, (0.05, -0.03), huber, 1e-5
@@ -65,16 +65,16 @@ def test_one_step_matches_the_dense_equations(huber):
 
 
 def test_recovers_focal_length_and_radial_terms():
-    truth = RadialLens(CAMERA, -0.2, 0.05)
+    truth = CAMERA.moved(0.0, -0.2, 0.05)
     start = disturbed(lens_problem(truth), 0.01, 0.05)
-    guess = RadialLens(CAMERA).moved(math.log(1.25))
+    guess = CAMERA.moved(math.log(1.25))
     options = replace(OPTIONS, iterations=40, huber=100.0)
     block = LensBlock(guess, GRID.pixels, radial=True)
     result = solve_shared(start, block, options, least_decrease=1e-9)
     assert result.finite
     found = result.block.lens
-    assert abs(found.camera.fx / CAMERA.fx - 1) < 1e-3
-    assert abs(found.camera.fy / CAMERA.fy - 1) < 1e-3
+    assert abs(found.fx / CAMERA.fx - 1) < 1e-3
+    assert abs(found.fy / CAMERA.fy - 1) < 1e-3
     assert abs(found.k1 + 0.2) < 1e-3
     assert abs(found.k2 - 0.05) < 1e-3
 
@@ -82,10 +82,10 @@ def test_recovers_focal_length_and_radial_terms():
 def test_deviations_are_those_of_repeated_measurements():
     errors, deviations = [], []
     for seed in range(16):
-        problem = lens_problem(RadialLens(CAMERA), frames=8, noise=0.3, seed=seed)
-        result = solve_shared(problem, LensBlock(RadialLens(CAMERA), GRID.pixels, radial=True))
+        problem = lens_problem(CAMERA, frames=8, noise=0.3, seed=seed)
+        result = solve_shared(problem, LensBlock(CAMERA, GRID.pixels, radial=True))
         lens = result.block.lens
-        errors.append([math.log(lens.camera.fx / CAMERA.fx), lens.k1, lens.k2])
+        errors.append([math.log(lens.fx / CAMERA.fx), lens.k1, lens.k2])
         deviations.append(result.covariance.diagonal().sqrt().tolist())
     actual = np.sqrt(np.square(errors).mean(0))
     said = np.sqrt(np.square(deviations).mean(0))
@@ -94,8 +94,8 @@ def test_deviations_are_those_of_repeated_measurements():
 
 
 def test_what_is_no_variable_stays():
-    problem = lens_problem(RadialLens(CAMERA, 0.05).moved(0.1))
-    lens = RadialLens(CAMERA, 0.05)
+    problem = lens_problem(CAMERA.moved(0.0, 0.05).moved(0.1))
+    lens = CAMERA.moved(0.0, 0.05)
     fixed = solve_shared(problem, LensBlock(lens, GRID.pixels, focal=False))
     assert fixed.block.lens == lens
     assert not fixed.covariance.any()
@@ -103,12 +103,12 @@ def test_what_is_no_variable_stays():
     focal = solve_shared(problem, LensBlock(lens, GRID.pixels))
     assert focal.block.lens.k1 == 0.05
     assert float(focal.covariance[1, 1]) == 0
-    assert focal.block.lens.camera.fx > 1.05 * CAMERA.fx
+    assert focal.block.lens.fx > 1.05 * CAMERA.fx
 
 
 def test_matches_that_are_not_finite_are_reported():
-    problem = lens_problem(RadialLens(CAMERA))
+    problem = lens_problem(CAMERA)
     problem.pixels[0, 0] = torch.nan
-    result = solve_shared(problem, LensBlock(RadialLens(CAMERA), GRID.pixels))
+    result = solve_shared(problem, LensBlock(CAMERA, GRID.pixels))
     assert not result.finite
-    assert result.block.lens == RadialLens(CAMERA)
+    assert result.block.lens == CAMERA

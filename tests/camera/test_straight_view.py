@@ -102,19 +102,6 @@ def test_what_the_lens_did_not_see_is_known():
     assert StraightView(CAMERA, FoundLens(-0.1, 0.0, 0.001, 0.001)).is_seen.all()
 
 
-def test_two_lenses_in_turn_are_one():
-    first = FoundLens(0.09, -0.18, 0.01, 0.01, 0.95, 0.03, 0.02, -0.03, 0.004)
-    then = FoundLens(0.03, -0.04, 0.1, 0.2, right=0.001, down=0.002, deviation_centre=0.003)
-    both = StraightView(CAMERA, first).followed_by(then)
-    assert (both.deviation_k1, both.deviation_k2, both.deviation_focal) == (0.1, 0.2, 0.03)
-    pixels = torch.tensor([[c, r] for r, c in PLACES], dtype=torch.float64)
-    inner = StraightView(CAMERA, then).bent(pixels)
-    wanted = StraightView(CAMERA, first).bent(inner)
-    assert both.deviation_centre == 0.003
-    np.testing.assert_allclose(StraightView(CAMERA, both).bent(pixels), wanted, atol=0.04)
-    assert float((StraightView(CAMERA, first).bent(pixels) - wanted).abs().max()) > 0.1
-
-
 def test_the_lens_is_that_of_the_matches():
     """To first order: a pinhole's pixel less the one that is seen, as the adjustment has it."""
     lens = FoundLens(1e-3, -2e-3, 0.001, 0.001, right=2e-3, down=-1e-3)

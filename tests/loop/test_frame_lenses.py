@@ -6,23 +6,21 @@ import torch
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes
-from geogs.bundle.uncertainty.varying_intrinsics import OWN, VaryingPrior
+from geogs.bundle.uncertainty.varying_intrinsics import VaryingPrior
 from geogs.camera.straight_view import StraightView
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.camera import frame_lenses
-from geogs.loop.camera import lens as lens_correction
-from geogs.loop.camera.found import FoundLenses
+from geogs.loop.camera.found import FrameLenses
 from geogs.loop.camera.frame_lenses import correct_frame_lenses
 from geogs.loop.global_bundle import global_bundle
 from geogs.loop.keyframe_matches import KeyframeMatches
 from geogs.scene_mask import SceneMask
-from geogs.tracking.frame_lenses import shift_frames, sizes_of_frames
+from geogs.tracking.frame_lenses import shift_frames, shifts_of_own, sizes_of_frames
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import solved_poses
 from geogs.tracking.tracker import Tracker
-from geogs.types import FlowMatch, FoundLens, SeenRows
+from geogs.types import FlowMatch, FrameLens, SeenRows
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameRecord, Observation
 from geogs.world.grid import SampleGrid
@@ -45,43 +43,20 @@ def walk() -> Tensor:
     return se3_inverse(T_wc)
 
 
-def seen_by(sizes: Tensor, wanted: Tensor) -> Tensor:
-    """Where a lens shows what the pinhole shows at some pixels."""
-    seen = wanted
-    for _ in range(6):
-        seen = seen + wanted - pinhole(sizes, seen)
-    return seen
-
-
-def pinhole(sizes: Tensor, pixels: Tensor) -> Tensor:
-    return pixels + torch.einsum("k,k...->...", sizes, lens_shapes(CAMERA, pixels))
+def camera_of(own: Tensor) -> Camera:
+    focal, right, down = own.tolist()
+    return CAMERA.moved(focal, right=right, down=down)
 
 
 class VaryingFlow(PlantedFlow):
-    """Matches between images whose lenses have errors of their own, until they are straight."""
+    """Matches between images whose lenses have something of their own."""
 
     def __init__(self, T: Tensor, sizes: Tensor) -> None:
-        super().__init__(GRID, T, torch.empty(0), 0.0)
-        self.is_straight = False
-        self._see(sizes)
-
-    def encode(self, image: np.ndarray) -> int:
-        if not self.is_straight and not np.array_equal(image[..., 2], NOISE):
-            self.is_straight = True
-            self._see(torch.zeros_like(self.sizes))
-        return super().encode(image)
-
-    def _see(self, sizes: Tensor) -> None:
-        self.sizes = sizes
-        self.rays, depths = [], []
-        for n, own in enumerate(sizes):
-            at = pinhole(own, GRID.pixels) - torch.tensor([CAMERA.cx, CAMERA.cy])
-            rays = torch.cat([at / CAMERA.fx, torch.ones(GRID.size, 1)], 1)
-            grid = SampleGrid(CAMERA)
-            object.__setattr__(grid, "rays", rays)
-            self.rays.append(rays)
-            depths.append(true_inverse_depth(self.T[n : n + 1], grid)[0])
-        self.d = torch.stack(depths)
+        self.cameras = [camera_of(own) for own in sizes]
+        grids = [SampleGrid(camera) for camera in self.cameras]
+        each = [true_inverse_depth(T[n : n + 1], grid)[0] for n, grid in enumerate(grids)]
+        super().__init__(GRID, T, torch.stack(each), 0.0)
+        self.rays = [grid.rays for grid in grids]
 
     def _match(self, source, target) -> FlowMatch:
         found = [self._one(i, j) for i, j in zip(source, target, strict=True)]
@@ -90,12 +65,12 @@ class VaryingFlow(PlantedFlow):
 
     def _one(self, i: int, j: int) -> tuple[Tensor, Tensor]:
         T = (self.T[j] @ se3_inverse(self.T[i]))[None]
-        p = project(CAMERA, self.rays[i], T, self.d[i][None])
+        p = project(self.cameras[j], self.rays[i], T, self.d[i][None])
         used = (p.valid & GRID.inside(p.pixels))[0]
-        wanted = torch.where(used[:, None], p.pixels[0], GRID.centre)
         g = torch.Generator().manual_seed(100 * i + j)
-        pixels = seen_by(self.sizes[j], wanted) + 0.02 * torch.randn(wanted.shape, generator=g)
-        return pixels, torch.where(used, 400.0, 0.0)[:, None].expand(-1, 2).contiguous()
+        pixels = p.pixels[0] + 0.02 * torch.randn(p.pixels[0].shape, generator=g)
+        weight = torch.where(used, 400.0, 0.0)[:, None].expand(-1, 2).contiguous()
+        return torch.where(used[:, None], pixels, GRID.centre), weight
 
 
 def image_of(number: int) -> np.ndarray:
@@ -104,10 +79,8 @@ def image_of(number: int) -> np.ndarray:
 
 def sizes_of(focal: float, centre: float) -> Tensor:
     k = torch.arange(COUNT)
-    found = torch.zeros(COUNT, SHAPES)
-    found[:, 0] = focal * torch.sin(1.1 * k)
-    found[:, OWN[1]], found[:, OWN[2]] = centre * torch.cos(1.7 * k), centre * torch.sin(2.3 * k)
-    return found
+    each = focal * torch.sin(1.1 * k), centre * torch.cos(1.7 * k), centre * torch.sin(2.3 * k)
+    return torch.stack(each, 1)
 
 
 def tracker_of(sizes: Tensor) -> tuple[Tracker, Tensor]:
@@ -144,7 +117,7 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     lens, own = table.lens, table.frame_lenses
     assert lens is not None
     found = torch.tensor([[own[n].focal, own[n].right, own[n].down] for n in range(COUNT)])
-    want = sizes[:, list(OWN)]
+    want = sizes
     found, want = found - found.mean(0), want - want.mean(0)
     assert float((found - want).square().mean().sqrt()) < 0.45 * float(want.square().mean().sqrt())
     assert lens.varies_focal == pytest.approx(focal / 2**0.5, rel=0.3)
@@ -155,26 +128,11 @@ def test_lenses_of_keyframes_are_found_and_images_straightened_by_them(monkeypat
     assert shown is None or np.array_equal(shown, view.is_seen)
 
 
-@pytest.mark.system
-def test_what_frames_have_of_their_own_is_taken_off_beside_the_lens_of_all(monkeypatch):
-    """The lens of all takes the place of what frames were corrected by."""
-    order = []
-    shift_lens, shift = lens_correction.shift_lens, FoundLenses.shift
-    monkeypatch.setattr(
-        lens_correction, "shift_lens", lambda *a: (order.append("all"), shift_lens(*a))
-    )
-    monkeypatch.setattr(FoundLenses, "shift", lambda *a: (order.append("own"), shift(*a)))
-    tracker, _ = tracker_of(sizes_of(0.02, 0.0))
-    tracker.keyframes.table.focal_deviation = 0.01
-    global_bundle(tracker, ends=True)
-    assert order == ["all", "all", "own"]
-
-
 def test_a_lens_that_stays_changes_nothing(monkeypatch):
     poses = []
     for explained in (frame_lenses.EXPLAINED, np.inf):
         monkeypatch.setattr(frame_lenses, "EXPLAINED", explained)
-        tracker, _ = tracker_of(torch.zeros(COUNT, SHAPES))
+        tracker, _ = tracker_of(torch.zeros(COUNT, 3))
         global_bundle(tracker, ends=True)
         poses.append(tracker.keyframes.poses(range(COUNT)))
         assert tracker.keyframes.table.lens is None
@@ -213,41 +171,63 @@ def test_what_is_ambiguous_is_left_to_the_verdict_where_rows_may_be_why(monkeypa
     assert bool(correct_frame_lenses(matches)) == has_rows
 
 
-def test_where_matches_tell_nothing_of_straight_images_nothing_is_found(monkeypatch):
-    tracker, _ = tracker_of(torch.zeros(COUNT, SHAPES))
+def test_where_matches_tell_nothing_more_what_was_found_stays(monkeypatch):
+    tracker, _ = tracker_of(torch.zeros(COUNT, 3))
     ids = list(range(COUNT))
     tracker.map.graph.measure([(a, a + 1) for a in ids[:-1]], packed=True)
-    before = FoundLenses(FoundLens(0.0, 0.0, 0.0, 0.0), {}, VaryingPrior((0.0, 0.01, 0.01)))
+    each = {n: FrameLens(0.0, 0.001 * n, 0.0) for n in range(COUNT)}
+    before = FrameLenses(each, VaryingPrior((0.0, 0.01, 0.01)))
     monkeypatch.setattr(frame_lenses, "said_of_frame_lenses", lambda *a: [])
     found = correct_frame_lenses(KeyframeMatches(tracker, ids[1:], ids), before)
     assert found
-    assert all(max(map(abs, own.sizes)) < 1e-6 for own in found.own.values())
+    for n, own in found.each.items():
+        assert own.sizes == pytest.approx(each[n].sizes, abs=1e-9)
+
+
+@pytest.mark.parametrize("own", [(0.1, 0.0, 0.0), (0.0, 0.05, -0.03), (-0.08, 0.03, 0.04)])
+def test_matches_of_lenses_of_their_own_become_those_of_one(own):
+    """Whatever the sizes: where nothing is carried over, up to rounding."""
+    still, lens = torch.eye(4)[None], CAMERA.moved(0.0, 0.08, -0.1)
+    grid = SampleGrid(lens)
+    depth = torch.full((1, GRID.size), 0.5)
+    T = se3_exp(torch.tensor([[0.1, 0.05, 0.1, 0.01, 0.02, 0.0]]).double())
+    seen_by = lens.moved(own[0], right=own[1], down=own[2])
+    zero, sizes = torch.zeros(3), torch.tensor(own)
+    at = project(lens, grid.rays, T, depth)
+    there = project(seen_by, grid.rays, T, depth).pixels
+    shift = shifts_of_own(lens, grid.rays, T, at, torch.stack([zero, sizes])[None])
+    assert float((there + shift - at.pixels)[at.valid].abs().max()) < 2e-3
+    seen = SampleGrid(seen_by).rays  # of the same cells, by the source's lens
+    there = project(lens, seen, still, depth).pixels
+    at = project(lens, grid.rays, still, depth)
+    shift = shifts_of_own(lens, grid.rays, still, at, torch.stack([sizes, zero])[None])
+    off, before = ((x - at.pixels).norm() for x in (there + shift, there))
+    assert off < 1e-4 * before
 
 
 def test_a_frame_between_keyframes_tells_its_own_lens():
-    tracker, T = tracker_of(torch.zeros(COUNT, SHAPES))
+    tracker, T = tracker_of(torch.zeros(COUNT, 3))
     for keyframe in tracker.keyframes:
         keyframe.information *= 1e4  # depths are exact
     keyframes, log = tracker.keyframes, tracker.map.recorder.log
-    own = torch.zeros(SHAPES)
-    own[0], own[OWN[1]] = 0.015, 0.005
+    own = torch.tensor([0.015, 0.005, 0.0])
     pose = se3_exp(torch.tensor([0.01, 0.02, 0.0, 0.01, 0.0, 0.02]).double()) @ T[3]
     record = FrameRecord(COUNT, 0.35, 3, T[4] @ se3_inverse(T[3]))
     cells = sparse_cells(GRID)
     for k in (3, 4):
         motion = (pose @ se3_inverse(T[k]))[None]
-        p = project(CAMERA, GRID.rays[cells], motion, keyframes.inverse_depths([k])[:, cells])
-        used = (p.valid & GRID.inside(p.pixels, 4.0))[0]
-        pixels = seen_by(own, p.pixels[0])
+        depth = keyframes.inverse_depths([k])[:, cells]
+        p = project(camera_of(own), GRID.rays[cells], motion, depth)
+        used, pixels = (p.valid & GRID.inside(p.pixels, 4.0))[0], p.pixels[0]
         weight = torch.where(used, 100.0, 0.0)[:, None].expand(-1, 2)
         record.observations.append(Observation(k, *pack_matches(GRID, pixels, weight)))
     log.records.append(record)
-    zero = torch.zeros(SHAPES, dtype=torch.float64)
+    zero = torch.zeros(3, dtype=torch.float64)
     known = {k.frame_index: zero for k in keyframes}
     found = sizes_of_frames(log, keyframes, known, VaryingPrior((1.0, 1.0, 1.0), 1.0))
     np.testing.assert_allclose(found[COUNT], own, atol=2e-3)
     wrong = solved_poses(log, keyframes)[COUNT]
-    shift_frames(log, keyframes, found)
+    shift_frames(log, keyframes, {n: FrameLens(*s.tolist()) for n, s in found.items()})
     right = solved_poses(log, keyframes)[COUNT]
     off = [float((T[:3, 3] - pose[:3, 3]).norm()) for T in (wrong, right)]
     assert off[1] < 0.2 * off[0]

@@ -7,7 +7,7 @@ from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.loop.camera.straightening import BentImages
+from geogs.loop.camera.straightening import straighten
 from geogs.mapping.view_arrays import MapCameras
 from geogs.types import FoundLens
 from geogs.world.grid import SampleGrid
@@ -43,7 +43,7 @@ def test_views_have_the_images_that_took_the_places_of_others():
     view = views.add(segment.add(0, 0.0, image, None, torch.eye(4, dtype=torch.float64)).id)
     before, segments = view.depth_view.grey.copy(), view.bare_segments
     view_of_lens = StraightView(CAMERA, FoundLens(0.3, 0.1, 0.01, 0.01))
-    BentImages.of(segment).straighten(FrameViews(view_of_lens))
+    straighten(segment, FrameViews(view_of_lens))
     views.arrays.forget_images()
     assert np.array_equal(view.depth_view.image, segment[0].image)
     assert not np.array_equal(view.depth_view.image, image)

@@ -35,7 +35,7 @@ def linearised(
     and the lens, (e, 2, p) by the inverse depths."""
     lens, rays, T_ji = block.lens, block.rays, relative_motion(T_cw, source, target)
     y, _, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
-    x, c, q = y[..., :2] / z[..., None], lens.camera, 1 / z
+    x, c, q = y[..., :2] / z[..., None], lens, 1 / z
     u, v = x.unbind(-1)
     R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
     tx, ty, tz = t[:, None].unbind(-1)

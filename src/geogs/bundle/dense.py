@@ -29,7 +29,7 @@ class DenseBundle:
     """Solver for one grid on the CPU; holds no state between calls."""
 
     def __init__(self, grid: SampleGrid) -> None:
-        self.flow = LensFlow.of_pinhole(grid)
+        self.flow = LensFlow.of(grid)
 
     def solve(self, problem: BundleProblem, options: BundleOptions) -> BundleResult:
         return DenseSchur(problem, self.flow, options).adjusted()

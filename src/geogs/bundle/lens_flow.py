@@ -1,7 +1,7 @@
 """The term of dense flow on the CPU, by compiled loops over the cells of each source.
 
-They are seen through a lens, whose sizes may be unknowns that all edges share; the tracker's is a
-pinhole that is known.
+They are seen through a lens, whose sizes may be unknowns that all edges share; the tracker's is
+known.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import BEHIND, SourceFlow, damped_curvature
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import MIN_Z, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -34,9 +34,9 @@ class LensFlow:
         self._known, self._further = known, further
 
     @staticmethod
-    def of_pinhole(grid: SampleGrid) -> "LensFlow":
+    def of(grid: SampleGrid) -> "LensFlow":
         """Dense flow of the cells of a grid, seen through its camera."""
-        return LensFlow(LensBlock(RadialLens(grid.camera), grid.pixels))
+        return LensFlow(LensBlock(grid.camera, grid.pixels))
 
     def sources(
         self, problem: BundleProblem, state: BundleState, options: BundleOptions
@@ -91,12 +91,10 @@ class _Edges:
     def __init__(
         self, block: LensBlock, problem: BundleProblem, T_ji: Float[Tensor, "e 4 4"]
     ) -> None:
-        lens, camera = block.lens, block.lens.camera
+        lens = block.lens
         self.motions = _float(T_ji[:, :3])
         self.rays, self.slopes = _float(block.rays.rays[:, :2].mT), _float(block.rays.slope)
-        self.lens = np.array(
-            [camera.fx, camera.fy, camera.cx, camera.cy, lens.k1, lens.k2], np.float32
-        )
+        self.lens = np.array(lens.numbers, np.float32)
         self.pixels, self.weight = _float(problem.pixels), _float(problem.weight)
 
 

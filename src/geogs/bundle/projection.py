@@ -1,10 +1,10 @@
 """Where the cells of source frames fall in their targets, and how that changes.
 
 A cell with ray X and inverse depth d lies at y = R X + d t in the target, in units of its depth in
-the source, for T_ji = (R, t). What follows from y alone is here for every camera: the tracker's
-pinhole, which is here too, the lens with unknowns (:mod:`geogs.bundle.lens`) and the batch of
-cameras of the training. Each of them multiplies the same derivatives of a point by those of its own
-image, in an order of its own: one order for all would change the last bits of results.
+the source, for T_ji = (R, t). What follows from y alone is here for every camera: the tracker's,
+which is here too, the lens with unknowns (:mod:`geogs.bundle.lens`) and the batch of cameras of the
+training. Each of them multiplies the same derivatives of a point by those of its own image, in an
+order of its own: one order for all would change the last bits of results.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.geometry.camera import Camera
+from geogs.geometry.camera import LEAST_SLOPE, Camera
 from geogs.geometry.lie import se3_inverse
 
 MIN_Z = 0.05
@@ -90,8 +90,16 @@ def project(
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
 ) -> CellProjection:
-    """Project the cells of source frames: p = pi(K y), see :func:`seen_from_targets`."""
+    """Project the cells of source frames: where the camera shows y, of :func:`seen_from_targets`.
+
+    What lies so far off the axis that radial terms fold it over is not valid.
+    """
     y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
+    if not camera.is_pinhole:
+        plane = y[..., :2] / z[..., None]
+        focal, centre = plane.new_tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]])
+        is_shown = camera.steepness(plane.square().sum(-1)) > LEAST_SLOPE
+        return CellProjection(camera.bent(plane) * focal + centre, valid & is_shown, z)
     pixels = torch.stack(
         [camera.fx * y[..., 0] / z + camera.cx, camera.fy * y[..., 1] / z + camera.cy], -1
     )
@@ -107,17 +115,24 @@ def linearise(
     """:func:`project` with the Jacobians in a left perturbation of T_ji and in d."""
     p = project(camera, rays, T_ji, inverse_depth)
     t, q = T_ji[:, :3, 3].to(inverse_depth), 1 / p.z
-    x = (p.pixels[..., 0] - camera.cx) / camera.fx
-    y = (p.pixels[..., 1] - camera.cy) / camera.fy
+    plane = camera.plane(p.pixels)
+    x, y = plane.unbind(-1)
     row_x, row_y = motion_rows(x, y, inverse_depth * q)
-    pose = torch.stack([row_x * camera.fx, row_y * camera.fy], -2)
     tx, ty, tz = t[:, None].unbind(-1)
-    depth = torch.stack([camera.fx * (tx - tz * x) * q, camera.fy * (ty - tz * y) * q], -1)
+    depth_x, depth_y = tx - tz * x, ty - tz * y
+    if not camera.is_pinhole:
+        xx, xy, yy = camera.bend_jacobian(plane)
+        depth_x, depth_y = xx * depth_x + xy * depth_y, xy * depth_x + yy * depth_y
+        xx, xy, yy = (each[:, None] for each in (xx, xy, yy))
+        row_x, row_y = xx * row_x + xy * row_y, xy * row_x + yy * row_y
+    pose = torch.stack([row_x * camera.fx, row_y * camera.fy], -2)
+    depth = torch.stack([camera.fx * depth_x * q, camera.fy * depth_y * q], -1)
     return LinearProjection(p.pixels, p.valid, p.z, pose, depth)
 
 
 def carried_over(
     camera: Camera,
+    rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     at: CellProjection,
     step: Float[Tensor, "*b e p 2"],
@@ -126,7 +141,16 @@ def carried_over(
 
     To first order; ``at`` is where the cells fall by T_ji.
     """
-    focal = at.pixels.new_tensor([camera.fx, camera.fy])
-    plane = (at.pixels - at.pixels.new_tensor([camera.cx, camera.cy])) / focal
-    moved = (T_ji[:, :3, :2].to(step) @ (step / focal).mT).mT  # as :func:`seen_from_targets` does
-    return focal * (moved[..., :2] - plane * moved[..., 2:]) / at.z[..., None]
+    focal, plane = at.pixels.new_tensor([camera.fx, camera.fy]), camera.plane(at.pixels)
+    step = step / focal
+    if not camera.is_pinhole:
+        xx, xy, yy = camera.bend_jacobian(rays[:, :2])
+        x, y = step.unbind(-1)
+        step = torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / (xx * yy - xy * xy)[:, None]
+    moved = (T_ji[:, :3, :2].to(step) @ step.mT).mT  # as :func:`seen_from_targets` does
+    off = moved[..., :2] - plane * moved[..., 2:]
+    if not camera.is_pinhole:
+        xx, xy, yy = camera.bend_jacobian(plane)
+        x, y = off.unbind(-1)
+        off = torch.stack([xx * x + xy * y, xy * x + yy * y], -1)
+    return focal * off / at.z[..., None]

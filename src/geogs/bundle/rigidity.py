@@ -45,6 +45,9 @@ def best_residuals(
 
     Returns 0 where there is no match.
     """
+    if not camera.is_pinhole:  # as a pinhole would have seen them
+        plane, focal = camera.plane(pixels), pixels.new_tensor([camera.fx, camera.fy])
+        pixels = plane * focal + pixels.new_tensor([camera.cx, camera.cy])
     if inverse_depth.is_cuda:
         from geogs.bundle.cuda import rigidity
 

@@ -42,7 +42,7 @@ class StreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
 
     def __init__(self, problem: StreamedProblem, grid: SampleGrid, options: BundleOptions) -> None:
         super().__init__(problem, options)
-        self.flow = LensFlow.of_pinhole(grid)
+        self.flow = LensFlow.of(grid)
         self.system = SparseCameraSystem(*problem.joined(), problem.free_pose)
         self.chunks: Sequence[slice] = source_chunks(problem.source, options.chunk)
 

@@ -1,4 +1,4 @@
-"""The pinhole camera with pixel centres at integer coordinates."""
+"""The camera, a pinhole or one with radial distortion; pixel centres at integer coordinates."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,10 +8,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_NEWTON_STEPS = 8
+LEAST_SLOPE = 0.1
+"""Distorted radius per radius, below which the lens folds the image over."""
+
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels of an undistorted image; the centre of pixel (0, 0) is (0, 0)."""
+    """Intrinsics in pixels; the centre of pixel (0, 0) is (0, 0).
+
+    Pixel = c + f x (1 + k1 |x|^2 + k2 |x|^4), x = (X / Z, Y / Z): OpenCV's model with k1 and k2
+    alone. Without them it is a pinhole, and images are undistorted. Only tracking takes another:
+    depth search, renderer, mesh and textures need pinholes.
+    """
 
     fx: float
     fy: float
@@ -19,11 +28,18 @@ class Camera:
     cy: float
     width: int
     height: int
+    k1: float = 0.0
+    k2: float = 0.0
 
     @property
     def long_edge(self) -> int:
         """Pixels along the longer side of the image."""
         return max(self.width, self.height)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """fx, fy, cx, cy, k1 and k2, as kernels take them."""
+        return self.fx, self.fy, self.cx, self.cy, self.k1, self.k2
 
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
@@ -42,7 +58,8 @@ class Camera:
         the scaling.
         """
         sx, sy = width / self.width, height / self.height
-        return Camera(
+        return replace(
+            self,
             fx=self.fx * sx,
             fy=self.fy * sy,
             cx=(self.cx + 0.5) * sx - 0.5,
@@ -65,13 +82,90 @@ class Camera:
         """The camera with the focal length that sees so much along its longer side."""
         return self.with_focal(self.long_edge / 2 / math.tan(math.radians(degrees / 2)))
 
+    def moved(
+        self,
+        log_focal: float,
+        k1: float = 0.0,
+        k2: float = 0.0,
+        right: float = 0.0,
+        down: float = 0.0,
+    ) -> "Camera":
+        """The camera with the focal length times ``exp(log_focal)``, ``k1`` and ``k2`` added to the
+        radial terms, and its principal point moved by so many of its focal lengths."""
+        factor = math.exp(log_focal)
+        fx, fy = factor * self.fx, factor * self.fy
+        cx, cy = self.cx + right * fx, self.cy + down * fy
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, k1=self.k1 + k1, k2=self.k2 + k2)
+
+    def moves_from(self, other: "Camera") -> tuple[float, float, float, float, float]:
+        """What :meth:`moved` makes this of another by."""
+        right, down = (self.cx - other.cx) / self.fx, (self.cy - other.cy) / self.fy
+        return math.log(self.fx / other.fx), self.k1 - other.k1, self.k2 - other.k2, right, down
+
+    # --- distortion ------------------------------------------------------------------------
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether it has no radial terms."""
+        return not (self.k1 or self.k2)
+
+    @property
+    def pinhole(self) -> "Camera":
+        """The same without radial terms."""
+        return replace(self, k1=0.0, k2=0.0)
+
+    def growth(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Factor on a ray's distance from the axis, whose square is given."""
+        return 1 + square * (self.k1 + square * self.k2)
+
+    def steepness(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Slope of the distorted radius over the radius: 1 + 3 k1 r^2 + 5 k2 r^4, at the least
+        ``LEAST_SLOPE``."""
+        return (1 + square * (3 * self.k1 + 5 * square * self.k2)).clamp(min=LEAST_SLOPE)
+
+    def bent(self, plane: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Where points x / z, y / z are shown, in focal lengths from the principal point."""
+        return plane * self.growth(plane.square().sum(-1, keepdim=True))
+
+    def straight(self, bent: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """The points x / z, y / z that are shown there; source: Newton's method on the radius."""
+        if self.is_pinhole:
+            return bent
+        s = radius = bent.norm(dim=-1, keepdim=True)
+        for _ in range(_NEWTON_STEPS):
+            square = s.square()
+            s = s - (s * self.growth(square) - radius) / self.steepness(square)
+        return bent / self.growth(s.square())
+
+    def plane(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """The points x / z, y / z that are seen at some pixels."""
+        x, y = (pixels[..., 0] - self.cx) / self.fx, (pixels[..., 1] - self.cy) / self.fy
+        return self.straight(torch.stack([x, y], -1))
+
+    def pixels(self, plane: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        """Where points x / z, y / z are seen: the inverse of :meth:`plane`."""
+        x, y = self.bent(plane).unbind(-1)
+        return torch.stack([self.fx * x + self.cx, self.fy * y + self.cy], -1)
+
+    def bend_jacobian(
+        self, plane: Float[Tensor, "*b 2"]
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+        """Derivatives of :meth:`bent`: of x by x, of either by the other, of y by y."""
+        x, y = plane.unbind(-1)
+        square = x * x + y * y
+        growth, slope = self.growth(square), 2 * self.k1 + 4 * self.k2 * square
+        return growth + slope * x * x, slope * x * y, growth + slope * y * y
+
+    # --- points ----------------------------------------------------------------------------
+
     def rays(
         self, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
     ) -> Float[Tensor, "h w 3"]:
-        """K^-1 (u, v, 1) of every pixel: the point at depth 1."""
+        """The point at depth 1 that every pixel sees; of a pinhole K^-1 (u, v, 1)."""
         u = (torch.arange(self.width, dtype=torch.float64, device=device) - self.cx) / self.fx
         v = (torch.arange(self.height, dtype=torch.float64, device=device) - self.cy) / self.fy
         v, u = torch.meshgrid(v, u, indexing="ij")
+        u, v = self.straight(torch.stack([u, v], -1)).unbind(-1)
         return torch.stack([u, v, torch.ones_like(u)], -1).to(dtype)
 
     def project(
@@ -80,6 +174,8 @@ class Camera:
         """Pixels and depths of camera-frame points; pixels mean something only where z > 0."""
         x, y, z = points.unbind(-1)
         safe = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+        if not self.is_pinhole:
+            x, y = (safe * self.bent(torch.stack([x / safe, y / safe], -1)).movedim(-1, 0)).unbind()
         return torch.stack([self.fx * x / safe + self.cx, self.fy * y / safe + self.cy], -1), z
 
     def back_project(self, depth: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w 3"]:

@@ -1,12 +1,13 @@
 """Matches between all keyframes of a tracker: measured, corrected for the camera, adjusted to."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.protocols import BundleOptions
+from geogs.geometry.camera import Camera
 from geogs.stopwatch import StageProgress, unwatched
 from geogs.tracking.frames.row_errors import in_parts
 from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
@@ -42,7 +43,7 @@ before it is gone (docs/adjustment.md)."""
 
 Measured = Mapping[Pair, PackedEdge]
 Shifts = Callable[[list[Pair]], Float[Tensor, "e p 2"]]
-"""Pixels to be added to the matches of some edges."""
+"""Pixels to be added to the matches of some edges, by the present poses and depths."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,13 @@ class KeyframeMatches:
     """That are matched."""
     progress: StageProgress = unwatched
     options: BundleOptions = GLOBAL_OPTIONS
+    measured: dict[Pair, PackedEdge] = field(default_factory=dict)
+    """The edges as they were measured; the graph has them corrected."""
+    corrections: dict[str, Shifts] = field(default_factory=dict)
+    """What is added to all matches whenever they are adjusted to, by what it corrects."""
+
+    def __post_init__(self) -> None:
+        self.measured.update(self.graph.packed)
 
     @staticmethod
     def of(tracker: Tracker, progress: StageProgress = unwatched) -> "KeyframeMatches":
@@ -66,6 +74,11 @@ class KeyframeMatches:
         return KeyframeMatches(
             tracker, free_pose, segment.free, global_pairs(tracker), progress, GLOBAL_OPTIONS
         )
+
+    @property
+    def camera(self) -> Camera:
+        """By which they are seen."""
+        return self.keyframes.grid.camera
 
     @property
     def keyframes(self) -> KeyframeSet:
@@ -82,14 +95,17 @@ class KeyframeMatches:
         """Frames between the keyframes."""
         return self.tracker.map.recorder.log
 
-    def measure(self, fine: bool) -> None:
+    def measure(self, fine: bool, anew: bool = True) -> None:
         """Measure all pairs and adjust everything, from round to round those that have moved.
 
         At full resolution where it is ``fine``, else at half of it; small images always at full.
+        If not ``anew``, pairs that have not moved since they were measured stay.
         """
         graph, odometry = self.graph, self.tracker.map.odometry
         batch = MATCHED_TOGETHER[self.keyframes.grid.on_gpu]
-        graph.edges.clear()
+        if anew:
+            graph.edges.clear()
+            self.measured.clear()
         for n in range(ROUNDS if self.pairs else 0):
             # Pairs of a keyframe one after the other: images of old ones are read from a file.
             stale = sorted(graph.stale(self.pairs, REMEASURE))
@@ -98,23 +114,30 @@ class KeyframeMatches:
             for start in range(0, len(stale), batch):
                 graph.measure(stale[start : start + batch], fine=fine, packed=True)
                 self.progress(STAGE, (n + start / len(stale)) / ROUNDS)
+            both = {*stale, *((j, i) for i, j in stale)}
+            self.measured.update({e: v for e, v in graph.packed.items() if e in both})
             self.adjust()
             graph.update_dynamic(set(self.free_depth), self.tracker.config.moving)
             odometry.update_scale_by_all()
 
     def adjust(self, most: int | None = None) -> None:
-        """Solve for the free poses and depths, by that many steps at most."""
+        """Solve for the free poses and depths, by that many steps at most, with all matches as
+        they are corrected now."""
+        if self.corrections:
+            self.graph.edges.update(self.corrected())
         steps = min(self.options.iterations, most or self.options.iterations)
         options = replace(self.options, iterations=steps)
         self.graph.adjust(list(self.graph.edges), self.free_pose, self.free_depth, options)
 
-    def correct(self, measured: Measured, shifts: Shifts, most: int | None = None) -> None:
-        """Have edges as they were measured, with their matches shifted, and adjust again."""
-        grid = self.keyframes.grid
-        for part in in_parts(sorted(measured), grid.on_gpu):
-            for pair, shift in zip(part, shifts(part), strict=True):
-                self.graph.edges[pair] = measured[pair].moved(grid.camera, shift)
-        self.adjust(most)
+    def corrected(self, but: str = "") -> Measured:
+        """The edges with all corrections, or all but one."""
+        grid, shifts = self.keyframes.grid, [s for n, s in self.corrections.items() if n != but]
+        found = dict(self.measured)
+        for part in in_parts(sorted(found) if shifts else [], grid.on_gpu):
+            total = sum((each(part) for each in shifts[1:]), shifts[0](part))
+            for pair, shift in zip(part, total, strict=True):
+                found[pair] = found[pair].moved(grid.camera, shift)
+        return found
 
 
 def global_pairs(tracker: Tracker) -> list[Pair]:

@@ -146,8 +146,8 @@ class ViewArrays:
     def set_depth(self, id: int, depth: DenseDepth) -> None:
         """Set the dense depth, and the losses' constants that depend on it."""
         keyframe, mask, render = self.keyframes[id], self.mask(id), self.cameras.render
-        if keyframe.moving is not None:
-            moving = keyframe.grid.enlarged(keyframe.moving, render.width, render.height)
+        if (moving := keyframe.shown_moving) is not None:
+            moving = keyframe.grid.enlarged(moving, render.width, render.height)
             depth = depth.unknown_in(moving)
         if mask is not None:
             depth = depth.within(mask)

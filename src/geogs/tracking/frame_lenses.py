@@ -8,9 +8,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.bundle.flow_term import weighed_residuals
-from geogs.bundle.projection import linearise, project
+from geogs.bundle.projection import CellProjection, linearise, project
 from geogs.bundle.uncertainty.lens_error import SHAPES, lens_shapes, shifts_of_edges
 from geogs.bundle.uncertainty.varying_intrinsics import COUNTS, OWN, VaryingPrior
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.frames.frame_recorder import sparse_cells
 from geogs.tracking.frames.pose_filling import (
@@ -19,6 +20,7 @@ from geogs.tracking.frames.pose_filling import (
     seen_by_keyframes,
     solved_poses,
 )
+from geogs.types import FrameLens
 from geogs.world.edges import in_steps, unpacked_positions
 from geogs.world.frames import FrameLog
 from geogs.world.keyframes import KeyframeSet
@@ -26,7 +28,8 @@ from geogs.world.keyframes import KeyframeSet
 STEPS = 5
 """Of Gauss and Newton, of each frame's pose and lens together."""
 
-Sizes = Float64[Tensor, "5"]
+Sizes = Float64[Tensor, "3"]
+"""Of what a frame's lens has of its own: ``FrameLens.sizes``."""
 
 
 def sizes_of_frames(
@@ -35,12 +38,12 @@ def sizes_of_frames(
     of_keyframes: Mapping[int, Sizes],
     varies: VaryingPrior,
 ) -> dict[int, Sizes]:
-    """Errors of the lenses of all frames that have a place, by their indices.
+    """What the lenses of all frames that have a place have of their own, by their indices.
 
     Args:
         log: frames, with what was found of them in keyframes.
-        of_keyframes: errors of the lenses of keyframes, by the indices of their frames; they are
-            taken for right, and so are poses and depths.
+        of_keyframes: the same of keyframes, by the indices of their frames; it is taken for right,
+            and so are poses and depths.
         varies: by how much the lens of a frame differs from those of the keyframes around,
             interpolated.
     """
@@ -53,7 +56,7 @@ def sizes_of_frames(
     each = [np.interp(at, known_at, column) for column in table.T]
     expected = torch.from_numpy(np.stack(each, 1))
     sizes = {**of_keyframes, **dict(zip(between, expected, strict=True))}
-    place, own = {n: k for k, n in enumerate(between)}, list(OWN)
+    place = {n: k for k, n in enumerate(between)}
     inverse = varies.between(known_at, at).square().reciprocal()
     prior = torch.diag_embed(torch.cat([inverse.new_zeros(len(at), 6), inverse], 1))
     for _ in range(STEPS if between else 0):
@@ -62,7 +65,7 @@ def sizes_of_frames(
             for n, e in zip(frames, equations, strict=True):
                 if n in place:
                     A[place[n]] += COUNTS * e
-        off = torch.stack([sizes[n] for n in between])[:, own] - expected[:, own]
+        off = torch.stack([sizes[n] for n in between]) - expected
         right = A[..., 9:] - prior @ torch.cat([off.new_zeros(len(off), 6), off], 1)[..., None]
         damping = 1e-9 * (1 + A[..., :9].diagonal(dim1=1, dim2=2).amax(1))
         step = torch.linalg.solve(
@@ -70,20 +73,44 @@ def sizes_of_frames(
         )[..., 0]
         for n, s in zip(between, step, strict=True):
             poses[n] = se3_exp(s[:6]) @ poses[n]
-            sizes[n] = sizes[n].index_add(0, torch.tensor(own), s[6:])
+            sizes[n] = sizes[n] + s[6:]
     return sizes
 
 
-def shift_frames(log: FrameLog, keyframes: KeyframeSet, sizes: Mapping[int, Sizes]) -> None:
-    """Correct what was found of frames by the lenses of both, beside what it was corrected by."""
+def shift_frames(log: FrameLog, keyframes: KeyframeSet, lenses: Mapping[int, FrameLens]) -> None:
+    """Correct what was found of frames by what the lenses of both have of their own."""
+    sizes = {n: torch.tensor(lens.sizes).double() for n, lens in lenses.items()}
     poses = solved_poses(log, keyframes)
     grid = keyframes.grid
     for part, ids in seen_by_keyframes(log, keyframes):
         frames = [record.index for record, _ in part]
         _, shift = _shifts(keyframes, ids, frames, poses, sizes)
         for (_, observation), step in zip(part, in_steps(grid.camera, shift), strict=True):
-            before = observation.shift
-            observation.shift = step if before is None else before + step
+            observation.lens_shift = step
+
+
+def shifts_of_own(
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    at: CellProjection,
+    own: Float[Tensor, "e 2 3"],
+) -> Float[Tensor, "e p 2"]:
+    """What is to be added to where cells were found, as if the lens of all had seen both images.
+
+    Args:
+        camera: that of all.
+        rays: of the cells.
+        T_ji: from the camera of each edge's source to that of its target.
+        at: where the cells fall.
+        own: what the lenses of each edge's source and target have of their own.
+    """
+    # Whatever the size, but for the step of the cell, which is carried over to first order.
+    (source, target), sizes = own.unbind(1), own.new_zeros(len(own), 2, SHAPES)
+    sizes[:, 0, list(OWN)] = torch.cat([-(-source[:, :1]).expm1(), source[:, 1:]], 1)
+    factor = target[:, :1].exp()
+    sizes[:, 1, list(OWN)] = torch.cat([target[:, :1].expm1(), factor * target[:, 1:]], 1)
+    return shifts_of_edges(camera, rays, T_ji, at, sizes)
 
 
 def _shifts(
@@ -98,13 +125,13 @@ def _shifts(
     cells = sparse_cells(grid)
     T = torch.stack([poses[n] for n in frames]) @ se3_inverse(keyframes.poses(ids))
     at = project(grid.camera, grid.rays[cells], T, keyframes.inverse_depths(ids)[:, cells])
-    zero = torch.zeros(SHAPES, dtype=torch.float64)
+    zero = torch.zeros(len(OWN), dtype=torch.float64)
     both = [
         torch.stack([sizes.get(keyframes[k].frame_index, zero), sizes.get(n, zero)])
         for k, n in zip(ids, frames, strict=True)
     ]
     each = torch.stack(both).to(at.pixels)
-    return T, shifts_of_edges(grid.camera, grid.rays[cells], T, at, each)
+    return T, shifts_of_own(grid.camera, grid.rays[cells], T, at, each)
 
 
 def _equations(
@@ -123,7 +150,7 @@ def _equations(
         weight = torch.stack([o.half_weight for _, o in part]).float()
         information = keyframes.informations(ids)[:, cells]
         weight = depth_aware_weight(weight, p.depth_jacobian, information)
-        found = unpacked_positions(grid, torch.stack([o.shifted for _, o in part]))
+        found = unpacked_positions(grid, torch.stack([o.of_one_time for _, o in part]))
         r, w = weighed_residuals(p, found + shift, weight, HUBER)
         lens = -lens_shapes(grid.camera, p.pixels)[own].permute(1, 0, 3, 2)
         J = torch.cat([p.pose_jacobian, lens], 1).flatten(2)

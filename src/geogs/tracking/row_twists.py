@@ -181,7 +181,7 @@ def _of_frames(
     cells = sparse_cells(grid)
     for part, ids in seen_by_keyframes(log, keyframes):
         target = [record.index for record, _ in part]
-        found = torch.stack([o.shifted if are_corrected else o.position for _, o in part])
+        found = torch.stack([o.shifted if are_corrected else o.of_one_lens for _, o in part])
         yield _Matches(
             [keyframes[k].frame_index for k in ids], target,
             errors.poses(target) @ se3_inverse(keyframes.poses(ids)), grid.rays[cells],

@@ -34,12 +34,24 @@ class Observation:
     position: Int16[Tensor, "s 2"]
     half_weight: Annotated[Float16[Tensor, "s 2"], Range(0)]
     shift: Int16[Tensor, "s 2"] | None = None
-    """Steps to be added to the position, for the rows of a rolling shutter and the lens."""
+    """Steps to be added to the position, for the rows of a rolling shutter."""
+    lens_shift: Int16[Tensor, "s 2"] | None = None
+    """And for what the lenses of frames have of their own."""
+
+    @property
+    def of_one_lens(self) -> Int16[Tensor, "s 2"]:
+        """The position as if the lens of all had seen it."""
+        return self.position if self.lens_shift is None else self.position + self.lens_shift
+
+    @property
+    def of_one_time(self) -> Int16[Tensor, "s 2"]:
+        """The position as if all rows had been seen at once."""
+        return self.position if self.shift is None else self.position + self.shift
 
     @property
     def shifted(self) -> Int16[Tensor, "s 2"]:
-        """The position with its shift."""
-        return self.position if self.shift is None else self.position + self.shift
+        """The position with both shifts."""
+        return self.of_one_time + (self.of_one_lens - self.position)
 
 
 @dataclass(eq=False)

@@ -30,7 +30,7 @@ class SampleGrid:
     pixels: Float[Tensor, "p 2"] = field(init=False)
     """x, y of each cell, float32."""
     rays: Float[Tensor, "p 3"] = field(init=False)
-    """K^-1 (x, y, 1) of each cell, float32."""
+    """What each cell sees at depth 1, float32."""
     centre: Float[Tensor, "2"] = field(init=False)
     """Half of the image's width and height, float32."""
 
@@ -43,9 +43,8 @@ class SampleGrid:
                 "tracking needs at least 32 x 32."
             )
         yy, xx = torch.meshgrid(y, x, indexing="ij")
-        cam = self.camera
-        rays = torch.stack([(xx - cam.cx) / cam.fx, (yy - cam.cy) / cam.fy, xx * 0 + 1], -1)
-        pixels = torch.stack([xx, yy], -1)
+        cam, pixels = self.camera, torch.stack([xx, yy], -1)
+        rays = torch.cat([cam.plane(pixels), torch.ones_like(pixels[..., :1])], -1)
         object.__setattr__(self, "width", len(x))
         object.__setattr__(self, "height", len(y))
         object.__setattr__(self, "pixels", pixels.reshape(-1, 2).float().to(self.device))

@@ -1,9 +1,10 @@
 """All keyframes of a run, by stable id: what was seen, from where, and how far it is."""
 
 import copy
+import functools
 from bisect import insort
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, cast
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from torch import Tensor
 
+from geogs.camera.straight_view import StraightView
 from geogs.config.setting import Range
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
@@ -171,11 +173,29 @@ class Keyframe:
         return known / (1 + known * floor)
 
     def depth_field(self) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
-        """Inverse depth and its ``confident_information`` as images of cells, on the CPU."""
-        grid = self.grid
+        """Inverse depth and its ``confident_information`` as images of the cells of the straight
+        image, on the CPU."""
+        grid, shown = self.grid, self._shown
         fields = torch.stack([self.inverse_depth, self.confident_information])
+        if shown is not None:
+            fields = grid.sample_field(fields.mT, shown).mT
         depth, information = fields.reshape(2, grid.height, grid.width).cpu().numpy()
         return depth, information
+
+    @property
+    def shown_moving(self) -> Bool[Tensor, "p"] | None:
+        """Which cells of the straight image show something dynamic, where it is known."""
+        if self.moving is None or (shown := self._shown) is None:
+            return self.moving
+        nearest, is_cell = self.grid.cells_of(shown)
+        return self.moving[nearest] & is_cell
+
+    @property
+    def _shown(self) -> Float[Tensor, "p 2"] | None:
+        """Where the image that was tracked shows the cells of the straight one; none where they are
+        the same."""
+        view = self.table.view_of(self.id)
+        return None if view is None else view.bent(self.grid.pixels)
 
 
 @dataclass(eq=False)
@@ -191,15 +211,15 @@ class KeyframeTable:
     poses: PoseTable = field(default_factory=PoseTable)
     arrays: ArrayTable = field(default_factory=ArrayTable)
     lens: FoundLens | None = None
-    """Lens by which images and depths were straightened at the end; none where they are as they
-    were tracked."""
+    """Lens by which images were straightened at the end; none where they are as they were tracked.
+    Matches and depths of cells are always those of images as they were tracked."""
     frame_lenses: dict[Id, FrameLens] = field(default_factory=dict)
     """What the lenses of keyframes had of their own then, where they had."""
     grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
     """Grid of matches and depths, with the camera that saw them."""
     camera: Camera = field(init=False, repr=False, metadata=NOT_STORED)
     """The pinhole that the images are of, or will be once they are straight. That of the grid is
-    another only while the lens is being found."""
+    another where a lens was found."""
     focal_deviation: float = field(default=0.0, init=False, repr=False, metadata=NOT_STORED)
     """Relative standard deviation of their focal length where nobody said it, before all matches
     are asked for it."""
@@ -227,17 +247,24 @@ class KeyframeTable:
         """The table with what belongs to the process: where depth is kept, how images are encoded,
         how many of the large arrays of a name stay in memory, and how well the lens was known."""
         self.grid, self.camera, self.encode, self.set_of = grid, grid.camera, encode, {}
+        if self.lens is not None:
+            self.see_by(StraightView(self.camera, self.lens).seen_by)
         self.focal_deviation = focal_deviation
         self.arrays.resident = resident
         for keyframe in self.keyframes.values():
             keyframe.table = self
         return self
 
-    def refocus(self, factor: float) -> None:
-        """Have matches and depths as a focal length saw them that is so many times the images'."""
-        camera = self.camera
-        seen = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
-        self.grid = SampleGrid(seen, self.grid.device)
+    def see_by(self, camera: Camera) -> None:
+        """Take matches and depths for what another camera saw."""
+        self.grid = SampleGrid(camera, self.grid.device)
+
+    def view_of(self, id: int) -> StraightView | None:
+        """How the image of a keyframe was straightened; none where it is as it was tracked."""
+        if self.lens is None:
+            return None
+        view, own = _view(self.camera, self.lens), self.frame_lenses.get(id)
+        return view if own is None else view.of_frame(own)
 
     def mirror(self) -> "KeyframeTable":
         """A table without keyframes that has the large arrays of this one."""
@@ -410,6 +437,12 @@ class KeyframeSet:
             after[k] = T @ S.to(T)
             after[k][:3] /= scale
         return PoseCorrection(before, after, dict.fromkeys(before, scale))
+
+
+@functools.lru_cache(maxsize=1)
+def _view(camera: Camera, lens: FoundLens) -> StraightView:
+    """One view for all keyframes, which keeps what it has computed."""
+    return StraightView(camera, lens)
 
 
 def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:

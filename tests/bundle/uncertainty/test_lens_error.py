@@ -17,7 +17,6 @@ from geogs.bundle.uncertainty.lens_error import (
     LEAST,
     RADIAL,
     SHAPES,
-    LensBend,
     LensEvidence,
     lens_evidence,
     lens_prior,
@@ -233,17 +232,6 @@ def same_length(T: Tensor, truth: Tensor) -> Tensor:
     T, t = T.clone(), T[:, :3, 3]
     T[:, :3, 3] /= float((t * truth[:, :3, 3]).sum() / truth[:, :3, 3].square().sum())
     return se3_log(T @ se3_inverse(truth))
-
-
-def test_matches_that_are_corrected_are_those_of_a_pinhole():
-    bend = LensBend(0.01, -0.02)
-    grid, problem = walk((0.0, bend.k1, bend.k2))
-    T_ji = relative_motion(problem.T_cw, problem.source, problem.target)
-    d = problem.inverse_depth[problem.source]
-    wanted = project(CAMERA, grid.rays, T_ji, d).pixels
-    found = problem.pixels + bend.of_matches(CAMERA, grid.rays, T_ji, d)
-    off, before = ((problem.weight * (p - wanted)).norm() for p in (found, problem.pixels))
-    assert off < 0.03 * before
 
 
 @pytest.mark.parametrize(("readout", "guess"), [((), 0.0), ((0.4, 0.2), 0.0), ((), 0.35)])

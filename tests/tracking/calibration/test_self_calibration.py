@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import tracking_scenes
-from geogs.bundle.lens import RadialLens, lens_rays
+from geogs.bundle.lens import lens_rays
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
@@ -108,7 +108,7 @@ def test_the_distortion_of_a_pinhole_is_about_none():
 def test_finds_the_distortion_of_a_barrel_lens():
     wide = Camera(CAMERA.fx, CAMERA.fy, 143.5, 107.5, 288, 216)
     rays = lens_rays(
-        RadialLens(CAMERA, -0.2, 0.05), torch.from_numpy(pixels_of(CAMERA))
+        CAMERA.moved(0.0, -0.2, 0.05), torch.from_numpy(pixels_of(CAMERA))
     ).rays.numpy()
     at = (rays @ wide.matrix().numpy().T.astype(np.float32))[:, :2]
     at = at.reshape(CAMERA.height, CAMERA.width, 2)

@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from geogs.bundle.uncertainty.lens_error import LensBend
 from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.tracking.frame_lenses import shift_frames
 from geogs.tracking.frames.frame_recorder import FrameRecorder, pose_of
 from geogs.tracking.frames.interpolation import interpolate
 from geogs.tracking.frames.pose_filling import (
     depth_aware_weight,
     row_errors,
-    shift_lens,
     solve_trajectory,
 )
-from geogs.types import FlowMatch, Frame, SeenRows
+from geogs.types import FlowMatch, Frame, FrameLens, SeenRows
 from geogs.world.frames import FrameLog
 from planted_walk import planted_tracker
 from records import copied
@@ -93,9 +92,9 @@ def test_a_lens_bends_what_is_found_of_a_frame_where_that_is_not_where_tracking_
         recorder.add(frame(50), 2, 0, left, FlowMatch(match.pixels, match.weight))
         recorder.add(frame(51), 2, 0, left, FlowMatch(match.pixels, match.weight))
         log.records[1].anchor = 99  # of another segment by now: nothing says where it is here
-        shift_lens(log, tracker.keyframes, LensBend(0.1, -0.05))
-        assert log.records[1].observations[0].shift is None
-        shifts.append(log.records[0].observations[0].shift.int())
+        shift_frames(log, tracker.keyframes, {50: FrameLens(0.0, 0.05, -0.02)})
+        assert log.records[1].observations[0].lens_shift is None
+        shifts.append(log.records[0].observations[0].lens_shift.int())
     assert int(shifts[0].abs().max()) > 40
     assert int((shifts[1] - shifts[0]).abs().max()) <= 1
 

@@ -87,6 +87,29 @@ def test_points_lie_beside_where_a_wrong_motion_put_them(distortion):
         np.testing.assert_allclose(found[0, 0], expected, atol=0.02 + 0.04 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("device", ["loops", "plain"])
+def test_what_a_lens_shows_lies_where_the_pinhole_has_it_but_for_the_bend(device, monkeypatch):
+    """All pixels being seen at one time, which is another than was assumed."""
+    lens = CAMERA.moved(0.0, 0.1, -0.15)
+    nodes = rows()[2]
+    seen = SeenRows(torch.zeros_like(nodes.offset), torch.full_like(nodes.seconds, 0.02))
+    pixels, d = GRID.pixels[None], torch.full((1, GRID.size), 0.7)
+    found = []
+    for camera in (CAMERA, lens):
+        known = RowErrors(SampleGrid(camera), {FRAME: seen}, range(COUNT), trajectory())
+        at = camera.pixels(CAMERA.plane(pixels))
+        if device == "loops":
+            shifts = known.of_pixels([FRAME], at, d)
+        else:
+            shifts = known._shifted(list(known._rectified.values()), [0], at, d)
+        longer = known.with_readout(1.02).of_pixels([FRAME], at, d)
+        slope = (longer.shift - shifts.shift) / 0.02
+        torch.testing.assert_close(shifts.slope, slope, atol=0.03, rtol=0.02)
+        found.append(camera.plane(at - shifts.shift))
+    assert float((found[0] - CAMERA.plane(pixels)).abs().max()) > 0.01
+    torch.testing.assert_close(*found, atol=1e-5, rtol=0)
+
+
 def test_a_match_is_corrected_at_both_its_ends():
     seen = rows()[2]
     T_ji = pose(1 / RATE) @ se3_inverse(pose(0.0))
@@ -104,18 +127,23 @@ def test_a_match_is_corrected_at_both_its_ends():
     torch.testing.assert_close(both[small], (there - beside + p.pixels)[small], atol=0.01, rtol=0)
 
 
-def test_a_step_is_carried_as_finite_differences_carry_it():
+@pytest.mark.parametrize("bend", [(0.0, 0.0), (0.1, -0.15)])
+def test_a_step_is_carried_as_finite_differences_carry_it(bend):
+    camera = CAMERA.moved(0.0, *bend)
     T_ji = se3_exp(torch.tensor([[0.3, -0.1, 0.4, 0.2, -0.3, 0.15]], dtype=torch.float64))
     d = torch.linspace(0.2, 1.5, GRID.size, dtype=torch.float64)[None]
-    rays, small = GRID.rays.double(), 1e-5
-    p = project(CAMERA, rays, T_ji, d)
+    pixels, small = GRID.pixels.double(), 1e-5
+
+    def rays(pixels: torch.Tensor) -> torch.Tensor:
+        return torch.cat([camera.plane(pixels), torch.ones(GRID.size, 1).double()], 1)
+
+    p = project(camera, rays(pixels), T_ji, d)
     for axis in (0, 1):
         step = torch.zeros(1, GRID.size, 2, dtype=torch.float64)
         step[..., axis] = 1.0
-        moved = rays.clone()
-        moved[:, axis] += small / (CAMERA.fx, CAMERA.fy)[axis]
-        numeric = (project(CAMERA, moved, T_ji, d).pixels - p.pixels) / small
-        carried = carried_over(CAMERA, T_ji, p, step)
+        moved = rays(pixels + small * step[0])
+        numeric = (project(camera, moved, T_ji, d).pixels - p.pixels) / small
+        carried = carried_over(camera, rays(pixels), T_ji, p, step)
         torch.testing.assert_close(carried[p.valid], numeric[p.valid], atol=1e-3, rtol=1e-3)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, solve_shared
 from geogs.camera.shutter.angular_motion import AngularMotion, rotated
@@ -87,9 +87,7 @@ def _lens() -> None:
         T_cw[:2], depth, torch.tensor([0]), torch.tensor([1]), free, free.new_ones(2),
         pixels=pixels, weight=torch.ones_like(pixels),
     )  # fmt: skip
-    solve_shared(
-        problem, LensBlock(RadialLens(CAMERA), grid.pixels), replace(OPTIONS, iterations=1)
-    )
+    solve_shared(problem, LensBlock(CAMERA, grid.pixels), replace(OPTIONS, iterations=1))
     rows = RowOffsets(RollingCamera(CAMERA), CAMERA)
     seen = rows.seen(rows.nodes(AngularMotion(), 0.0), Shutter(0.02))
     way = Trajectory(times, torch.linalg.inv(T_cw).numpy(), np.ones(VIEWS, bool))

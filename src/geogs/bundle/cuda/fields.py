@@ -98,8 +98,8 @@ class CudaFields(GridFields):
         there, back = out.unbind() if reproject else (None, None)
         kernels_for(SOURCE, device)["carry_depth"](
             n, block_size(grid.size, MOST_THREADS), poses[:n], poses[n:], rows, inverse_depth,
-            information, grid.rays, grid.width, grid.height, OFFSET, STRIDE, camera.fx, camera.fy,
-            camera.cx, camera.cy, size, scratch, depth, None if reproject else out, there, back,
+            information, grid.rays, grid.width, grid.height, OFFSET, STRIDE, *camera.numbers,
+            size, scratch, depth, None if reproject else out, there, back,
         )  # fmt: skip
         if there is None or back is None:
             return depth.reshape(n, -1), out

@@ -37,7 +37,7 @@ class CudaPairs(KeyframePairs):
         pixels = self.inverse_depth.new_empty(len(self), grid.size, 2)
         self._kernel("project_pairs")(
             len(self), block_size(grid.size), self.T_cw, self.inverse_depth, self.source,
-            self.target, grid.rays, grid.size, c.fx, c.fy, c.cx, c.cy, pixels,
+            self.target, grid.rays, grid.size, *c.numbers, pixels,
         )  # fmt: skip
         return pixels
 
@@ -48,7 +48,7 @@ class CudaPairs(KeyframePairs):
         median = self.inverse_depth.new_empty(len(self))
         self._kernel("moved_pairs")(
             len(self), block_size(grid.size), self.T_cw, self.inverse_depth, self.source,
-            self.target, grid.rays, grid.size, c.fx, c.fy, c.cx, c.cy, before, weight, median,
+            self.target, grid.rays, grid.size, *c.numbers, before, weight, median,
             shared=4 * grid.size,
         )  # fmt: skip
         return median
@@ -58,8 +58,8 @@ class CudaPairs(KeyframePairs):
         distance = self.inverse_depth.new_empty(len(self))
         self._kernel("pair_distances")(
             len(self), min(block_size(grid.size), 128), self.T_cw, self.inverse_depth, self.source,
-            self.target, grid.rays, grid.pixels, grid.width, grid.height, CELL_STEP, c.fx, c.fy,
-            c.cx, c.cy, c.width - 2, c.height - 2, rotation_weight, distance,
+            self.target, grid.rays, grid.pixels, grid.width, grid.height, CELL_STEP, *c.numbers,
+            c.width - 2, c.height - 2, rotation_weight, distance,
         )  # fmt: skip
         return distance
 

@@ -80,7 +80,7 @@ def edge_costs(
     cost = depth.new_empty(len(a.source), dtype=torch.float64)
     kernels["find_edge_costs"](
         len(a.source), block_size(cells), poses, depth, a.source, a.target, *matches, grid.rays,
-        cells, c.fx, c.fy, c.cx, c.cy, huber, BEHIND, cost,
+        cells, *c.numbers, huber, BEHIND, cost,
     )  # fmt: skip
     return cost
 
@@ -121,7 +121,7 @@ class LinearisedEdges:
         a, c, (curvature, gradient) = self.arrays, grid.camera, self.per_edge
         self.kernels["linearise_edges"](
             len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
-            self.cells, c.fx, c.fy, c.cx, c.cy, options.huber, self.motion, self.normal,
+            self.cells, *c.numbers, options.huber, self.motion, self.normal,
             self.coupling, curvature, gradient,
         )  # fmt: skip
         self.kernels["sum_sources"](

@@ -37,7 +37,7 @@ class CudaMotion(MotionSolver):
         residual = torch.empty_like(pixels)
         kernels_for(SOURCE, device)["solve_poses"](
             n, block_size(d.shape[1], MOST_THREADS), first, order, d.contiguous(), poses[n:],
-            pixels, weight, None, self.rays, d.shape[1], c.fx, c.fy, c.cx, c.cy, iterations, huber,
+            pixels, weight, None, self.rays, d.shape[1], *c.numbers, iterations, huber,
             poses, residual,
         )  # fmt: skip
         return poses[:n].to(T_cw.device), residual
@@ -65,11 +65,11 @@ class CudaMotion(MotionSolver):
         kernels = kernels_for(SOURCE, device)
         kernels["solve_poses"](
             1, threads, rows, rows, keyframe.inverse_depth, T_source, pixels, weight, known,
-            self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, iterations, huber, T, residual,
+            self.rays, grid.size, *c.numbers, iterations, huber, T, residual,
         )  # fmt: skip
         kernels["judge_match"](
             1, threads, pixels, weight, known, keyframe.inverse_depth, residual, grid.pixels,
-            self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, limit, KNOWN**2, T, T_source, judged,
+            self.rays, grid.size, *c.numbers, limit, KNOWN**2, T, T_source, judged,
             T_ji, shared=4 * grid.size,
         )  # fmt: skip
         return T.reshape(4, 4), T_ji.reshape(4, 4), judged

@@ -5,7 +5,8 @@
 
 #define MIN_Z 0.05f
 
-struct Camera { float fx, fy, cx, cy; };
+// Pixel = c + f x (1 + k1 |x|^2 + k2 |x|^4) of a point x on the plane z = 1.
+struct Camera { float fx, fy, cx, cy, k1, k2; };
 
 // The upper three rows R | t of the motion from the source to the target.
 struct Motion { float m[12]; };
@@ -28,7 +29,19 @@ __device__ __forceinline__ Projected project_cell(
 }
 
 __device__ __forceinline__ float2 pixel_of(const Camera& camera, const Projected& p) {
-  return make_float2(camera.fx * p.x + camera.cx, camera.fy * p.y + camera.cy);
+  float square = p.x * p.x + p.y * p.y, growth = 1.f + square * (camera.k1 + square * camera.k2);
+  return make_float2(
+      camera.fx * (p.x * growth) + camera.cx, camera.fy * (p.y * growth) + camera.cy);
+}
+
+// Derivatives of a pixel by its point on the plane z = 1.
+struct Bend { float xx, xy, yx, yy; };
+
+__device__ __forceinline__ Bend bend_of(const Camera& camera, float x, float y) {
+  float square = x * x + y * y, growth = 1.f + square * (camera.k1 + square * camera.k2);
+  float slope = 2.f * camera.k1 + 4.f * camera.k2 * square;
+  return {camera.fx * (growth + slope * x * x), camera.fx * slope * x * y,
+          camera.fy * slope * x * y, camera.fy * (growth + slope * y * y)};
 }
 
 // A measured cell, linearised in a left perturbation of the motion and in its inverse depth.
@@ -45,14 +58,18 @@ __device__ __forceinline__ LinearCell linearise_cell(
   Projected p = project_cell(T, rays, cell, d);
   float2 at = pixel_of(camera, p);
   float x = p.x, y = p.y, dq = d * p.q;
+  Bend b = bend_of(camera, x, y);
+  float by_depth_x = (T.m[3] - T.m[11] * x) * p.q, by_depth_y = (T.m[7] - T.m[11] * y) * p.q;
+  float of_x[6] = {dq, 0.f, -x * dq, -x * y, 1.f + x * x, -y};
+  float of_y[6] = {0.f, dq, -y * dq, -1.f - y * y, x * y, x};
   LinearCell c;
-  c.jx[0] = camera.fx * dq;  c.jx[1] = 0.f;             c.jx[2] = -camera.fx * x * dq;
-  c.jy[0] = 0.f;             c.jy[1] = camera.fy * dq;  c.jy[2] = -camera.fy * y * dq;
-  c.jx[3] = -camera.fx * x * y;          c.jx[4] = camera.fx * (1.f + x * x);
-  c.jy[3] = -camera.fy * (1.f + y * y);  c.jy[4] = camera.fy * x * y;
-  c.jx[5] = -camera.fx * y;  c.jy[5] = camera.fy * x;
-  c.dx = camera.fx * (T.m[3] - T.m[11] * x) * p.q;
-  c.dy = camera.fy * (T.m[7] - T.m[11] * y) * p.q;
+#pragma unroll
+  for (int k = 0; k < 6; k++) {
+    c.jx[k] = b.xx * of_x[k] + b.xy * of_y[k];
+    c.jy[k] = b.yx * of_x[k] + b.yy * of_y[k];
+  }
+  c.dx = b.xx * by_depth_x + b.xy * by_depth_y;
+  c.dy = b.yx * by_depth_x + b.yy * by_depth_y;
   c.rx = pixel.x - at.x;
   c.ry = pixel.y - at.y;
   float seen = p.valid ? 1.f : 0.f;

@@ -1,4 +1,4 @@
-"""What matches say of a lens that is taken for a pinhole, and what it costs the poses.
+"""What matches say of the error of a lens, and what it costs the poses.
 
 A lens that bends by a thousandth lets every keyframe of a walk straight on seem a little shorter
 than the one before it: what lies ahead moves outwards, where it is magnified otherwise. All matches
@@ -10,7 +10,7 @@ Source: self-calibration in the adjustment (Brown 1971), consider analysis (Bier
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -61,13 +61,13 @@ def lens_prior(focal_deviation: float = 0.0) -> tuple[float, ...]:
 
 
 def lens_shapes(camera: Camera, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "5 *b 2"]:
-    """Offset of a pinhole's pixel from what is seen, for each size of one, to first order."""
-    centre = pixels.new_tensor([camera.cx, camera.cy])
-    off = pixels - centre
-    square = (off / pixels.new_tensor([camera.fx, camera.fy])).square().sum(-1, keepdim=True)
+    """Offset of the camera's pixel from what is seen, for each size of one, to first order."""
+    focal, plane = pixels.new_tensor([camera.fx, camera.fy]), camera.plane(pixels)
+    off, flat = pixels - pixels.new_tensor([camera.cx, camera.cy]), focal * plane
+    square = plane.square().sum(-1, keepdim=True)
     right, down = torch.zeros_like(off), torch.zeros_like(off)
     right[..., 0], down[..., 1] = camera.fx, camera.fy
-    return torch.stack([-off, -off * square, -off * square.square(), -right, -down])
+    return torch.stack([-off, -flat * square, -flat * square.square(), -right, -down])
 
 
 def shape_shifts(
@@ -87,7 +87,7 @@ def shape_shifts(
         torch.einsum("mk,k...->m...", sizes, lens_shapes(camera, p))
         for p in (at.pixels, _own_pixels(camera, rays))
     )
-    return there - carried_over(camera, T_ji, at, here[:, None].expand_as(there))
+    return there - carried_over(camera, rays, T_ji, at, here[:, None].expand_as(there))
 
 
 def shifts_of_edges(
@@ -101,44 +101,13 @@ def shifts_of_edges(
     there = torch.einsum("ek,kepc->epc", sizes[:, 1], lens_shapes(camera, at.pixels))
     own = lens_shapes(camera, _own_pixels(camera, rays))
     here = torch.einsum("ek,kpc->epc", sizes[:, 0], own)
-    return there - carried_over(camera, T_ji, at, here)
+    return there - carried_over(camera, rays, T_ji, at, here)
 
 
 def _own_pixels(camera: Camera, rays: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
     """Where cells with these rays are."""
-    own = rays.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
+    own = rays.new_tensor([camera.fx, camera.fy]) * camera.bent(rays[:, :2])
     return own + rays.new_tensor([camera.cx, camera.cy])
-
-
-@dataclass(frozen=True)
-class LensBend:
-    """A lens' error beside the distortion that it is known for: OpenCV's k1 and k2, small."""
-
-    k1: float = 0.0
-    k2: float = 0.0
-    focal: float = 0.0
-    """Logarithm of the focal length over what it is taken for."""
-    right: float = 0.0
-    down: float = 0.0
-    """Where the principal point lies off what it is taken for, in focal lengths."""
-
-    def plus(self, k1: float, k2: float, right: float = 0.0, down: float = 0.0) -> "LensBend":
-        """With sizes added to."""
-        return replace(
-            self, k1=self.k1 + k1, k2=self.k2 + k2, right=self.right + right, down=self.down + down
-        )
-
-    def of_matches(
-        self,
-        camera: Camera,
-        rays: Float[Tensor, "p 3"],
-        T_ji: Float[Tensor, "e 4 4"],
-        inverse_depth: Float[Tensor, "e p"],
-    ) -> Float[Tensor, "e p 2"]:
-        """What is to be added to where cells were found, as if a pinhole had seen both views."""
-        at = project(camera, rays, T_ji, inverse_depth)
-        sizes = at.pixels.new_tensor([[self.focal, self.k1, self.k2, self.right, self.down]])
-        return shape_shifts(camera, rays, T_ji, at, sizes)[0]
 
 
 @dataclass(frozen=True)

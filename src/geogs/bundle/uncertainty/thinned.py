@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import SourceFlow, linearised_sources, residual_norms
 from geogs.bundle.hyper_edge import DepthEquations
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
 from geogs.bundle.projection import project, relative_motion
@@ -31,7 +31,7 @@ class ThinnedProblem:
         self._problem, self._cells = problem, slice(None, None, step)
         self.camera, self.rays = grid.camera, grid.rays[self._cells].cpu()
         self.pixels = grid.pixels[self._cells].cpu()
-        self.lens = LensBlock(RadialLens(grid.camera), self.pixels)
+        self.lens = LensBlock(grid.camera, self.pixels)
         self.count = len(self.rays)
         self.fraction = self.count / grid.size
         self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()

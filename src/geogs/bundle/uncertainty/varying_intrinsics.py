@@ -310,7 +310,7 @@ class OwnLensFlow:
         p = linearise(camera, self._rays, T_ji, state.inverse_depth[problem.source])
         r, w = weighed_residuals(p, problem.pixels, problem.weight, options.huber)
         there, here = lens_shapes(camera, p.pixels), lens_shapes(camera, self._pixels)
-        here = carried_over(camera, T_ji, p, here[:, None].expand_as(there))
+        here = carried_over(camera, self._rays, T_ji, p, here[:, None].expand_as(there))
         # What is to be added to a match is what the lens takes off where its cell falls.
         moved = torch.cat([-there[own], here[own], here - there]).permute(1, 0, 3, 2)
         J = torch.cat([p.pose_jacobian, moved], 1)

@@ -1,22 +1,21 @@
 """Per-frame intrinsics in the adjustment of all keyframes: focusing, zooming, stabilised lenses.
 
 Focal length and principal point of each keyframe, beside those of the video, are estimated from all
-matches; the matches are corrected, and everything is adjusted again. Flow is measured again once
-images are straight. The prior of what a keyframe has of its own is white noise, of the focal length
-and a random walk, whose variances are estimated as well (EM). Focal length and principal point are
-freed one after the other, where that lowers the cost by much (forward selection): a depth that is
-still wrong asks for either.
+matches; the matches are corrected, and everything is adjusted again. The prior of what a keyframe
+has of its own is white noise, of the focal length and a random walk, whose variances are estimated
+as well (EM). Focal length and principal point are freed one after the other, where that lowers the
+cost by much (forward selection): a depth that is still wrong asks for either.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.bundle.uncertainty.lens_error import SHAPES, lens_prior, shifts_of_edges
+from geogs.bundle.uncertainty.lens_error import SHAPES, lens_prior
 from geogs.bundle.uncertainty.varying_intrinsics import (
     EXPLAINED,
     OWN,
@@ -24,14 +23,14 @@ from geogs.bundle.uncertainty.varying_intrinsics import (
     VaryingEvidence,
     VaryingPrior,
 )
-from geogs.loop.camera.found import FoundLenses
-from geogs.loop.keyframe_matches import KeyframeMatches
-from geogs.tracking.frame_lenses import sizes_of_frames
+from geogs.geometry.camera import Camera
+from geogs.loop.camera.found import FrameLenses
+from geogs.loop.keyframe_matches import KeyframeMatches, Shifts
+from geogs.tracking.frame_lenses import shift_frames, shifts_of_own, sizes_of_frames
 from geogs.tracking.keyframe_uncertainty import said_of_frame_lenses
-from geogs.types import FoundLens, FrameLens
-from geogs.world.edges import Pair
-from geogs.world.frames import FrameLog
-from geogs.world.keyframes import KeyframeSet
+from geogs.types import FrameLens
+from geogs.world.edges import Edge, Pair
+from geogs.world.keyframes import Keyframe
 
 ROUNDS = 12
 """At most."""
@@ -54,57 +53,86 @@ Evidence = Sequence[tuple[list[int], VaryingEvidence]]
 
 
 def correct_frame_lenses(
-    matches: KeyframeMatches, before: FoundLenses | None = None
-) -> FoundLenses:
+    matches: KeyframeMatches, before: FrameLenses | None = None
+) -> FrameLenses:
     """Estimate per-frame intrinsics, correct all matches for them and adjust again.
 
     Nothing, and everything as it was, where no parameter lowers the cost enough, the steps do not
-    converge, or a parameter that stays fixed would do nearly as well. With ``before``, which images
-    are straight by, the remainder is estimated. Matches of frames between the keyframes stay
-    (:meth:`FoundLenses.shift`). Not in the world of a saved map. The shared intrinsics of a given
+    converge, or a parameter that stays fixed would do nearly as well. What was found ``before`` is
+    where the steps begin, and stays where they lead to nothing. Matches of frames between the
+    keyframes are corrected, too. Not in the world of a saved map. The shared intrinsics of a given
     lens stay.
     """
-    graph, keyframes, log = matches.graph, matches.keyframes, matches.log
-    if not graph.edges or matches.tracker.segment.fixed:
-        return FoundLenses()
-    kept = [(k, k.T_cw.clone(), k.inverse_depth.clone(), k.information.clone()) for k in keyframes]
-    measured = graph.packed
-    prior = None if before is None else before.prior
-    intrinsics = _Intrinsics(keyframes, prior or VaryingPrior())
-    evidence = said_of_frame_lenses(matches.tracker, matches.tracker.segment.ids)
-    if prior is None and not intrinsics.free_another(evidence):
-        return FoundLenses()
+    before = before or FrameLenses()
+    ids = matches.tracker.segment.ids
+    if not matches.measured or matches.tracker.segment.fixed:
+        return before
+    kept = _State.of(matches)
+    intrinsics = _Intrinsics(matches, before)
+    evidence = said_of_frame_lenses(matches.tracker, ids)
+    if not before and not intrinsics.free_another(evidence):
+        return before
+    matches.corrections["lenses"] = intrinsics.shifts
     for _ in range(ROUNDS):
         last = intrinsics.step(evidence)
-        matches.correct(measured, intrinsics.shifts)
-        evidence = said_of_frame_lenses(matches.tracker, matches.tracker.segment.ids)
+        matches.adjust()
+        evidence = said_of_frame_lenses(matches.tracker, ids)
         if last < CONVERGED and not intrinsics.free_another(evidence):
             break
-    if last > DIVERGED or intrinsics.left > (AMBIGUOUS_ROWS if log.rows else AMBIGUOUS):
-        graph.edges.update(measured)
-        for keyframe, T_cw, depth, information in kept:
+    most = AMBIGUOUS_ROWS if matches.log.rows else AMBIGUOUS
+    if last > DIVERGED or intrinsics.left > most:
+        kept.restore(matches)
+        return before
+    found = intrinsics.found()
+    shift_frames(matches.log, matches.keyframes, found.each)
+    return found
+
+
+@dataclass(frozen=True)
+class _State:
+    """What an adjustment changes."""
+
+    camera: Camera
+    corrections: Mapping[str, Shifts]
+    edges: Mapping[Pair, Edge]
+    keyframes: Sequence[tuple[Keyframe, Tensor, Tensor, Tensor]]
+
+    @staticmethod
+    def of(matches: KeyframeMatches) -> "_State":
+        """As it is now."""
+        each = [(k, k.T_cw.clone(), k.inverse_depth, k.information) for k in matches.keyframes]
+        edges, corrections = dict(matches.graph.edges), dict(matches.corrections)
+        return _State(matches.camera, corrections, edges, each)
+
+    def restore(self, matches: KeyframeMatches) -> None:
+        """Have it as it was."""
+        matches.graph.see_by(self.camera)
+        matches.graph.replace(self.edges)
+        matches.corrections.clear()
+        matches.corrections.update(self.corrections)
+        for keyframe, T_cw, depth, information in self.keyframes:
             keyframe.T_cw, keyframe.inverse_depth = T_cw, depth
             keyframe.information = information
-        return FoundLenses()
-    return intrinsics.found(log)
 
 
 class _Intrinsics:
     """Errors of the shared intrinsics and of each keyframe's that matches are corrected for."""
 
-    def __init__(self, keyframes: KeyframeSet, prior: VaryingPrior) -> None:
-        self.prior, self.common = prior, torch.zeros(SHAPES, dtype=torch.float64)
+    def __init__(self, matches: KeyframeMatches, before: FrameLenses) -> None:
+        self.prior = before.prior or VaryingPrior()
         self.left = 0.0
         """Largest relative cost reduction by a parameter that is fixed, as estimated last."""
-        self._keyframes, self._own = keyframes, dict[int, Tensor]()
-        deviation = keyframes.table.focal_deviation
+        self._matches, self._keyframes = matches, matches.keyframes
+        self._own = {
+            k.id: torch.tensor(before.each[k.frame_index].sizes, dtype=torch.float64)
+            for k in matches.keyframes if k.frame_index in before.each
+        }  # fmt: skip
+        self._common = torch.zeros(SHAPES, dtype=torch.float64)
+        """By which the camera was moved."""
+        deviation = self._keyframes.table.focal_deviation
         self._is_open = deviation > 0
         expected = lens_prior(deviation) if self._is_open else SHAPES * (GIVEN,)
         self._shared = torch.tensor(expected, dtype=torch.float64)
-
-    def of(self, id: int) -> Float[Tensor, "5"]:
-        """Errors of a keyframe's intrinsics, the shared ones included."""
-        return self.common.index_add(0, torch.tensor(OWN), self._of(id))
 
     def free_another(self, evidence: Evidence) -> bool:
         """Forward selection: free the parameter with the largest gain, if that is enough."""
@@ -132,7 +160,10 @@ class _Intrinsics:
         }
         self._own.update({k: self._of(k) + size for k, size in own.items()})
         if self._is_open:
-            self.common = self.common + torch.stack([step[-SHAPES:] for step in steps]).mean(0)
+            common = torch.stack([step[-SHAPES:] for step in steps]).mean(0)
+            self._common = self._common + common
+            matches = self._matches
+            matches.graph.see_by(matches.camera.moved(*common.tolist()))
         return float(torch.stack([*own.values()]).square().mean(0).max().sqrt())
 
     def _estimated(
@@ -142,7 +173,7 @@ class _Intrinsics:
         steps, explained = [], 0.0
         for frames, part in evidence:
             times = [self._keyframes[k].timestamp for k in frames]
-            taken = torch.cat([*(self._of(k) for k in frames), self.common])
+            taken = torch.cat([*(self._of(k) for k in frames), self._common])
             at = torch.tensor(times, dtype=torch.float64)
             step, prior = part.told(at, taken, prior, self._shared)
             steps.append(step)
@@ -153,22 +184,17 @@ class _Intrinsics:
         return self._own.get(id, torch.zeros(len(OWN), dtype=torch.float64))
 
     def shifts(self, part: list[Pair]) -> Float[Tensor, "e p 2"]:
-        """Pixels to be added to the matches of some edges, as if pinholes had seen them."""
+        """Pixels to be added to the matches of some edges, as if the lens of all had seen them."""
         grid, keyframes = self._keyframes.grid, self._keyframes
         T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
         at = project(grid.camera, grid.rays, T_ji, depth)
-        both = torch.stack([torch.stack([self.of(k) for k in pair]) for pair in part])
-        return shifts_of_edges(grid.camera, grid.rays, T_ji, at, both.to(at.pixels))
+        both = torch.stack([torch.stack([self._of(k) for k in pair]) for pair in part])
+        return shifts_of_own(grid.camera, grid.rays, T_ji, at, both.to(at.pixels))
 
-    def found(self, log: FrameLog) -> FoundLenses:
-        """Intrinsics of the video and of each frame."""
-        known = {k.frame_index: self.of(k.id) for k in self._keyframes}
-        sizes = sizes_of_frames(log, self._keyframes, known, self.prior)
+    def found(self) -> FrameLenses:
+        """Intrinsics of each frame."""
+        known = {k.frame_index: self._of(k.id) for k in self._keyframes}
+        sizes = sizes_of_frames(self._matches.log, self._keyframes, known, self.prior)
         varies = torch.tensor(self.prior.jitter) > 0
-        own = {
-            n: FrameLens(*torch.where(varies, (s - self.common)[list(OWN)], 0.0).tolist())
-            for n, s in sizes.items()
-        }
-        focal, k1, k2, right, down = self.common.tolist()
-        lens = FoundLens(k1, k2, 0.0, 0.0, math.exp(focal), right=right, down=down)
-        return FoundLenses(lens, own, self.prior)
+        each = {n: FrameLens(*torch.where(varies, s, 0.0).tolist()) for n, s in sizes.items()}
+        return FrameLenses(each, self.prior)

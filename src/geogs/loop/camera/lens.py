@@ -2,13 +2,14 @@
 
 Images were undistorted by the given or found lens. The distortion that remains is small, and all
 matches of the video together determine it; a walk straight on drifts in scale until it is
-corrected. Matches are corrected and everything is adjusted again; flow stays as it is. The focal
-length is corrected with it where matches require that: one that was found for a pinhole is off by
-several percent (docs/notebook/lens.md).
+corrected. The camera of the grid becomes the one that was found and everything is adjusted again;
+matches stay as they are. The focal length is corrected with it where matches require that: one that
+was found for a pinhole is off by several percent (docs/notebook/lens.md).
 """
 
 import math
 from dataclasses import replace
+from functools import partial
 
 from jaxtyping import Float
 from torch import Tensor
@@ -18,21 +19,21 @@ from geogs.bundle.uncertainty.lens_error import (
     RADIAL,
     SHAPES,
     STANDARD_ERRORS,
-    LensBend,
     LensEstimate,
     LensEvidence,
     lens_prior,
 )
-from geogs.loop.camera.found import FoundLenses
-from geogs.loop.keyframe_matches import KeyframeMatches, Measured
-from geogs.tracking.frames.pose_filling import row_errors, shift_lens, shift_rows
+from geogs.loop.camera.found import found_lens
+from geogs.loop.keyframe_matches import KeyframeMatches
+from geogs.tracking.frames.pose_filling import row_errors, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, row_shifts
 from geogs.tracking.keyframe_uncertainty import said_of_lens
 from geogs.types import FoundLens
 from geogs.world.edges import Pair
 
 ROUNDS = 8
-"""At most. Each is to first order and leaves a fifth to a half of what the one before it left."""
+"""At most. Poses and depths follow each to first order: it leaves a fifth to a half of what the one
+before it left."""
 CONVERGED = 0.2
 """Standard deviations by which the last round may change a parameter."""
 MOST_AT_ONCE = 0.3
@@ -62,40 +63,38 @@ def correct_lens(
     ends: bool = False,
     before: FoundLens | None = None,
     readout: float = 1.0,
-) -> FoundLenses:
-    """Estimate the lens from all matches, correct them for it and adjust again.
+) -> FoundLens | None:
+    """Estimate the lens from all matches and adjust again; none, and everything as it was, where
+    nothing is found.
 
-    Matches of the frames between the keyframes are corrected, too. Beside a given lens k1 and k2
-    are accepted by ``EVIDENCE`` and ``AGREEMENT``. All is estimated, however small, where images
-    are straight by ``before``, and where tracking ``ends`` and the focal length was found or
-    guessed (``KeyframeTable.focal_deviation``; the prior is
+    The camera of the grid is the one that was found then. Beside a given lens k1 and k2 are
+    accepted by ``EVIDENCE`` and ``AGREEMENT``. All is estimated, however small, where something was
+    found ``before``, and where tracking ``ends`` and the focal length was found or guessed
+    (``KeyframeTable.focal_deviation``; the prior is
     :func:`~geogs.bundle.uncertainty.lens_error.lens_prior`); then the principal point is, too. The
-    focal length is corrected at the end alone, as what is matched afterwards would be of another;
-    so is a readout that was found: rows were corrected for ``readout`` times it. Not in the world
-    of a saved map, whose keyframes stay as they are.
+    focal length is corrected at the end alone; so is a readout that was found: rows were corrected
+    for ``readout`` times it. Not in the world of a saved map, whose keyframes stay as they are.
     """
-    measured = matches.graph.packed
-    if not measured or matches.tracker.segment.fixed:
-        return FoundLenses()
+    if not matches.measured or matches.tracker.segment.fixed:
+        return None
     search = _LensSearch(matches, ends, before, readout)
     while search.left and search.step():
-        matches.correct(measured, lambda part: search.shifts(part, measured))
+        matches.adjust()
     return search.found()
 
 
 class _LensSearch:
-    """Parameters of the lens' error, from round to round."""
+    """Parameters of the lens, from round to round."""
 
     def __init__(
         self, matches: KeyframeMatches, ends: bool, before: FoundLens | None, readout: float
     ) -> None:
         self.left = ROUNDS
         """Rounds that may follow."""
-        self._matches, self._keyframes, self._ends = matches, matches.keyframes, ends
-        self._before, self._readout = before, readout
-        self._bend, self._focal, self._longer = LensBend(), 0.0, 0.0
+        self._matches, self._table, self._ends = matches, matches.keyframes.table, ends
+        self._before, self._readout, self._longer = before, readout, 0.0
         self._said: LensEstimate | None = None
-        self._is_open = ends and matches.keyframes.table.focal_deviation > 0
+        self._is_open = ends and self._table.focal_deviation > 0
         self._frees_focal = before.focal != 1 if before else self._is_open
         self._frees_centre = self._is_open and (before is None or before.is_off_centre)
         self._rows = _rows_in_doubt(matches, readout) if ends else None
@@ -110,18 +109,14 @@ class _LensSearch:
             return False
         self.left -= 1
         self._said = said = self._chosen(evidence)
-        if self._frees_focal:
-            self._focal += float(said.size[0])
-            if self._before:  # cells stay where straight images show them
-                self._bend = replace(self._bend, focal=self._focal)
-            else:
-                self._matches.graph.refocus(math.exp(self._focal))
-        if self._rows is not None:
-            self._longer += float(said.size[-1])
         if bool((said.size.abs() < CONVERGED * said.deviation).all()):
             self.left = 0
-        first = int(self._frees_focal)
-        self._bend = self._bend.plus(*said.size[first : first + self._shapes - 1].tolist())
+        size = said.size.tolist()
+        if self._rows is not None:
+            self._longer += size.pop()
+            self._matches.corrections["readout"] = partial(self._shifts, self._rows)
+        focal = size.pop(0) if self._frees_focal else 0.0
+        self._matches.graph.see_by(self._matches.camera.moved(focal, *size))
         if not self.left and self._frees_centre and not self._before:
             self._leave_centre_unless_sure(said)
         return True
@@ -142,20 +137,20 @@ class _LensSearch:
         return [evidence for evidence in found if evidence is not None]
 
     @property
-    def _shapes(self) -> int:
-        return SHAPES if self._frees_centre else RADIAL
+    def _moves(self) -> tuple[float, ...]:
+        """Sizes by which the camera is another than was given."""
+        return self._matches.camera.moves_from(self._table.camera)
 
     def _chosen(self, evidence: LensEvidence) -> LensEstimate:
         """The estimate of the free parameters, with their priors."""
         said = evidence.whole(self._frees_centre)
+        shapes = SHAPES if self._frees_centre else RADIAL
         if self._is_open:
-            bend = self._bend
-            taken = self._focal, bend.k1, bend.k2, bend.right, bend.down
-            priors = lens_prior(self._keyframes.table.focal_deviation)[: self._shapes]
-            for n, prior in enumerate(priors):
-                said = said.told(n, -taken[n], prior)
+            priors = lens_prior(self._table.focal_deviation)[:shapes]
+            for n, (taken, prior) in enumerate(zip(self._moves, priors, strict=False)):
+                said = said.told(n, -taken, prior)
         if self._rows is not None:
-            said = said.told(self._shapes, 1 - self._readout - self._longer, self._rows.doubt)
+            said = said.told(shapes, 1 - self._readout - self._longer, self._rows.doubt)
         if self._ends and not self._frees_focal and _contradict_focal(said):
             self._frees_focal, self.left = True, ROUNDS
         if self._frees_focal:
@@ -164,41 +159,35 @@ class _LensSearch:
 
     def _leave_centre_unless_sure(self, said: LensEstimate) -> None:
         """Begin again with the principal point in the middle, unless it is clearly elsewhere."""
-        found = said.size.new_tensor([self._bend.right, self._bend.down])
+        found = said.size.new_tensor(self._moves[RADIAL:])
         if said.of(slice(RADIAL, SHAPES))._replace(size=found).evidence < CENTRE_EVIDENCE:
             self._frees_centre, self.left = False, ROUNDS
-            self._bend = replace(self._bend, right=0.0, down=0.0)
+            given = self._table.camera
+            self._matches.graph.see_by(replace(self._matches.camera, cx=given.cx, cy=given.cy))
 
-    def shifts(self, part: list[Pair], measured: Measured) -> Float[Tensor, "e p 2"]:
-        """Pixels to be added to the matches of some edges, as if a pinhole had seen them, with the
-        readout as it is known now."""
-        grid, keyframes = self._keyframes.grid, self._keyframes
-        T_ji, depth = keyframes.relative_poses(part), keyframes.inverse_depths([i for i, _ in part])
-        shifts = self._bend.of_matches(grid.camera, grid.rays, T_ji, depth)
-        if self._rows is None or self._longer == 0:
-            return shifts
-        return shifts + self._longer * row_shifts(self._rows, keyframes, part, measured).slope
+    def _shifts(self, rows: RowErrors, part: list[Pair]) -> Float[Tensor, "e p 2"]:
+        """Pixels to be added to the matches of some edges for the readout as it is known now."""
+        matches = self._matches
+        return self._longer * row_shifts(rows, matches.keyframes, part, matches.measured).slope
 
-    def found(self) -> FoundLenses:
-        """The lens, by which the frames between the keyframes are corrected, too."""
+    def found(self) -> FoundLens | None:
+        """The lens, and its deviations."""
         if self._said is None:
-            return FoundLenses()
-        log, bend, focal = self._matches.log, self._bend, self._focal
+            return None
+        log, focal = self._matches.log, self._moves[0]
         deviation = self._said.deviation.tolist()
         if self._rows is not None:
             readout = self._readout + self._longer
-            shift_rows(log, self._keyframes, self._rows.with_readout(readout))
+            shift_rows(log, self._matches.keyframes, self._rows.with_readout(readout))
             log.set_readout(readout, deviation.pop())
-        shift_lens(log, self._keyframes, bend)
         # Matches of different keyframes err alike, here as before the run (docs/notebook/lens.md).
         deviation = [STANDARD_ERRORS * error for error in deviation]
         open_focal = math.hypot(deviation.pop(0), FOCAL_LEFT * focal) if self._frees_focal else 0.0
         k1, k2, *of_centre = deviation
-        lens = FoundLens(
-            bend.k1, bend.k2, k1, k2, math.exp(focal), open_focal, bend.right, bend.down,
-            max(of_centre, default=0.0),
-        )  # fmt: skip
-        return FoundLenses(lens)
+        said = FoundLens(
+            0.0, 0.0, k1, k2, 1.0, open_focal, deviation_centre=max(of_centre, default=0.0)
+        )
+        return found_lens(self._table.camera, self._matches.camera, said)
 
 
 def _contradict_focal(said: LensEstimate) -> bool:

@@ -45,8 +45,9 @@ def correct_rows(matches: KeyframeMatches, finds_readout: bool = True) -> float:
     whether the readout is found once more, where it was found in the video. Returns how many times
     the readout it is.
     """
-    keyframes, log, measured = matches.keyframes, matches.log, matches.graph.packed
-    search, last = _Search(), ROUNDS - 1
+    keyframes, log, search, last = matches.keyframes, matches.log, _Search(), ROUNDS - 1
+    matches.corrections.pop("readout", None)  # which the rows have by now
+    measured = matches.corrected(but="rows")
     for n in range(1 + READOUTS):
         errors = row_errors(log, keyframes) if measured else None
         if errors is None:
@@ -62,8 +63,8 @@ def correct_rows(matches: KeyframeMatches, finds_readout: bool = True) -> float:
         present = errors.with_readout(search.factor)
         found = row_twists(present, keyframes, measured, log)
         present = present.with_twists(found.frames, found.twist)
-        shifts = partial(_shifts, present, keyframes, measured)
-        matches.correct(measured, shifts, None if n == last else BETWEEN)
+        matches.corrections["rows"] = partial(_shifts, present, keyframes, measured)
+        matches.adjust(None if n == last else BETWEEN)
         shift_rows(log, keyframes, present)
         if n == last:
             break
@@ -80,15 +81,15 @@ def _shifts(
 def let_lenses_move(matches: KeyframeMatches, lenses: Mapping[int, FrameLens]) -> None:
     """Let the principal points of frames' lenses move while rows are read, if the matches say so.
 
-    A stabilised lens moves all the time, a crop is put elsewhere after an image was read. Images
-    and matches are straight by these lenses, and not corrected for the rows yet.
+    A stabilised lens moves all the time, a crop is put elsewhere after an image was read. Matches
+    are corrected for these lenses.
     """
     keyframes, log = matches.keyframes, matches.log
     still = row_errors(log, keyframes) if lenses else None
     if still is None:
         return
     moving = still.with_lenses(lenses)
-    if part_seen(still, moving, keyframes, matches.graph.edges, log) > MOVES:
+    if part_seen(still, moving, keyframes, matches.corrected(but="rows"), log) > MOVES:
         log.lenses = dict(lenses)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.camera.distortion import USUAL_BEND
@@ -40,7 +40,7 @@ a long valley; whoever stops in it may take the wrong one for the best."""
 class Start:
     """Keyframes placed by one candidate; on the CPU."""
 
-    lens: RadialLens
+    lens: Camera
     T_cw: Float[Tensor, "n 4 4"]
     inverse_depth: Float[Tensor, "p"]
     """On the cells of the first keyframe."""
@@ -55,20 +55,20 @@ class Start:
         return self.cost + BEND_COST * sum((k / usual) ** 2 for k, usual in bends)
 
 
-def candidates(camera: Camera, radial: bool) -> list[RadialLens]:
+def candidates(camera: Camera, radial: bool) -> list[Camera]:
     """The guess, pinholes of other fields of view, and barrels if lenses are ``radial``."""
     guess = camera.with_focal(camera.fx)
     pinholes = [guess, *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
     wide = [guess, camera.with_field_of_view(OF_BARREL)] if radial else []
-    return [*map(RadialLens, pinholes), *(RadialLens(c, *BARREL) for c in wide)]
+    return [*pinholes, *(c.moved(0.0, *BARREL) for c in wide)]
 
 
 def try_candidate(
-    lens: RadialLens, flows: list[FlowMatch], min_parallax: float, radial: bool
+    lens: Camera, flows: list[FlowMatch], min_parallax: float, radial: bool
 ) -> Start | None:
     """Place the keyframes by the pinhole of a lens and adjust them from there, at last with k1 and
     k2 if ``radial``; None where it shows no parallax."""
-    camera, flows = lens.camera, [f.on_cpu() for f in flows]
+    camera, flows = lens.pinhole, [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view(camera, flows[1::2], min_parallax)
     if found is None:

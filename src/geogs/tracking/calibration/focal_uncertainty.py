@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from geogs.bundle.lens import RadialLens
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
 from geogs.camera.distortion import USUAL_BEND
+from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
 
@@ -28,7 +28,7 @@ FIELDS_OF_VIEW = 15.0, 150.0
 class Estimate:
     """The lens by one stretch."""
 
-    lens: RadialLens
+    lens: Camera
     covariance: Float64[Tensor, "3 3"]
     """Covariance of log focal length, k1 and k2; zero for those that are known."""
     keyframes: int
@@ -50,7 +50,7 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     result = bundle.result
     assert result is not None
     lens = result.block.lens
-    angle = 2 * math.degrees(math.atan(lens.camera.long_edge / 2 / lens.camera.fx))
+    angle = 2 * math.degrees(math.atan(lens.long_edge / 2 / lens.fx))
     if not FIELDS_OF_VIEW[0] < angle < FIELDS_OF_VIEW[1]:
         return f"it seems to have a field of view of {angle:.0f} degrees"
     bends = zip((lens.k1, lens.k2), USUAL_BEND, strict=True)

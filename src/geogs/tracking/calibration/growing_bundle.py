@@ -9,9 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
-from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View
@@ -57,7 +58,7 @@ class GrowingBundle:
         grid: SampleGrid,
         operator: FlowOperator,
         views: list[View],
-        lens: RadialLens,
+        lens: Camera,
         placed: PlacedViews,
     ) -> None:
         self.grid = grid
@@ -78,7 +79,7 @@ class GrowingBundle:
         grid: SampleGrid, operator: FlowOperator, views: list[View], start: Start
     ) -> "GrowingBundle":
         """The views that a candidate has placed, with the depth of the first one."""
-        views, pinhole = views[: len(start.T_cw)], SampleGrid(start.lens.camera, grid.device)
+        views, pinhole = views[: len(start.T_cw)], SampleGrid(start.lens.pinhole, grid.device)
         known = start.information.to(grid.device)
         first = grid_fields(grid).fill(start.inverse_depth.to(grid.device), known)
         each = [(first, known)]
@@ -100,13 +101,13 @@ class GrowingBundle:
     @property
     def _pinhole(self) -> SampleGrid:
         """The grid of the present focal length."""
-        return SampleGrid(self.lens.camera, self.grid.device)
+        return SampleGrid(self.lens.pinhole, self.grid.device)
 
     def place(self, view: View) -> bool:
         """Append the next view by PnP on the last one's depth; False if that fails."""
         assert view.step is not None
         grid, step = self._pinhole, view.step.there.on_cpu()
-        plain, depth = SampleGrid(self.lens.camera), self._depth[-1].cpu()
+        plain, depth = SampleGrid(self.lens.pinhole), self._depth[-1].cpu()
         good = step.sure()[0] & (self._information[-1].cpu() > 0)
         T = pnp(plain, depth, step.pixels[0], good)
         if T is None:

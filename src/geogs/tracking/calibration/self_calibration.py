@@ -89,7 +89,7 @@ def self_calibrate(
         lens = found.lens
         bends = lens.k1 != 0 or lens.k2 != 0
         return SelfCalibration(
-            camera.with_focal(camera.fx * lens.camera.fx / small.fx),
+            camera.with_focal(camera.fx * lens.fx / small.fx),
             (lens.k1, lens.k2) if bends else None, found.deviation,
             found.deviations[1:] if bends else None, found.keyframes, gatherer.frames,
             placed=stretch.placed,

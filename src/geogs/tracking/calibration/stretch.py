@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from geogs.bundle.lens import RadialLens
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate
@@ -92,7 +91,7 @@ class Stretch:
         views = self._gatherer.again(before.frames, self._tick)
         if len(views) < len(before.frames):
             return "the video has fewer images than before"
-        lens = RadialLens(self.grid.camera)
+        lens = self.grid.camera
         bundle = GrowingBundle(self.grid, self.operator, views, lens, before)
         if not self._adjusted(bundle, fine=True):
             return NOT_FOLLOWED

@@ -12,7 +12,6 @@ from torch import Tensor
 from geogs.bundle.device_choice import motion_solver
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
-from geogs.bundle.uncertainty.lens_error import LensBend
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.interpolation import bridged
@@ -106,25 +105,11 @@ def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> N
             [keyframes[k].frame_index for k in ids], seen,
             errors.poses(seen) @ se3_inverse(keyframes.poses(ids)),
             grid.rays[cells], keyframes.inverse_depths(ids)[:, cells],
-            unpacked_positions(grid, torch.stack([o.position for _, o in part])),
+            unpacked_positions(grid, torch.stack([o.of_one_lens for _, o in part])),
         )  # fmt: skip
         steps = in_steps(grid.camera, shifts.shift)
         for (_, observation), step in zip(part, steps, strict=True):
             observation.shift = step
-
-
-def shift_lens(frames: FrameLog, keyframes: KeyframeSet, bend: LensBend) -> None:
-    """Correct what was found of frames by what the lens bends, beside the errors of their rows."""
-    grid = keyframes.grid
-    cells, poses = sparse_cells(grid), solved_poses(frames, keyframes)
-    for part, ids in seen_by_keyframes(frames, keyframes):
-        seen = torch.stack([poses[r.index] for r, _ in part])
-        T, depth = seen @ se3_inverse(keyframes.poses(ids)), keyframes.inverse_depths(ids)
-        shifts = bend.of_matches(grid.camera, grid.rays[cells], T, depth[:, cells])
-        steps = in_steps(grid.camera, shifts)
-        for (_, observation), shift in zip(part, steps, strict=True):
-            rows = observation.shift if frames.rows else None
-            observation.shift = shift if rows is None else rows + shift
 
 
 def seen_by_keyframes(

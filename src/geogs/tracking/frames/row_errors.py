@@ -215,13 +215,13 @@ class RowErrors:
             pixels: where they were found in the target.
         """
         camera = self._grid.camera
-        own = pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
+        own = pixels.new_tensor([camera.fx, camera.fy]) * camera.bent(rays[:, :2])
         own = (own + pixels.new_tensor([camera.cx, camera.cy])).expand_as(pixels)
         p = project(camera, rays, T_ji, inverse_depth)
         there = self.of_pixels(target, pixels, inverse_depth / p.z)
         here = self.of_pixels(source, own, inverse_depth)
         shift, slope = (
-            t - carried_over(camera, T_ji, p, h) for t, h in zip(there, here, strict=True)
+            t - carried_over(camera, rays, T_ji, p, h) for t, h in zip(there, here, strict=True)
         )
         believed = p.valid & (shift.norm(dim=-1) < MAX_SHIFT * camera.long_edge)
         return RowShifts(*(torch.where(believed[..., None], x, 0.0) for x in (shift, slope)))
@@ -264,14 +264,14 @@ class RowErrors:
         """:meth:`_shifted` of all edges of rectified frames by compiled loops, into ``found``."""
         from geogs.tracking.frames.row_kernels import shift_pixels
 
-        c = self._grid.camera
-        camera = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
+        camera = np.array(self._grid.camera.numbers, np.float32)
         limits, factor = np.array([CELL, MIN_Z], np.float32), np.float32(self._factor)
         known = {
             frame: (laid(f.rows).float().numpy(), f.times.numpy(), f.motions.numpy())
             for frame, f in rectified.items()
         }
-        each = zip(*(x.contiguous().numpy() for x in (pixels, inverse_depth, *found)), strict=True)
+        both = pixels, self._grid.camera.plane(pixels), inverse_depth
+        each = zip(*(x.contiguous().numpy() for x in (*both, *found)), strict=True)
         for frame, edge in zip(frames, each, strict=True):
             if frame in known:
                 shift_pixels(*known[frame], camera, limits, factor, *edge)
@@ -292,7 +292,7 @@ class RowErrors:
         focal, centre = (
             pixels.new_tensor([camera.fx, camera.fy]), pixels.new_tensor([camera.cx, camera.cy])
         )  # fmt: skip
-        plane = (pixels - centre) / focal
+        plane = camera.plane(pixels)
         rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
         moved, change = torch.zeros_like(plane), torch.zeros_like(plane)
         for j in range(NODES):
@@ -300,8 +300,12 @@ class RowErrors:
             there = y[..., :2] / z[..., None]
             moved += weights[j][..., None] * there
             change += changes[j][..., None] * there
+        xx, xy, yy = camera.bend_jacobian(moved)
+        x, y = change.unbind(-1)
+        bent_change = torch.stack([xx * x + xy * y, xy * x + yy * y], -1)
         return RowShifts(
-            pixels + offset - (moved * focal + centre), -seconds[..., None] * change * focal
+            pixels + offset - (camera.bent(moved) * focal + centre),
+            -seconds[..., None] * bent_change * focal,
         )
 
 

@@ -9,22 +9,23 @@ from numba import njit
 
 _NODES = 5
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_TWO, _FOUR = np.float32(2.0), np.float32(4.0)
 
 
 @njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
 )  # fmt: skip
 def shift_pixels(
-    field, times, motions, camera, limits, factor, pixels, inverse_depth, shift, slope
+    field, times, motions, camera, limits, factor, pixels, plane, inverse_depth, shift, slope
 ):
     """Fill ``shift`` and ``slope`` (p, 2), as :meth:`RowErrors.of_pixels` says.
 
     Of the frame: ``field`` (r, c, 3) of offsets and seconds, times (5) of the nodes and motions
-    (5, 4, 4) to them. ``camera`` as fx, fy, cx, cy; ``limits`` are the pixels of a cell of the
-    field and the least z. Then the factor on the readout, pixels (p, 2) and their inverse depths
-    (p); all float32.
+    (5, 4, 4) to them. ``camera`` as fx, fy, cx, cy, k1, k2; ``limits`` are the pixels of a cell of
+    the field and the least z. Then the factor on the readout, pixels (p, 2), their points on the
+    plane z = 1 (p, 2) and inverse depths (p); all float32.
     """
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
+    fx, fy, cx, cy, k1, k2 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
     cell, nearest = limits[0], limits[1]
     bottom, right = field.shape[0] - 1, field.shape[1] - 1
     seconds, inverse_span = (
@@ -52,7 +53,7 @@ def shift_pixels(
                 seconds[n] = value
     for n in range(len(pixels)):
         at, d = factor * seconds[n], inverse_depth[n]
-        x, y = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
+        x, y = plane[n, 0], plane[n, 1]
         u = v = along = across = _ZERO
         for j in range(_NODES):
             weight, change = _ONE, _ZERO
@@ -70,7 +71,10 @@ def shift_pixels(
             v += weight * Y
             along += change * X
             across += change * Y
-        shift[n, 0] += pixels[n, 0] - (u * fx + cx)
-        shift[n, 1] += pixels[n, 1] - (v * fy + cy)
-        slope[n, 0] = -seconds[n] * along * fx
-        slope[n, 1] = -seconds[n] * across * fy
+        square = u * u + v * v
+        growth = _ONE + square * (k1 + square * k2)
+        turned = (_TWO * k1 + _FOUR * k2 * square) * (u * along + v * across)
+        shift[n, 0] += pixels[n, 0] - (u * growth * fx + cx)
+        shift[n, 1] += pixels[n, 1] - (v * growth * fy + cy)
+        slope[n, 0] = -seconds[n] * (along * growth + u * turned) * fx
+        slope[n, 1] = -seconds[n] * (across * growth + v * turned) * fy

@@ -17,6 +17,7 @@ from geogs.bundle.device_choice import (
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project
 from geogs.bundle.protocols import BundleOptions, BundleResult
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator
@@ -54,9 +55,9 @@ class FrameGraph:
         self.edges: dict[Pair, Edge] = {} if edges is None else edges
         self.bundle = bundle_solver(keyframes.grid)
 
-    def refocus(self, factor: float) -> None:
-        """Take matches and depths for what a focal length saw that is so many times the images'."""
-        self.keyframes.table.refocus(factor)
+    def see_by(self, camera: Camera) -> None:
+        """Take matches and depths for what another camera saw."""
+        self.keyframes.table.see_by(camera)
         self.bundle = bundle_solver(self.keyframes.grid)
 
     @property
