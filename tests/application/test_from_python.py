@@ -20,7 +20,6 @@ from geogs.cli import main as cli
 from geogs.cli.terminal.speech import NOT_JUDGED, closing_message
 from geogs.config import InputConfig
 from geogs.io.pose_files import read_tum_trajectory
-from geogs.loop.camera.found import FoundLenses
 from geogs.pose_estimate import PoseEstimate
 from geogs.types import FoundLens
 from posed_scene import vertices
@@ -201,11 +200,18 @@ def test_the_package_loads_nothing_before_it_is_used():
 @pytest.mark.usefixtures("no_report")
 def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, monkeypatch):
     found = FoundLens(0.1, -0.05, 0.002, 0.003)
+
+    def bent(matches, *_, before=None, **__) -> FoundLens | None:
+        if before is not None:
+            return None
+        matches.graph.see_by(matches.camera.moved(0.0, 0.1, -0.05))
+        return found
+
     patch = "geogs.loop.camera.adjustment.correct_lens"
     folder = tmp_path / "out"
-    argv = [str(small_room), *RUN, "--device", "cpu"]
+    argv = [str(small_room), *RUN, "--device", "cpu", "--no-fallback"]
     with monkeypatch.context() as patched:
-        patched.setattr(patch, lambda *_, before=None, **__: FoundLenses(None if before else found))
+        patched.setattr(patch, bent)
         assert cli.main(["run", *argv, "-o", str(folder)]) == 0
     (said,) = re.findall(r"Lens, by all matches, .*", capfd.readouterr().err)
     assert "(none): k1 0.1000 +- 0.0020, k2 -0.0500 +- 0.0030" in said

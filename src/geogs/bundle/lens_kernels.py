@@ -10,6 +10,7 @@ for each other.
 import numpy as np
 from numba import njit
 
+from geogs.geometry.camera import LEAST_SLOPE
 from geogs.kernel_parts import inlined
 
 _FAST = {
@@ -19,7 +20,8 @@ _FAST = {
 _PART = inlined(_FAST)
 _BLOCK = 64
 """Cells whose derivatives are formed at a time: they stay in the first cache."""
-_ZERO, _ONE, _TWO, _FOUR = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(4.0)
+_ZERO, _ONE, _TWO, _THREE, _FOUR, _FIVE = map(np.float32, range(6))
+_LEAST_SLOPE = np.float32(LEAST_SLOPE)
 
 
 @njit(**_PART)
@@ -30,6 +32,12 @@ def _seen(motion, x, y, d, nearest):
     Z = motion[2, 0] * x + motion[2, 1] * y + motion[2, 2] + motion[2, 3] * d
     q = _ONE / (nearest if nearest > Z else Z)
     return X * q, Y * q, q, nearest < Z
+
+
+@njit(**_PART)
+def _unfolded(square, k1, k2):
+    """Whether the lens does not fold over what lies so far off its axis."""
+    return _ONE + square * (_THREE * k1 + _FIVE * square * k2) > _LEAST_SLOPE
 
 
 @njit(**_PART)
@@ -86,6 +94,7 @@ def _derivatives(motion, rays, slopes, lens, inverse_depth, pixels, weight, limi
             second[8, n] = across * slopes[2, n] + own_y * square * square
         a = pixels[n, 0] - (fx * u * growth + cx)
         b = pixels[n, 1] - (fy * v * growth + cy)
+        is_front = is_front and _unfolded(square, k1, k2)
         wx = weight[n, 0] if is_front else _ZERO
         wy = weight[n, 1] if is_front else _ZERO
         norm = np.sqrt(wx * a * a + wy * b * b)
@@ -169,7 +178,7 @@ def cost_of_source(motions, rays, lens, inverse_depth, pixels, weight, limits, b
             a = pixels[e, n, 0] - (fx * u * growth + cx)
             b = pixels[e, n, 1] - (fy * v * growth + cy)
             error = weight[e, n, 0] * a * a + weight[e, n, 1] * b * b
-            if not is_front:
+            if not (is_front and _unfolded(square, k1, k2)):
                 error = behind
             total += (
                 error if not error > knee * knee else _TWO * knee * np.sqrt(error) - knee * knee

@@ -97,9 +97,8 @@ def project(
     y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
     if not camera.is_pinhole:
         plane = y[..., :2] / z[..., None]
-        focal, centre = plane.new_tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]])
         is_shown = camera.steepness(plane.square().sum(-1)) > LEAST_SLOPE
-        return CellProjection(camera.bent(plane) * focal + centre, valid & is_shown, z)
+        return CellProjection(camera.pixels(plane), valid & is_shown, z)
     pixels = torch.stack(
         [camera.fx * y[..., 0] / z + camera.cx, camera.fy * y[..., 1] / z + camera.cy], -1
     )

@@ -134,7 +134,7 @@ extern "C" __global__ void __launch_bounds__(1024) carry_depth(
     for (int p = threadIdx.x; p < cells; p += blockDim.x) {
       Projected at = project_cell(motion, rays, p, d[p]);
       if (pass == 0 && there) there[to + p] = pixel_of(camera, at);
-      int cell = at.valid ? cell_of(pixel_of(camera, at), offset, stride, width, height) : -1;
+      int cell = is_shown(camera, at) ? cell_of(pixel_of(camera, at), offset, stride, width, height) : -1;
       if (cell < 0) continue;
       float moved = d[p] / at.z;
       // Positive numbers are ordered as their bits.

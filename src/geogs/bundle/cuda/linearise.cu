@@ -65,7 +65,7 @@ extern "C" __global__ void __launch_bounds__(256) find_edge_costs(
     Projected seen = project_cell(pose, rays, p, inverse_depth[(size_t)i * cells + p]);
     float2 at = pixel_of(camera, seen), measured = pixels[e * cells + p], w = weight[e * cells + p];
     float rx = measured.x - at.x, ry = measured.y - at.y;
-    float norm = seen.valid ? sqrtf(w.x * rx * rx + w.y * ry * ry) : behind * huber;
+    float norm = is_shown(camera, seen) ? sqrtf(w.x * rx * rx + w.y * ry * ry) : behind * huber;
     if (w.x > 0.f) sum += norm <= huber ? norm * norm : huber * (2.f * norm - huber);
   }
   sum = block_sum(sum);

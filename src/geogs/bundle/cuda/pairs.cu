@@ -61,7 +61,7 @@ extern "C" __global__ void __launch_bounds__(128) pair_distances(
     float d = inverse_depth[(size_t)i * width * height + p];
     for (int k = 0; k < 2; k++) {
       Projected at = project_cell(k ? shift : motion, rays, p, d);
-      if (!at.valid) continue;
+      if (!is_shown(camera, at)) continue;
       float2 q = pixel_of(camera, at);
       float x = q.x - grid_pixels[p].x, y = q.y - grid_pixels[p].y;
       flow[k] += sqrtf(x * x + y * y);

@@ -4,6 +4,7 @@
 #include "pose.cuh"
 
 #define MIN_Z 0.05f
+#define LEAST_SLOPE 0.1f
 
 // Pixel = c + f x (1 + k1 |x|^2 + k2 |x|^4) of a point x on the plane z = 1.
 struct Camera { float fx, fy, cx, cy, k1, k2; };
@@ -32,6 +33,12 @@ __device__ __forceinline__ float2 pixel_of(const Camera& camera, const Projected
   float square = p.x * p.x + p.y * p.y, growth = 1.f + square * (camera.k1 + square * camera.k2);
   return make_float2(
       camera.fx * (p.x * growth) + camera.cx, camera.fy * (p.y * growth) + camera.cy);
+}
+
+// Whether a point lies before the target, and where the radial terms do not fold the image over.
+__device__ __forceinline__ bool is_shown(const Camera& camera, const Projected& p) {
+  float square = p.x * p.x + p.y * p.y;
+  return p.valid && 1.f + square * (3.f * camera.k1 + 5.f * square * camera.k2) > LEAST_SLOPE;
 }
 
 // Derivatives of a pixel by its point on the plane z = 1.
@@ -72,7 +79,7 @@ __device__ __forceinline__ LinearCell linearise_cell(
   c.dy = b.yx * by_depth_x + b.yy * by_depth_y;
   c.rx = pixel.x - at.x;
   c.ry = pixel.y - at.y;
-  float seen = p.valid ? 1.f : 0.f;
+  float seen = is_shown(camera, p) ? 1.f : 0.f;
   c.wx = weight.x * seen;
   c.wy = weight.y * seen;
   float norm = sqrtf(c.wx * c.rx * c.rx + c.wy * c.ry * c.ry);

@@ -31,6 +31,6 @@ def adjust_camera(matches: KeyframeMatches, ends: bool) -> None:
         let_lenses_move(matches, own.each)
         correct_rows(matches, finds_readout=False)
     own = correct_frame_lenses(matches, own) if own else FrameLenses()
-    lens = correct_lens(matches, ends, before=lens) if lens else None
+    lens = (correct_lens(matches, ends, before=lens) or lens) if lens else None
     if lens or own:
         straighten(matches.keyframes, straight_views(table.camera, matches.camera, lens, own))
