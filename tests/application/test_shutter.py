@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from geogs.application.calibrate import self_calibrated, with_shutter_found
+from geogs.application.calibrate import with_shutter_found
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
 from geogs.application.results.summary import source_summary
@@ -17,8 +17,6 @@ from geogs.camera.shutter.shutter import Shutter
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
-from geogs.tracking.calibration import self_calibration
-from geogs.tracking.calibration.self_calibration import SelfCalibration
 from io_samples import write_images
 from progress_listener import Listener
 
@@ -49,24 +47,6 @@ def test_a_readout_that_is_found_is_said_and_written(folder, tmp_path, monkeypat
     assert said["readout"] == 0.0276
     assert said["origin"].startswith("found in the video: 12 clips")
     assert source_summary(source)["shutter"] == said
-
-
-def test_the_focal_length_is_asked_of_rectified_rows(folder, monkeypatch):
-    """And the shutter again afterwards, by that focal length."""
-    asked = []
-
-    def calibrates(frames, *given):
-        asked.append([frame.rows is not None for frame in frames])
-        return SelfCalibration(given[0], failure="it is a test")
-
-    monkeypatch.setattr(self_calibration, "self_calibrate", calibrates)
-    for found in (FOUND, FoundReadout(0.0, 0.012, 0.009, 8)):
-        finding(monkeypatch, found)
-        listener = Listener()
-        source = self_calibrated(open_source(folder), progress=listener)
-        assert source.is_shutter_open
-        assert not any("shutter" in words for words in listener.said)
-    assert asked == [[True] * 4, [False] * 4]
 
 
 def test_what_is_not_believed_leaves_the_shutter_global(folder, monkeypatch):

@@ -12,7 +12,6 @@ import torch
 
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
-from geogs.camera.distortion import with_bend
 from geogs.camera.shutter.shutter import Shutter
 from geogs.config import Config
 from geogs.io.sources.calibration import Calibration, FocalRefinement
@@ -21,15 +20,10 @@ from geogs.types import FoundLens
 
 if TYPE_CHECKING:
     from geogs.camera.shutter.readout import FoundReadout
-    from geogs.tracking.calibration.growing_bundle import PlacedViews
     from geogs.tracking.calibration.self_calibration import SelfCalibration
 
 F = TypeVar("F")
 Report = Callable[[float], None]
-LENS_ROUNDS = 3
-"""Times that a lens is asked for, at most, each time with rows rectified by the one before."""
-SETTLED = 2.0
-"""Deviations that a lens moves by, at most, from one round to the last one."""
 
 
 def without_overlay(source: Source, progress: RunProgress | None = None) -> Source:
@@ -62,7 +56,7 @@ def self_calibrated(
     """The source with its focal length refined, if that is a guess or nominal and may be refined.
 
     Where the video does not tell, or after a request to stop, the guess stays and ``progress``
-    says so. Where rows do not roll by the lens that was found, the shutter is known, too.
+    says so.
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
     if not (config.calibration.refine and source.is_calibration_open):
@@ -72,95 +66,33 @@ def self_calibrated(
                 "--intrinsics fx,fy,cx,cy for a better result."
             )
         return source
-    found = _by_rectified_rows(source, config.calibration.radial, device, progress, stop)
+    ask = partial(_self_calibration, source, config.calibration.radial, device)
+    found = _found("calibration", progress, stop, ask)
     if found is None:
         progress.write(
             f"Calibration stopped; going on with {source.intrinsics_origin}. "
             "Press Ctrl-C again to end."
         )
         return source
-    progress.write(_calibration_sentence(found.calibration, source.intrinsics_origin))
-    return found
-
-
-def _by_rectified_rows(
-    source: Source, radial: bool, device: str | torch.device, progress: RunProgress, stop: Stop
-) -> Source | None:
-    """The source with what it tells of its lens; none where a request to stop came before.
-
-    A turn that stretches what is seen row by row looks like another lens, so the lens is asked for
-    on rectified rows. But rows are rectified by a lens, and by a guess they are so only in part,
-    and their readout is known to a sixth or so: hence both again, near what was found, until the
-    lens stays. What the images do not tell then is as before.
-    """
-    radial = radial and not source.calibration.is_distorted
-    calibrated, rolled, placed = source, False, None
-    for n in range(LENS_ROUNDS):
-        known = calibrated if n else None
-        rectified = _with_rows_rectified(calibrated, progress, stop, n)
-        if rectified is None:
-            return known
-        rolls = rectified.shutter.readout != 0
-        if n and not (rolls or rolled):
-            return rectified
-        images = rectified if rolls else calibrated
-        ask = partial(_self_calibration, images, radial, device, n, placed)
-        found = _found("calibration", progress, stop, ask)
-        if found is None or (n and found.failure is not None):
-            return known
-        placed = found.placed
-        before, found = calibrated.calibration, _of_stored(found, calibrated, source)
-        after = refined(source.calibration, source.camera.fx, found)
-        calibrated, rolled = source.with_calibration(after), rolls
-        if found.failure is not None or _is_settled(before, after, found):
-            break
-    return calibrated
-
-
-def _is_settled(before: Calibration, after: Calibration, found: "SelfCalibration") -> bool:
-    """Whether a lens is about the one before, by the deviations of what was found."""
-    bends = (lens.distortion or (0.0, 0.0) for lens in (before, after))
-    bent = zip(*bends, found.deviations or (0.0, 0.0), strict=False)
-    return abs(math.log(after.fx / before.fx)) <= SETTLED * found.deviation and all(
-        abs(new - old) <= SETTLED * deviation for old, new, deviation in bent
-    )
-
-
-def _of_stored(found: "SelfCalibration", straight: Source, source: Source) -> "SelfCalibration":
-    """What was found on the images of ``straight``, for those of the source as they are stored."""
-    before, bend = straight.calibration, found.distortion
-    factor = found.camera.fx / straight.camera.fx
-    camera, (k1, k2, *_) = with_bend(
-        before.camera(), before.distortion, before.lens, bend or (0.0, 0.0), factor
-    )
-    working = source.camera.fx * camera.fx / source.calibration.fx
-    return replace(
-        found, camera=source.camera.with_focal(working),
-        distortion=None if bend is None else (k1, k2),
-    )  # fmt: skip
+    calibration = refined(source.calibration, source.camera.fx, found)
+    progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
+    return source.with_calibration(calibration)
 
 
 def _self_calibration(
-    source: Source,
-    radial: bool,
-    device: str | torch.device,
-    n: int,
-    placed: "PlacedViews | None",
-    report: Report,
+    source: Source, radial: bool, device: str | torch.device, report: Report
 ) -> "SelfCalibration":
-    """Lens of the images in round ``n``: estimated from the views that the round before ``placed``,
-    and from all where there are none, or where these fail."""
-    from geogs.tracking.calibration.self_calibration import part_of, self_calibrate
+    """Lens of the images of a source, whose rows are as they came."""
+    from geogs.tracking.calibration.self_calibration import self_calibrate
 
-    def estimate(before: "PlacedViews | None") -> "SelfCalibration":
-        with closing(source.linked_frames()) as frames:
-            return self_calibrate(
-                frames, source.camera, radial, device, part_of(report, n), source.mask,
-                source.black_is_masked, before,
-            )  # fmt: skip
-
-    found = estimate(placed)
-    return estimate(None) if placed is not None and found.failure is not None else found
+    known = None if source.is_shutter_open else source.shutter.readout
+    raw = source.with_shutter(Shutter()) if known else source
+    with closing(raw.linked_frames()) as frames:
+        return self_calibrate(
+            frames, source.camera, radial and not source.calibration.is_distorted, device, report,
+            source.mask, source.black_is_masked, None if known == 0 else source.rolling_camera,
+            known,
+        )  # fmt: skip
 
 
 def refined(
@@ -258,22 +190,6 @@ def with_shutter_found(
             f"({_evidence(found)}); rows are rectified."
         )
     return source.with_shutter(_shutter(found))
-
-
-def _with_rows_rectified(
-    source: Source, progress: RunProgress, stop: Stop, n: int
-) -> Source | None:
-    """The source with its rows rectified by its lens as it is known before round ``n``; none after
-    a request to stop."""
-    from geogs.tracking.calibration.self_calibration import part_of
-
-    if not source.is_shutter_open:
-        return source
-    found = _found(
-        "calibration", progress, stop,
-        lambda report: _readout(source, lambda fraction: part_of(report, n)(0.0)),
-    )  # fmt: skip
-    return None if found is None else source.with_shutter(_shutter(found))
 
 
 def _readout(source: Source, report: Report) -> "FoundReadout":

@@ -1,4 +1,4 @@
-"""The camera with unknowns: one focal length and two radial terms, with exact Jacobians.
+"""The camera with unknowns: focal length and two radial terms, with exact Jacobians, and a readout.
 
 All enter twice: in the ray of a source's cell and in its projection into the target.
 """
@@ -11,7 +11,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import CellProjection, project, relative_motion
+from geogs.bundle.row_motions import RowMotions
 from geogs.geometry.camera import Camera
+
+UNIT = 0.01
+"""Seconds of a readout that is one in the equations: as large as other unknowns are."""
 
 
 @dataclass(frozen=True)
@@ -25,20 +29,42 @@ class LensBlock:
     """Whether the focal length is a variable."""
     radial: bool = False
     """Whether k1 and k2 are variables."""
+    rows: RowMotions | None = None
+    """How frames move while they are read; none where all rows are seen at once."""
+    readout: float = 0.0
+    """Seconds from the first to the last row: the last unknown where there are ``rows``."""
+    rolls: bool = True
+    """Whether it is a variable."""
 
     @property
-    def free(self) -> tuple[bool, bool, bool]:
+    def free(self) -> tuple[bool, ...]:
         """Whether each unknown is a variable."""
-        return self.focal, self.radial, self.radial
+        of_rows = () if self.rows is None else (self.rolls,)
+        return self.focal, self.radial, self.radial, *of_rows
 
     @cached_property
     def rays(self) -> "LensRays":
         """Rays of the cells."""
         return lens_rays(self.lens, self.pixels)
 
-    def moved(self, step: Float[Tensor, "3"]) -> "LensBlock":
+    def moved(self, step: Float[Tensor, "m"]) -> "LensBlock":
         """The block after a step of all unknowns, zero for those that are no variables."""
-        return replace(self, lens=self.lens.moved(*step.tolist()))
+        *lens, longer = [*step.tolist(), 0.0][:4]
+        return replace(self, lens=self.lens.moved(*lens), readout=self.readout + UNIT * longer)
+
+    def slopes(
+        self,
+        T_cw: Float[Tensor, "n 4 4"],
+        source: Int[Tensor, "e"],
+        target: Int[Tensor, "e"],
+        inverse_depth: Float[Tensor, "n p"],
+    ) -> Float[Tensor, "e p 2"] | None:
+        """Moves of where cells are found by a readout of a second; none where all rows are seen at
+        once."""
+        if self.rows is None:
+            return None
+        T_ji = relative_motion(T_cw, source, target)
+        return self.rows.slopes(self.lens, self.rays.rays, T_ji, inverse_depth, source, target)
 
     def project(
         self,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from geogs.bundle.flow_term import BEHIND, SourceFlow, damped_curvature
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
-from geogs.bundle.lens import LensBlock
+from geogs.bundle.lens import UNIT, LensBlock
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import MIN_Z, relative_motion
 from geogs.bundle.protocols import BundleOptions
@@ -45,12 +45,16 @@ class LensFlow:
         from geogs.bundle.lens_kernels import linearise_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
-        adjoint, edges = se3_adjoint(T_ji), _Edges(self._block(state), problem, T_ji)
+        block = self._block(state)
+        by_rows = block.slopes(state.T_cw, problem.source, problem.target, state.inverse_depth)
+        adjoint, edges = se3_adjoint(T_ji), _Edges(block, problem, T_ji, by_rows)
         limits = _limits(options.huber)
         slopes = edges.slopes if self._known is None else edges.slopes[:0]
         further = np.zeros((len(edges.weight), 0, 0, 2), np.float32)
         if self._further is not None:
             further = _float(self._further(problem))
+        elif by_rows is not None:
+            further = _float(UNIT * by_rows[:, None])
         shared = len(slopes) + further.shape[1]
         for frame, e in sources_within(problem.source):
             size = 6 * (e.stop - e.start) + shared
@@ -71,7 +75,9 @@ class LensFlow:
         from geogs.bundle.lens_kernels import cost_of_source
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
-        edges = _Edges(self._block(state), problem, T_ji)
+        block = self._block(state)
+        by_rows = block.slopes(state.T_cw, problem.source, problem.target, state.inverse_depth)
+        edges = _Edges(block, problem, T_ji, by_rows)
         behind, limits = np.float32((BEHIND * huber) ** 2), _limits(huber)
         return sum(
             cost_of_source(
@@ -89,13 +95,20 @@ class _Edges:
     """Edges and the lens as the kernels take them."""
 
     def __init__(
-        self, block: LensBlock, problem: BundleProblem, T_ji: Float[Tensor, "e 4 4"]
+        self,
+        block: LensBlock,
+        problem: BundleProblem,
+        T_ji: Float[Tensor, "e 4 4"],
+        by_rows: Float[Tensor, "e p 2"] | None,
     ) -> None:
         lens = block.lens
         self.motions = _float(T_ji[:, :3])
         self.rays, self.slopes = _float(block.rays.rays[:, :2].mT), _float(block.rays.slope)
         self.lens = np.array(lens.numbers, np.float32)
-        self.pixels, self.weight = _float(problem.pixels), _float(problem.weight)
+        pixels = problem.pixels
+        if by_rows is not None:
+            pixels = pixels - block.readout * by_rows
+        self.pixels, self.weight = _float(pixels), _float(problem.weight)
 
 
 def _float(values: Tensor) -> np.ndarray:

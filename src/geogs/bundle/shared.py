@@ -1,4 +1,4 @@
-"""Bundle adjustment with unknowns that all edges share: a lens.
+"""Bundle adjustment with unknowns that all edges share: a lens, and the readout of a shutter.
 
 Levenberg-Marquardt on the tracker's cost (:mod:`geogs.bundle.dense`) with a block of unknowns
 beside poses and inverse depths: depths are eliminated frame by frame, then poses and block are
@@ -125,8 +125,12 @@ def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
     """Median residual of the matches in front of their targets, in their own deviations, where a
     problem was adjusted."""
     source, depth = problem.source, result.inverse_depth[problem.source]
-    at = result.block.project(result.T_cw, source, problem.target, depth)
-    found = residual_norms(at, problem.pixels, problem.weight)
+    block, pixels = result.block, problem.pixels
+    at = block.project(result.T_cw, source, problem.target, depth)
+    by_rows = block.slopes(result.T_cw, source, problem.target, result.inverse_depth)
+    if by_rows is not None:
+        pixels = pixels - block.readout * by_rows
+    found = residual_norms(at, pixels, problem.weight)
     return float(found[at.valid & (problem.weight[..., 0] > 0)].median())
 
 

@@ -1,5 +1,6 @@
 """The focal length of a video from its images alone, and what is said where it cannot be."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
@@ -8,7 +9,9 @@ import pytest
 import torch
 
 import tracking_scenes
-from geogs.bundle.lens import lens_rays
+from geogs.bundle.lens import UNIT, lens_rays
+from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS
+from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
@@ -53,43 +56,43 @@ def test_finds_the_focal_length_of_a_rendered_room(factor):
     assert shares[-1] == 1.0
 
 
-def test_views_that_were_placed_are_asked_again_from_there():
-    """As when rows are rectified by the lens that they told: of images that were read anew."""
-    video = list(frames(swinging(22)))
-    first = self_calibrate(iter(video), CAMERA.with_focal(0.8 * CAMERA.fx))
-    assert first.placed is not None
-    assert len(first.placed.frames) == first.keyframes > 4
-    near = CAMERA.with_focal(1.04 * CAMERA.fx)
-    again = self_calibrate(iter(video), near, before=first.placed)
-    assert again.failure is None
-    assert again.keyframes == first.keyframes
-    assert again.frames == max(first.placed.frames)  # no more of the video is read
-    assert abs(again.camera.fx / CAMERA.fx - 1) < 0.01
-    assert again.camera.fx == pytest.approx(first.camera.fx, rel=0.005)
-    short = self_calibrate(iter(video[:3]), near, before=first.placed)
-    assert short.failure == "the video has fewer images than before"
-    assert short.camera == near
+def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkeypatch):
+    """Of a room rendered row by row; taken for those of a global shutter the lens is off."""
+    readout, blocks, adjust = 0.025, [], GrowingBundle.adjust
+
+    def noted(bundle: GrowingBundle, radial: bool) -> bool:
+        blocks.append(bundle)
+        return adjust(bundle, radial)
+
+    monkeypatch.setattr(GrowingBundle, "adjust", noted)
+    video = list(rolled(22, readout))
+    guess, rolling = CAMERA.with_focal(0.8 * CAMERA.fx), RollingCamera(CAMERA)
+    plain = self_calibrate(iter(video), guess)
+    known = self_calibrate(iter(video), guess, rolling=rolling, readout=readout)
+    assert blocks[-1].readout == readout
+    found = self_calibrate(iter(video), guess, rolling=rolling)
+    deviation = STANDARD_ERRORS * UNIT * float(blocks[-1].result.covariance[3, 3].sqrt())
+    off, *less = (abs(f.camera.fx / CAMERA.fx - 1) for f in (plain, known, found))
+    print(off, less, blocks[-1].readout, deviation)
+    assert max(less) < min(0.01, 0.5 * off)
+    assert found.deviation < 0.05
 
 
-def test_views_that_cannot_be_placed_are_not_asked_again(monkeypatch):
-    """Those before them, by which the lens is known, are."""
-    monkeypatch.setattr(stretch, "ENOUGH_DEVIATION", 0.0)
-    monkeypatch.setattr(stretch, "START_KEYFRAMES", 6)
-    place, more = GrowingBundle.place, []
+def rolled(count: int, readout: float) -> Iterator[Frame]:
+    """A hand's path, each row rendered where the camera is then, in bands of a few."""
 
-    def one_more_at_most(bundle, view):
-        if len(bundle) >= 6:
-            more.append(view)
-        return len(more) < 2 and place(bundle, view)
+    def at(k: float) -> np.ndarray:
+        x, y, z = -0.5 + 0.04 * k, 0.08 * np.sin(0.6 * k), 0.06 * np.sin(0.5 * k)
+        return pose(x, y, z, 0.3 * np.sin(0.3 * k) + 0.06 * np.sin(0.7 * k))
 
-    monkeypatch.setattr(GrowingBundle, "place", one_more_at_most)
-    found = self_calibrate(frames(swinging(22)), CAMERA.with_focal(0.8 * CAMERA.fx))
-    assert len(more) == 2
-    assert found.failure is None
-    views = found.placed
-    assert len(views.frames) == len(views.T_cw) == len(views.inverse_depth) == found.keyframes
-    again = self_calibrate(frames(swinging(22)), found.camera, before=views)
-    assert again.failure is None
+    band, height = 6, CAMERA.height
+    for k in range(count):
+        image = np.zeros((height, CAMERA.width, 3), np.uint8)
+        for top in range(0, height, band):
+            middle = (top + (band - 1) / 2 + 0.5) / height - 0.5
+            seen = render(at(k + 30 * readout * middle))[0]
+            image[top : top + band] = seen[top : top + band]
+        yield Frame(k, k / 30, image)
 
 
 @pytest.mark.long

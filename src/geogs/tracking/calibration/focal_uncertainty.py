@@ -59,7 +59,7 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     if bundle.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
     asked = torch.tensor([1, radial, radial], dtype=torch.float64)
-    covariance = STANDARD_ERRORS**2 * result.covariance + LEAST_DEVIATION**2 * asked.diag()
+    covariance = STANDARD_ERRORS**2 * result.covariance[:3, :3] + LEAST_DEVIATION**2 * asked.diag()
     said = with_prior(Estimate(lens, covariance, len(bundle)))
     if said.deviation < UNRELIABLE:
         return said

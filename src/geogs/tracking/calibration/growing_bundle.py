@@ -5,14 +5,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.row_motions import RowMotions, RowTimes, fitted_twists
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
-from geogs.geometry.camera import Camera
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View
@@ -40,14 +40,14 @@ class _Edge:
 
 
 @dataclass(frozen=True)
-class PlacedViews:
-    """Views of a video as they were adjusted, from which another adjustment may begin."""
+class OpenRows:
+    """Rows of a rolling shutter in images as they came."""
 
-    frames: tuple[int, ...]
-    """Which images of the video they are."""
-    T_cw: list[Float[Tensor, "4 4"]]
-    inverse_depth: list[Float[Tensor, "p"]]
-    information: list[Float[Tensor, "p"]]
+    times: RowTimes
+    velocity: Callable[[View], tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]]
+    """Pixels per second of what the cells of a view show, and where they are known."""
+    readout: float | None = None
+    """Seconds, where it is known."""
 
 
 class GrowingBundle:
@@ -58,45 +58,31 @@ class GrowingBundle:
         grid: SampleGrid,
         operator: FlowOperator,
         views: list[View],
-        lens: Camera,
-        placed: PlacedViews,
+        start: Start,
+        rows: OpenRows | None = None,
     ) -> None:
+        """The views that a candidate has placed, with the depth of the first one; ``rows`` where
+        they may not all be seen at once."""
         self.grid = grid
         """Grid of the guess: of its camera nothing but the size is used."""
-        self._operator = operator
-        self.lens = lens
-        self._views = list(views)
-        self._T = list(placed.T_cw)
-        self._depth = list(placed.inverse_depth)
-        self._information = list(placed.information)
+        self._operator, self._rows = operator, rows
+        self.lens = start.lens
+        self.readout = (rows and rows.readout) or 0.0
+        """Seconds."""
+        self._views = views[: len(start.T_cw)]
+        known = start.information.to(grid.device)
+        first = grid_fields(grid).fill(start.inverse_depth.to(grid.device), known)
+        fields = grid_fields(self._pinhole)
+        each = [(first, known), *(fields.transfer(T, first, known) for T in start.T_cw[1:])]
+        self._T = list(start.T_cw)
+        self._depth, self._information = map(list, zip(*each, strict=True))
         self._edges: dict[tuple[int, int], _Edge] = {}
         self.result: SharedResult | None = None
         self.residual = math.inf
         """Median residual of the matches, in their own deviations, as last adjusted."""
 
-    @staticmethod
-    def begun(
-        grid: SampleGrid, operator: FlowOperator, views: list[View], start: Start
-    ) -> "GrowingBundle":
-        """The views that a candidate has placed, with the depth of the first one."""
-        views, pinhole = views[: len(start.T_cw)], SampleGrid(start.lens.pinhole, grid.device)
-        known = start.information.to(grid.device)
-        first = grid_fields(grid).fill(start.inverse_depth.to(grid.device), known)
-        each = [(first, known)]
-        each += [grid_fields(pinhole).transfer(T, first, known) for T in start.T_cw[1:]]
-        depth, information = map(list, zip(*each, strict=True))
-        frames = tuple(view.frame for view in views)
-        placed = PlacedViews(frames, list(start.T_cw), depth, information)
-        return GrowingBundle(grid, operator, views, start.lens, placed)
-
     def __len__(self) -> int:
         return len(self._views)
-
-    @property
-    def placed(self) -> PlacedViews:
-        """The views as they are now, whatever is placed later."""
-        frames = tuple(view.frame for view in self._views)
-        return PlacedViews(frames, list(self._T), list(self._depth), list(self._information))
 
     @property
     def _pinhole(self) -> SampleGrid:
@@ -172,12 +158,15 @@ class GrowingBundle:
 
     def adjust(self, radial: bool) -> bool:
         """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
-        block = LensBlock(self.lens, self.grid.pixels.cpu(), radial=radial)
-        problem = self.problem()
+        problem, rows = self.problem(), self._rows
+        block = LensBlock(
+            self.lens, self.grid.pixels.cpu(), True, radial, self._motions(problem.inverse_depth),
+            self.readout, rows is not None and rows.readout is None,
+        )  # fmt: skip
         result = solve_shared(problem, block, PATIENT, LEAST_DECREASE)
         if not result.finite:
             return False
-        self.result, self.lens = result, result.block.lens
+        self.result, self.lens, self.readout = result, result.block.lens, result.block.readout
         self.residual = usual_residual(problem, result)
         self._T = list(result.T_cw)
         information = result.information.to(self.grid.device)
@@ -186,6 +175,17 @@ class GrowingBundle:
         self._depth = list(grid_fields(self.grid).fill(depth, information))
         self._normalise()
         return True
+
+    def _motions(self, inverse_depth: Float[Tensor, "n p"]) -> RowMotions | None:
+        """How views move while they are read, by the images beside them; none where all rows are
+        seen at once."""
+        if self._rows is None:
+            return None
+        velocity, known = map(torch.stack, zip(*map(self._rows.velocity, self._views), strict=True))
+        rays = SampleGrid(self.lens).rays
+        known = known.cpu() & (torch.stack(self._information).cpu() > 0)
+        twist = fitted_twists(self.lens, rays, inverse_depth, velocity.cpu(), known)
+        return RowMotions(twist, self._rows.times)
 
     def _normalise(self) -> None:
         """Median depth 1, so that limits and thresholds mean the same everywhere."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate
-from geogs.tracking.calibration.growing_bundle import GrowingBundle, PlacedViews
+from geogs.tracking.calibration.growing_bundle import GrowingBundle, OpenRows
 from geogs.tracking.calibration.view_gatherer import View, ViewGatherer, flows_from_first
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
@@ -41,13 +41,13 @@ class Stretch:
         gatherer: ViewGatherer,
         radial: bool,
         report: Report,
+        rows: OpenRows | None = None,
     ) -> None:
-        """``radial``: whether k1 and k2 are found, too."""
+        """``radial``: whether k1 and k2 are found, too; so is the readout of ``rows`` that may not
+        all be seen at once."""
         self.grid, self.operator, self.radial = grid, operator, radial
-        self._gatherer, self._report = gatherer, report
+        self._gatherer, self._report, self._rows = gatherer, report, rows
         self._views: list[View] = []
-        self.placed: PlacedViews | None = None
-        """The views as they were adjusted last."""
         self._done = 0.0
         self._min_parallax = MIN_PARALLAX * grid.camera.long_edge
 
@@ -67,7 +67,7 @@ class Stretch:
         start = self._start()
         if isinstance(start, Degeneracy):
             return start.value
-        bundle = GrowingBundle.begun(self.grid, self.operator, self._views, start)
+        bundle = GrowingBundle(self.grid, self.operator, self._views, start, self._rows)
         said: Estimate | str = NOT_FOLLOWED
         while True:
             for view in self._views[len(bundle) :]:
@@ -85,25 +85,10 @@ class Stretch:
             if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
                 return said
 
-    def ask_again(self, before: PlacedViews) -> Estimate | str:
-        """Estimate by views that were placed before, of images that are nearly straight since: they
-        are matched from there, and adjusted."""
-        views = self._gatherer.again(before.frames, self._tick)
-        if len(views) < len(before.frames):
-            return "the video has fewer images than before"
-        lens = self.grid.camera
-        bundle = GrowingBundle(self.grid, self.operator, views, lens, before)
-        if not self._adjusted(bundle, fine=True):
-            return NOT_FOLLOWED
-        return estimate(bundle, self.radial)
-
     def _adjusted(self, bundle: GrowingBundle, fine: bool) -> bool:
         """Whether views were matched and adjusted."""
         bundle.measure(fine, self._tick)
-        if not bundle.adjust(self.radial):
-            return False
-        self.placed = bundle.placed
-        return True
+        return bundle.adjust(self.radial)
 
     def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
@@ -135,4 +120,6 @@ class Stretch:
         if not found:
             return Degeneracy.TURNING
         best = min(found, key=lambda s: s.penalised)
-        return best if best.cost <= MAX_COST else Degeneracy.UNEXPLAINED
+        # Rows that roll are not explained yet.
+        is_explained = best.cost <= MAX_COST or self._rows is not None
+        return best if is_explained else Degeneracy.UNEXPLAINED

@@ -1,0 +1,106 @@
+"""A rolling shutter in an adjustment: how the camera moves while it reads each frame.
+
+Row by row a frame is seen from other places. To first order in the readout r, a point that a
+pinhole with the pose of the middle row would show at p is seen at p + r t v: t is the time of its
+row, in readouts from the middle one, and v the velocity of the point in the image, which follows
+from the twist of the camera and the depth. Twists are those by which what is seen moves from the
+frame to its neighbours in the video (:func:`fitted_twists`), so that the readout is one unknown, of
+which the residuals are linear.
+Source: differential rolling-shutter geometry (Zhuang, Cheong, Lee 2017), in the adjustment.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.bundle.projection import carried_over, linearise
+from geogs.geometry.camera import Camera
+
+ROUNDS = 8
+"""Of fitting a twist with Geman and McClure's weights."""
+OFF = 0.15
+"""Pixels per pixel that what is seen moves by, and pixels, from which on a cell hardly counts."""
+
+
+@dataclass(frozen=True)
+class RowTimes:
+    """When pixels are seen, in readouts from the middle of the image: linear in either axis."""
+
+    per_column: float
+    per_row: float
+    first: float
+    """Of the pixel (0, 0)."""
+
+    def of(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+        """Of some pixels."""
+        return self.per_column * pixels[..., 0] + self.per_row * pixels[..., 1] + self.first
+
+
+@dataclass(frozen=True)
+class RowMotions:
+    """Twists of frames while their rows are read."""
+
+    twist: Float[Tensor, "n 6"]
+    """Per second: a left perturbation of each frame's pose."""
+    times: RowTimes
+
+    def slopes(
+        self,
+        camera: Camera,
+        rays: Float[Tensor, "p 3"],
+        T_ji: Float[Tensor, "e 4 4"],
+        inverse_depth: Float[Tensor, "n p"],
+        source: Int[Tensor, "e"],
+        target: Int[Tensor, "e"],
+    ) -> Float[Tensor, "e p 2"]:
+        """Moves of where the cells of sources are found in targets by a readout of a second."""
+        at = linearise(camera, rays, T_ji, inverse_depth[source])
+        there = torch.einsum("ek,ekcp->epc", self.twist[target], at.pose_jacobian)
+        own = camera.pixels(rays[:, :2])
+        here = torch.einsum("nk,nkcp->npc", self.twist, _motions(camera, rays, inverse_depth))
+        here = here * self.times.of(own)[:, None]
+        there = there * self.times.of(at.pixels)[..., None]
+        return there - carried_over(camera, rays, T_ji, at, here[source])
+
+
+def fitted_twists(
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    inverse_depth: Float[Tensor, "n p"],
+    velocity: Float[Tensor, "n p 2"],
+    known: Bool[Tensor, "n p"],
+) -> Float[Tensor, "n 6"]:
+    """Twists of cameras per second by which the cells of each frame move in its image.
+
+    By iteratively reweighted least squares. Zero where nothing is known.
+
+    Args:
+        camera: of the frames.
+        rays: of the cells.
+        inverse_depth: of the cells of each frame.
+        velocity: pixels per second of what the cells show.
+        known: which of the velocities and depths are known.
+    """
+    J = _motions(camera, rays, inverse_depth).double().flatten(2)
+    v, weight = velocity.double().mT.flatten(1), known.double()
+    speed = (velocity.norm(dim=-1) * known).sum(1) / known.sum(1).clamp(min=1)
+    limit = (OFF * speed).clamp(min=1.0).double()[:, None]
+    eye = torch.eye(6, dtype=torch.float64)
+    for _ in range(ROUNDS):
+        wJ = J * weight.repeat(1, 2)[:, None]
+        H = wJ @ J.mT
+        damping = 1e-6 * H.diagonal(dim1=1, dim2=2).amax(1)[:, None, None] + 1e-9
+        twist = torch.linalg.solve(H + damping * eye, wJ @ v[..., None])[..., 0]
+        off = (v - (twist[:, None] @ J)[:, 0]).unflatten(1, (2, -1)).norm(dim=1) / limit
+        weight = known / (1 + off.square()).square()
+    return twist.to(velocity)
+
+
+def _motions(
+    camera: Camera, rays: Float[Tensor, "p 3"], inverse_depth: Float[Tensor, "n p"]
+) -> Float[Tensor, "n 6 2 p"]:
+    """Derivatives of the pixels of what cells show by the twist of their camera."""
+    still = torch.eye(4, dtype=torch.float64).expand(len(inverse_depth), 4, 4)
+    return linearise(camera, rays, still, inverse_depth).pose_jacobian
