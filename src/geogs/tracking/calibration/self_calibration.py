@@ -16,8 +16,9 @@ from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.growing_bundle import OpenRows
+from geogs.tracking.calibration.image_motions import TimedImage
 from geogs.tracking.calibration.stretch import Report, Stretch
-from geogs.tracking.calibration.view_gatherer import TimedImage, ViewGatherer
+from geogs.tracking.calibration.view_gatherer import ViewGatherer
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid

@@ -1,19 +1,16 @@
 """Keyframes of a camera about which nothing is known, and the flow between them."""
 
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import TrackingConfig
+from geogs.tracking.calibration.image_motions import ImageMotions, TimedImage
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.tracking.frames.row_errors import slope_at_zero
 from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
 from geogs.tracking.matching.flow_chain import (
     MIN_MATCHED,
@@ -27,19 +24,6 @@ from geogs.world.segments import ChainedPositions
 
 FRAMES = 600
 """Frames of the video that are used, at most: bounds the time."""
-
-
-BESIDE, FARTHEST = 5, 0.3
-"""Images that say how a view moves while it is read, with itself, and the seconds that one of them
-may be away from it (docs/notebook/calibration.md)."""
-
-
-class TimedImage(NamedTuple):
-    """An image of a video."""
-
-    timestamp: float
-    """Seconds."""
-    image: UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -66,9 +50,7 @@ class ViewGatherer:
         self.frames = 0
         """Frames taken so far."""
         self._is_read = False
-        self._latest = deque[_Encoded](maxlen=BESIDE)
-        self._beside = defaultdict[int, list[_Beside]](list)
-        """By frame."""
+        self._motions = ImageMotions(grid)
 
     @property
     def is_over(self) -> bool:
@@ -89,7 +71,7 @@ class ViewGatherer:
             self.frames += 1
             tick()
             encoded = self._operator.encode(following.image)
-            self._see_beside(views, _Encoded(self.frames, following.timestamp, encoded))
+            self._motions.see(self.frames, following)
             if self._operator.texture(encoded) < MIN_TEXTURE:
                 continue
             step = None
@@ -107,60 +89,12 @@ class ViewGatherer:
                     step = match
             self._chain.reset()
             views.append(View(self.frames, encoded, step))
-            for before in list(self._latest)[:-1]:
-                self._measure_beside(self._latest[-1], before)
+            self._motions.follow()
         return views
 
-    # --- how what is seen moves while a view is read ------------------------------------------
-
     def velocity(self, view: View) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
-        """Pixels per second of what the cells of a view show, and where they are known.
-
-        The slope of the polynomial through their places in the images beside it in the video.
-        """
-        beside = self._beside[view.frame]
-        times = torch.tensor([[0.0, *(b.seconds for b in beside)]], dtype=torch.float64)
-        flows = torch.stack([torch.zeros_like(self._grid.pixels), *(b.flow for b in beside)])
-        matched = [b.is_matched for b in beside]
-        known = torch.stack(matched).all(0) if matched else self._grid.pixels[:, 0] < 0
-        slope = slope_at_zero(times, flows.double().flatten(1)[None].cpu())
-        return slope.reshape(-1, 2).to(flows), known
-
-    def _see_beside(self, views: list[View], latest: "_Encoded") -> None:
-        """Note an image, and where the last view's cells are in it, if it comes soon after."""
-        self._latest.append(latest)
-        if views and 0 < latest.frame - views[-1].frame < BESIDE // 2 + 1:
-            self._measure_beside(self._of(views[-1].frame), latest)
-
-    def _of(self, frame: int) -> "_Encoded":
-        return next(seen for seen in self._latest if seen.frame == frame)
-
-    def _measure_beside(self, of: "_Encoded", other: "_Encoded") -> None:
-        seconds = other.timestamp - of.timestamp
-        if abs(other.frame - of.frame) > BESIDE // 2 or not 0 < abs(seconds) < FARTHEST:
-            return
-        match, _ = self._operator.measure([of.encoded], [other.encoded], fine=False)
-        flow, is_matched = match.pixels[0] - self._grid.pixels, match.weight[0, :, 0] > 0
-        self._beside[of.frame].append(_Beside(seconds, flow, is_matched))
-
-
-@dataclass(frozen=True)
-class _Encoded:
-    """An image of the video."""
-
-    frame: int
-    timestamp: float
-    encoded: Any
-
-
-@dataclass(frozen=True)
-class _Beside:
-    """Where the cells of a view are in an image beside it."""
-
-    seconds: float
-    """After the view."""
-    flow: Float[Tensor, "p 2"]
-    is_matched: Bool[Tensor, "p"]
+        """Pixels per second of what the cells of a view show, and where they are known."""
+        return self._motions.of(view.frame)
 
 
 def flows_from_first(

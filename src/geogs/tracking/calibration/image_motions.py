@@ -1,0 +1,84 @@
+"""How what a view shows moves while it is read, by the images beside it in the video."""
+
+from collections import deque
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from geogs.tracking.frames.row_errors import slope_at_zero
+from geogs.world.grid import SampleGrid
+
+EITHER_SIDE, FARTHEST = 2, 0.3
+"""Images before a view and after it, and the seconds that one of them may be away: of a wave the
+nearest alone show too little (docs/notebook/calibration.md)."""
+LONG_EDGE = 256
+"""Pixels of the images that flow is measured on, at most."""
+
+
+class TimedImage(NamedTuple):
+    """An image of a video."""
+
+    timestamp: float
+    """Seconds."""
+    image: UInt8[np.ndarray, "h w 3"]
+
+
+class _Seen(NamedTuple):
+    frame: int
+    timestamp: float
+    small: UInt8[np.ndarray, "h w"]
+
+
+class ImageMotions:
+    """Velocities of the cells of some images of a video, by dense inverse search (DIS)."""
+
+    def __init__(self, grid: SampleGrid) -> None:
+        self._grid = grid
+        camera = grid.camera
+        small = camera.with_long_edge(min(camera.long_edge, LONG_EDGE))
+        self._size, self._factor = (small.width, small.height), small.width / camera.width
+        column, row = ((grid.pixels.cpu().numpy() + 0.5) * self._factor - 0.5).round().astype(int).T
+        self._cells = row.clip(0, small.height - 1), column.clip(0, small.width - 1)
+        self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._latest = deque[_Seen](maxlen=EITHER_SIDE + 1)
+        self._followed: dict[int, list[tuple[float, np.ndarray]]] = {}
+        """Seconds to the images beside an image, and the flow there."""
+
+    def see(self, frame: int, image: TimedImage) -> None:
+        """Take the next image of the video."""
+        grey = cv2.cvtColor(image.image, cv2.COLOR_RGB2GRAY)
+        small = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
+        latest = _Seen(frame, image.timestamp, small)
+        for seen in self._latest:
+            if seen.frame in self._followed:
+                self._measure(seen, latest)
+        self._latest.append(latest)
+
+    def follow(self) -> None:
+        """Tell the velocities of the last image."""
+        latest = self._latest[-1]
+        self._followed[latest.frame] = []
+        for before in list(self._latest)[:-1]:
+            self._measure(latest, before)
+
+    def _measure(self, of: _Seen, other: _Seen) -> None:
+        seconds = other.timestamp - of.timestamp
+        if 0 < abs(seconds) < FARTHEST:
+            dense = self._flow.calc(of.small, other.small, None)
+            self._followed[of.frame].append((seconds, dense[self._cells] / self._factor))
+
+    def of(self, frame: int) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
+        """Pixels per second of what the cells of an image show, and where they are known: the slope
+        of the polynomial through their places in the images beside it."""
+        grid, beside = self._grid, self._followed[frame]
+        if not beside:
+            return torch.zeros_like(grid.pixels), torch.zeros_like(grid.pixels[:, 0]).bool()
+        times = torch.tensor([[0.0, *(seconds for seconds, _ in beside)]], dtype=torch.float64)
+        flows = torch.from_numpy(np.stack([np.zeros_like(beside[0][1]), *(f for _, f in beside)]))
+        slope = slope_at_zero(times, flows.double().flatten(1)[None])
+        known = grid.inside(grid.pixels + flows.to(grid.pixels)).all(0)
+        return slope.reshape(-1, 2).to(grid.pixels), known
