@@ -61,7 +61,7 @@ class Reconstruction:
         self.config = config or ReconstructConfig()
         if self.config.mapping.depth.engine == "tracker":
             raise InputError("mapping.depth.engine tracker needs a tracker: geogs run has one.")
-        self.camera = camera
+        self.camera = camera.required_pinhole()
         store = KeyframeTable.on(SampleGrid(camera, device), None, self.config.resident_keyframes)
         self._keyframes = store.new_set()
         self.stopwatch = Stopwatch()

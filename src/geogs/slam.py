@@ -71,7 +71,8 @@ class Slam(SlamOutput):
                 more of all matches at the end then.
 
         Raises:
-            InputError: images of that size cannot be tracked, or the world is of another camera.
+            InputError: images of that size cannot be tracked, the camera is no pinhole, or the
+                world is of another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
         self.config = c = config or Config()
@@ -81,7 +82,7 @@ class Slam(SlamOutput):
         where, scene_mask = str(require_device(device)), SceneMask(mask, black_is_masked)
         stream = urgent_stream(where) if live else None
         with torch.cuda.stream(stream):
-            grid = SampleGrid(camera, where)
+            grid = SampleGrid(camera.required_pinhole(), where)
             operator = build_operator(c.tracking, grid, mask, black_is_masked)
             keyframes = self.world.keyframes.attached(
                 grid, operator.encode, c.resident_keyframes, focal_deviation

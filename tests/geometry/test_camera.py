@@ -1,10 +1,14 @@
 """The pinhole camera: projection and resizing."""
 
+import math
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 
 F64 = torch.float64
@@ -44,3 +48,36 @@ def test_resizing_there_and_back_is_exact():
     there = CAMERA.resized(77, 131).resized(320, 240)
     for name in ("fx", "fy", "cx", "cy"):
         assert getattr(there, name) == pytest.approx(getattr(CAMERA, name), rel=1e-14)
+
+
+@pytest.mark.parametrize("bend", [(0.0, 0.0), (0.1, -0.2), (-0.25, 0.06)])
+def test_pixels_and_points_of_a_camera_that_bends_are_opencv_s(bend):
+    camera = replace(CAMERA, k1=bend[0], k2=bend[1])
+    pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)).double()
+    pixels = pixels * torch.tensor([camera.width - 1.0, camera.height - 1.0])
+    plane = camera.plane(pixels)
+    points = np.c_[plane.numpy(), np.ones(50)]
+    wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, (*bend, 0.0, 0.0))
+    np.testing.assert_allclose(wanted[:, 0], pixels, atol=1e-6)
+    np.testing.assert_allclose(camera.pixels(plane), pixels, atol=1e-6)
+    shown, z = camera.project(2 * torch.from_numpy(points))
+    np.testing.assert_allclose(shown, pixels, atol=1e-6)
+    assert (z == 2).all()
+    numeric = [(camera.bent(plane + step) - camera.bent(plane - step)) / 2e-6
+               for step in 1e-6 * torch.eye(2).double()]  # fmt: skip
+    xx, xy, yy = camera.bend_jacobian(plane)
+    torch.testing.assert_close(torch.stack([xx, xy], -1), numeric[0], atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(torch.stack([xy, yy], -1), numeric[1], atol=1e-6, rtol=1e-6)
+
+
+def test_moves_of_a_camera_add_up_and_are_found_again():
+    moves = 0.1, -0.2, 0.05, 0.01, -0.02
+    moved = CAMERA.moved(*moves)
+    assert moved.moves_from(CAMERA) == pytest.approx(moves)
+    assert moved.fx == pytest.approx(math.exp(0.1) * CAMERA.fx)
+    assert moved.cx == pytest.approx(CAMERA.cx + 0.01 * moved.fx)
+    assert CAMERA.moves_from(CAMERA) == (0.0,) * 5
+    assert moved.pinhole.is_pinhole
+    with pytest.raises(InputError, match="bends rays"):
+        moved.required_pinhole()
+    assert CAMERA.required_pinhole() is CAMERA

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.errors import InputError
+
 _NEWTON_STEPS = 8
 LEAST_SLOPE = 0.1
 """Distorted radius per radius, below which the lens folds the image over."""
@@ -113,6 +115,15 @@ class Camera:
     def pinhole(self) -> "Camera":
         """The same without radial terms."""
         return replace(self, k1=0.0, k2=0.0)
+
+    def required_pinhole(self) -> "Camera":
+        """Itself. Raises InputError where it has radial terms, which no map can be made through."""
+        if not self.is_pinhole:
+            raise InputError(
+                f"The camera bends rays (k1 {self.k1:g}, k2 {self.k2:g}); undistort its images, "
+                "and give the pinhole that sees them."
+            )
+        return self
 
     def growth(self, square: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Factor on a ray's distance from the axis, whose square is given."""
