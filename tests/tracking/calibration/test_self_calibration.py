@@ -78,6 +78,14 @@ def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkey
     assert max(residuals[1:]) < 0.8 * residuals[0]
 
 
+def test_images_that_are_far_apart_in_time_say_nothing_of_rows():
+    slow = [replace(f, timestamp=float(f.index)) for f in frames(swinging(22))]
+    guess = CAMERA.with_focal(0.8 * CAMERA.fx)
+    found = self_calibrate(slow, guess, rolling=RollingCamera(CAMERA))
+    assert found.failure is None
+    assert found.camera == self_calibrate(slow, guess).camera
+
+
 def rolled(count: int, readout: float) -> Iterator[Frame]:
     """A hand's path, each row rendered where the camera is then, in bands of a few."""
 

@@ -178,12 +178,14 @@ class GrowingBundle:
 
     def _motions(self, inverse_depth: Float[Tensor, "n p"]) -> RowMotions | None:
         """How views move while they are read, by the images beside them; none where all rows are
-        seen at once."""
+        seen at once, or none of these images is near enough to tell."""
         if self._rows is None:
             return None
         velocity, known = map(torch.stack, zip(*map(self._rows.velocity, self._views), strict=True))
         rays = SampleGrid(self.lens).rays
         known = known.cpu() & (torch.stack(self._information).cpu() > 0)
+        if not known.any():
+            return None
         twist = fitted_twists(self.lens, rays, inverse_depth, velocity.cpu(), known)
         return RowMotions(twist, self._rows.times)
 
