@@ -45,40 +45,41 @@ class ImageMotions:
         self._cells = row.clip(0, small.height - 1), column.clip(0, small.width - 1)
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._latest = deque[_Seen](maxlen=EITHER_SIDE + 1)
-        self._followed: dict[int, list[tuple[float, np.ndarray]]] = {}
-        """Seconds to the images beside an image, and the flow there."""
+        self._beside: dict[int, list[_Seen]] = {}
+        """Images around those that are followed, with these themselves."""
+        self._velocities: dict[int, tuple[Tensor, Tensor]] = {}
 
     def see(self, frame: int, image: TimedImage) -> None:
         """Take the next image of the video."""
         grey = cv2.cvtColor(image.image, cv2.COLOR_RGB2GRAY)
         small = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
         latest = _Seen(frame, image.timestamp, small)
-        for seen in self._latest:
-            if seen.frame in self._followed:
-                self._measure(seen, latest)
+        for seen in list(self._latest)[-EITHER_SIDE:]:
+            if seen.frame in self._beside:
+                self._beside[seen.frame].append(latest)
         self._latest.append(latest)
 
     def follow(self) -> None:
-        """Tell the velocities of the last image."""
-        latest = self._latest[-1]
-        self._followed[latest.frame] = []
-        for before in list(self._latest)[:-1]:
-            self._measure(latest, before)
-
-    def _measure(self, of: _Seen, other: _Seen) -> None:
-        seconds = other.timestamp - of.timestamp
-        if 0 < abs(seconds) < FARTHEST:
-            dense = self._flow.calc(of.small, other.small, None)
-            self._followed[of.frame].append((seconds, dense[self._cells] / self._factor))
+        """Remember what lies beside the last image."""
+        self._beside[self._latest[-1].frame] = list(self._latest)
 
     def of(self, frame: int) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
         """Pixels per second of what the cells of an image show, and where they are known: the slope
         of the polynomial through their places in the images beside it."""
-        grid, beside = self._grid, self._followed[frame]
+        if frame not in self._velocities:
+            self._velocities[frame] = self._measured(frame)
+        return self._velocities[frame]
+
+    def _measured(self, frame: int) -> tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]:
+        grid, around = self._grid, self._beside[frame]
+        own = next(seen for seen in around if seen.frame == frame)
+        away = [(seen, seen.timestamp - own.timestamp) for seen in around if seen is not own]
+        beside = [(seen, seconds) for seen, seconds in away if 0 < abs(seconds) < FARTHEST]
         if not beside:
             return torch.zeros_like(grid.pixels), torch.zeros_like(grid.pixels[:, 0]).bool()
-        times = torch.tensor([[0.0, *(seconds for seconds, _ in beside)]], dtype=torch.float64)
-        flows = torch.from_numpy(np.stack([np.zeros_like(beside[0][1]), *(f for _, f in beside)]))
+        times = torch.tensor([[0.0, *(seconds for _, seconds in beside)]], dtype=torch.float64)
+        dense = [self._flow.calc(own.small, seen.small, None)[self._cells] for seen, _ in beside]
+        flows = torch.from_numpy(np.stack([np.zeros_like(dense[0]), *dense]) / self._factor)
         slope = slope_at_zero(times, flows.double().flatten(1)[None])
         known = grid.inside(grid.pixels + flows.to(grid.pixels)).all(0)
         return slope.reshape(-1, 2).to(grid.pixels), known
