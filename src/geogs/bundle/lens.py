@@ -20,7 +20,8 @@ UNIT = 0.01
 
 @dataclass(frozen=True)
 class LensBlock:
-    """A lens as a block of unknowns: log of the focal length, k1 and k2."""
+    """A lens as a block of unknowns: log of the focal length, k1, k2, and the readout where rows
+    roll."""
 
     lens: Camera
     pixels: Float[Tensor, "p 2"]
@@ -54,7 +55,7 @@ class LensBlock:
 
     def slopes(
         self,
-        T_cw: Float[Tensor, "n 4 4"],
+        T_ji: Float[Tensor, "e 4 4"],
         source: Int[Tensor, "e"],
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "n p"],
@@ -63,8 +64,13 @@ class LensBlock:
         once."""
         if self.rows is None:
             return None
-        T_ji = relative_motion(T_cw, source, target)
         return self.rows.slopes(self.lens, self.rays.rays, T_ji, inverse_depth, source, target)
+
+    def unrolled(
+        self, pixels: Float[Tensor, "e p 2"], slopes: Float[Tensor, "e p 2"] | None
+    ) -> Float[Tensor, "e p 2"]:
+        """Where cells would have been found if all rows had been seen at once."""
+        return pixels if slopes is None else pixels - self.readout * slopes
 
     def project(
         self,

@@ -46,7 +46,7 @@ class LensFlow:
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         block = self._block(state)
-        by_rows = block.slopes(state.T_cw, problem.source, problem.target, state.inverse_depth)
+        by_rows = block.slopes(T_ji, problem.source, problem.target, state.inverse_depth)
         adjoint, edges = se3_adjoint(T_ji), _Edges(block, problem, T_ji, by_rows)
         limits = _limits(options.huber)
         slopes = edges.slopes if self._known is None else edges.slopes[:0]
@@ -76,7 +76,7 @@ class LensFlow:
 
         T_ji = relative_motion(state.T_cw, problem.source, problem.target)
         block = self._block(state)
-        by_rows = block.slopes(state.T_cw, problem.source, problem.target, state.inverse_depth)
+        by_rows = block.slopes(T_ji, problem.source, problem.target, state.inverse_depth)
         edges = _Edges(block, problem, T_ji, by_rows)
         behind, limits = np.float32((BEHIND * huber) ** 2), _limits(huber)
         return sum(
@@ -105,10 +105,8 @@ class _Edges:
         self.motions = _float(T_ji[:, :3])
         self.rays, self.slopes = _float(block.rays.rays[:, :2].mT), _float(block.rays.slope)
         self.lens = np.array(lens.numbers, np.float32)
-        pixels = problem.pixels
-        if by_rows is not None:
-            pixels = pixels - block.readout * by_rows
-        self.pixels, self.weight = _float(pixels), _float(problem.weight)
+        self.pixels = _float(block.unrolled(problem.pixels, by_rows))
+        self.weight = _float(problem.weight)
 
 
 def _float(values: Tensor) -> np.ndarray:

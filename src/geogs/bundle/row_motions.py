@@ -17,9 +17,10 @@ from torch import Tensor
 
 from geogs.bundle.projection import carried_over, linearise
 from geogs.geometry.camera import Camera
+from geogs.geometry.robust import geman_mcclure_weight
 
 ROUNDS = 8
-"""Of fitting a twist with Geman and McClure's weights."""
+"""Reweighted steps of the fit of a twist."""
 OFF = 0.15
 """Pixels per pixel that what is seen moves by, and pixels, from which on a cell hardly counts."""
 
@@ -31,10 +32,10 @@ class RowTimes:
     per_column: float
     per_row: float
     first: float
-    """Of the pixel (0, 0)."""
+    """Time of the pixel (0, 0)."""
 
     def of(self, pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
-        """Of some pixels."""
+        """Times of pixels."""
         return self.per_column * pixels[..., 0] + self.per_row * pixels[..., 1] + self.first
 
 
@@ -94,7 +95,7 @@ def fitted_twists(
         damping = 1e-6 * H.diagonal(dim1=1, dim2=2).amax(1)[:, None, None] + 1e-9
         twist = torch.linalg.solve(H + damping * eye, wJ @ v[..., None])[..., 0]
         off = (v - (twist[:, None] @ J)[:, 0]).unflatten(1, (2, -1)).norm(dim=1) / limit
-        weight = known / (1 + off.square()).square()
+        weight = known * geman_mcclure_weight(off.square())
     return twist.to(velocity)
 
 

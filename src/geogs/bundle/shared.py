@@ -22,6 +22,7 @@ from geogs.bundle.flow_term import residual_norms
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.lens_flow import LensFlow
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import relative_motion
 from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, minimise
@@ -125,12 +126,10 @@ def usual_residual(problem: BundleProblem, result: SharedResult) -> float:
     """Median residual of the matches in front of their targets, in their own deviations, where a
     problem was adjusted."""
     source, depth = problem.source, result.inverse_depth[problem.source]
-    block, pixels = result.block, problem.pixels
+    T_ji, block = relative_motion(result.T_cw, source, problem.target), result.block
     at = block.project(result.T_cw, source, problem.target, depth)
-    by_rows = block.slopes(result.T_cw, source, problem.target, result.inverse_depth)
-    if by_rows is not None:
-        pixels = pixels - block.readout * by_rows
-    found = residual_norms(at, pixels, problem.weight)
+    by_rows = block.slopes(T_ji, source, problem.target, result.inverse_depth)
+    found = residual_norms(at, block.unrolled(problem.pixels, by_rows), problem.weight)
     return float(found[at.valid & (problem.weight[..., 0] > 0)].median())
 
 

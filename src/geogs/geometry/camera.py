@@ -100,7 +100,7 @@ class Camera:
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, k1=self.k1 + k1, k2=self.k2 + k2)
 
     def moves_from(self, other: "Camera") -> tuple[float, float, float, float, float]:
-        """What :meth:`moved` makes this of another by."""
+        """The sizes by which :meth:`moved` makes this camera of another."""
         right, down = (self.cx - other.cx) / self.fx, (self.cy - other.cy) / self.fy
         return math.log(self.fx / other.fx), self.k1 - other.k1, self.k2 - other.k2, right, down
 

@@ -1,6 +1,6 @@
 """The camera in the adjustment of all keyframes: rows, lens, and what each frame has of its own."""
 
-from geogs.loop.camera.found import FrameLenses, straight_views
+from geogs.loop.camera.found import straight_views
 from geogs.loop.camera.frame_lenses import correct_frame_lenses
 from geogs.loop.camera.lens import correct_lens
 from geogs.loop.camera.rows import correct_rows, let_lenses_move
@@ -30,7 +30,9 @@ def adjust_camera(matches: KeyframeMatches, ends: bool) -> None:
         matches.measure(fine, anew=is_open and fine)
         let_lenses_move(matches, own.each)
         correct_rows(matches, finds_readout=False)
-    own = correct_frame_lenses(matches, own) if own else FrameLenses()
-    lens = (correct_lens(matches, ends, before=lens) or lens) if lens else None
+    if own:
+        own = correct_frame_lenses(matches, own)
+    if lens:
+        lens = correct_lens(matches, ends, before=lens) or lens
     if lens or own:
         straighten(matches.keyframes, straight_views(table.camera, matches.camera, lens, own))
