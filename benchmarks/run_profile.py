@@ -26,7 +26,7 @@ from pathlib import Path
 
 import torch
 
-from geogs.application.calibrate import with_shutter_found
+from geogs.application.calibrate import self_calibrated
 from geogs.application.machine.device import compile_gpu_kernels
 from geogs.application.results.result import Result
 from geogs.application.results.write import write_results
@@ -133,8 +133,8 @@ def measured_run(
     with meter("opening"):
         compile_gpu_kernels(torch.device(device))
         stream = open_source((source,), config.input)
-    with meter("shutter"):
-        stream = with_shutter_found(stream)
+    with meter("calibration"):
+        stream = self_calibrated(stream, config, device)
     with meter("making the system"):
         at_end = config.mapping.when != "online"  # as a run from files has it
         slam = Slam(stream.camera, config, device, mask=stream.mask, defers_map=at_end)

@@ -17,6 +17,7 @@ from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.self_calibration import SelfCalibration
+from geogs.tracking.calibration.unknowns import Unknowns
 from progress_listener import Listener
 from tracking_scenes import CAMERA, pose, render
 
@@ -88,15 +89,15 @@ def test_a_camera_that_stands_still_leaves_the_guess(tmp_path):
 
 def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
     monkeypatch.setattr(self_calibration, "self_calibrate", pytest.fail)
-    given = open_source(video, InputConfig(intrinsics="140,140,95.5,71.5"))
+    given = open_source(video, InputConfig(intrinsics="140,140,95.5,71.5", readout=0.0))
     assert self_calibrated(given, Config()) is given
-    guessed = open_source(video)
+    guessed = open_source(video, InputConfig(readout=0.0))
     off = Config(calibration=CalibrationConfig(refine=False))
     assert self_calibrated(guessed, off) is guessed
 
 
 def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
-    def interrupted(frames, camera, radial, device, report, *masks):
+    def interrupted(frames, camera, unknowns, device, report, *masks):
         signal.raise_signal(signal.SIGINT)
         report(0.1)
         pytest.fail("the request was not heard")
@@ -116,14 +117,13 @@ class Telling:
 
     def __init__(self, *lens: float) -> None:
         self.lens = lens
-        self.asked: list[tuple[bool, float | None]] = []
-        """Whether rows roll, and their readout where it is known."""
+        self.asked: list[Unknowns] = []
         self.rectified: list[bool] = []
         """Whether rows were rectified before."""
 
-    def __call__(self, frames, camera, radial, device, report, mask, black, rolling, readout):
+    def __call__(self, frames, camera, unknowns, *rest):
         self.rectified.append(any(frame.rows is not None for frame in frames))
-        self.asked.append((rolling is not None, readout))
+        self.asked.append(unknowns)
         if not self.lens:
             return SelfCalibration(camera, failure="it is a test")
         factor, *bend = self.lens
@@ -132,20 +132,22 @@ class Telling:
 
 
 @pytest.mark.parametrize(
-    ("given", "asked"),
-    [({}, (True, None)), ({"readout": 0.03}, (True, 0.03)), ({"readout": 0.0}, (False, 0.0))],
+    ("given", "rolls", "readout"),
+    [({}, True, None), ({"readout": 0.03}, True, 0.03), ({"readout": 0.0}, False, 0.0)],
 )
-def test_the_lens_is_asked_once_of_rows_as_they_came(video, monkeypatch, given, asked):
+def test_the_lens_is_asked_once_of_rows_as_they_came(video, monkeypatch, given, rolls, readout):
     lens = Telling(0.8, -0.2, 0.05)
     monkeypatch.setattr(self_calibration, "self_calibrate", lens)
     before = open_source(video, InputConfig(**given))
     found = self_calibrated(before, Config())
-    assert lens.asked == [asked]
+    rolling = before.rolling_camera if rolls else None
+    assert lens.asked == [Unknowns(True, True, rolling, readout)]
     assert lens.rectified == [False]
     assert found.calibration.fx == pytest.approx(0.8 * before.calibration.fx)
     assert found.calibration.distortion == pytest.approx((-0.2, 0.05, 0, 0), abs=1e-9)
     assert found.calibration.focal_deviation == pytest.approx(0.01)
-    assert found.shutter == before.shutter
+    assert found.shutter.readout == (readout or 0.0)
+    assert found.is_shutter_open is False
     lens.lens = ()
     failed = self_calibrated(before, Config())
     assert failed.calibration.fx == before.calibration.fx

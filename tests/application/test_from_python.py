@@ -74,8 +74,7 @@ def require_same(folder: Path, other: Path) -> None:
 
 def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd):
     source = geogs.open_source(small_room, run_config().input)
-    source = geogs.application.self_calibrated(source)
-    source = geogs.application.with_shutter_found(source)
+    source = geogs.application.self_calibrated(source, run_config())
     slam = geogs.Slam(source.camera, run_config(), device="cpu")
     for frame in source:
         slam.process(frame)
@@ -97,7 +96,7 @@ def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd
     assert page == f"Open {tmp_path}/out/report/index.html in a browser."
     phases = re.findall(r"^([a-z ]+): \d+", said.err, re.MULTILINE)
     final = ["bundle adjustment", "map refinement", "mesh", "report"]
-    assert phases == ["shutter", "frames", *final]
+    assert phases == ["calibration", "frames", *final]
     require_same(tmp_path / "own", tmp_path / "out")
     seconds = json.loads((tmp_path / "out" / "summary.json").read_text())["seconds"]
     assert seconds["reading"] > 0

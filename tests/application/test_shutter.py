@@ -6,22 +6,24 @@ from pathlib import Path
 
 import pytest
 
-from geogs.application.calibrate import with_shutter_found
+from geogs.application.calibrate import self_calibrated
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
 from geogs.application.results.summary import source_summary
 from geogs.application.run_settings import RunSettings
-from geogs.camera.shutter import readout
 from geogs.camera.shutter.readout import FoundReadout
 from geogs.camera.shutter.shutter import Shutter
-from geogs.config import Config, InputConfig
+from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.tracking.calibration import self_calibration
+from geogs.tracking.calibration.self_calibration import SelfCalibration
+from geogs.tracking.calibration.unknowns import Unknowns
 from io_samples import write_images
 from progress_listener import Listener
 
 INTRINSICS = "50,50,31.5,23.5"
-FOUND = FoundReadout(0.0276, 0.0276, 0.0011, 12)
+FOUND = FoundReadout(0.0276, 0.0011)
 
 
 @pytest.fixture
@@ -29,62 +31,84 @@ def folder(tmp_path) -> Path:
     return write_images(tmp_path / "images", [f"{k}.png" for k in range(4)])
 
 
-def finding(monkeypatch, found: FoundReadout) -> None:
-    monkeypatch.setattr(readout, "find_readout", lambda clips, camera, report, lens: found)
+def finding(monkeypatch, found: FoundReadout) -> list[Unknowns]:
+    """A video that says this of its readout; what it is asked for."""
+    asked = []
+
+    def answer(frames, camera, unknowns, *rest):
+        asked.append(unknowns)
+        return SelfCalibration(camera, deviation=0.0, readout=found)
+
+    monkeypatch.setattr(self_calibration, "self_calibrate", answer)
+    return asked
 
 
 def test_a_readout_that_is_found_is_said_and_written(folder, tmp_path, monkeypatch):
-    finding(monkeypatch, FOUND)
+    asked = finding(monkeypatch, FOUND)
     listener = Listener()
-    source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)), listener)
+    before = open_source(folder, InputConfig(INTRINSICS))
+    source = self_calibrated(before, progress=listener)
+    assert asked == [Unknowns(focal=False, rolling=before.rolling_camera)]
     assert (source.shutter.readout, source.shutter.error) == (0.0276, 0.0011)
+    assert source.calibration == before.calibration
     assert listener.said == [
-        "Rolling shutter: 27.6 ms from the first to the last row (12 clips say 27.6 ms, "
-        "standard error 1.1 ms); rows are rectified."
+        "Rolling shutter: 27.6 +- 1.1 ms from the first to the last row; rows are rectified."
     ]
     write_intrinsics(tmp_path / "i.json", source.camera, source.calibration, source.shutter)
     said = json.loads((tmp_path / "i.json").read_text())["shutter"]
     assert said["readout"] == 0.0276
-    assert said["origin"].startswith("found in the video: 12 clips")
+    assert said["origin"] == "the video says 27.6 +- 1.1 ms"
     assert source_summary(source)["shutter"] == said
 
 
 def test_what_is_not_believed_leaves_the_shutter_global(folder, monkeypatch):
-    finding(monkeypatch, FoundReadout(0.0, 0.012, 0.009, 8))
+    finding(monkeypatch, FoundReadout(0.012, 0.009))
     listener = Listener()
-    source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)), listener)
+    source = self_calibrated(open_source(folder, InputConfig(INTRINSICS)), progress=listener)
     assert listener.said == []
     assert source.shutter.readout == 0.0
-    assert source.shutter.error == FoundReadout(0.0, 0.012, 0.009, 8).left_open
+    assert source.shutter.error == FoundReadout(0.012, 0.009).left_open
     assert not source.is_shutter_open
     finding(monkeypatch, FoundReadout())
-    source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)))
+    source = self_calibrated(open_source(folder, InputConfig(INTRINSICS)))
     assert source.shutter.origin == "the video does not tell"
 
 
 def test_what_is_given_is_not_looked_for(folder, monkeypatch):
-    monkeypatch.setattr(readout, "find_readout", pytest.fail)
+    monkeypatch.setattr(self_calibration, "self_calibrate", pytest.fail)
     for given in (0.0, 0.02):
         source = open_source(folder, InputConfig(INTRINSICS, readout=given))
-        assert with_shutter_found(source) is source
+        assert self_calibrated(source) is source
+
+
+def test_a_lens_that_is_not_refined_is_unknown_while_the_readout_is_found(folder, monkeypatch):
+    asked = finding(monkeypatch, FOUND)
+    off = Config(calibration=CalibrationConfig(refine=False))
+    listener = Listener()
+    before = open_source(folder)
+    source = self_calibrated(before, off, progress=listener)
+    assert [(a.focal, a.radial, a.readout) for a in asked] == [(True, True, None)]
+    assert source.calibration == before.calibration
+    assert source.shutter.readout == 0.0276
+    assert listener.said[0].startswith("warning: the intrinsics are unknown")
 
 
 def test_several_videos_share_what_the_first_shows(folder, monkeypatch):
     finding(monkeypatch, FOUND)
-    several = with_shutter_found(open_source([folder, folder], InputConfig(INTRINSICS)))
+    several = self_calibrated(open_source([folder, folder], InputConfig(INTRINSICS)))
     assert several.shutter.readout == 0.0276
     assert several.calibration == open_source(folder, InputConfig(INTRINSICS)).calibration
 
 
 def test_ctrl_c_goes_on_with_a_global_shutter(folder, monkeypatch):
-    def interrupted(clips, camera, report, lens_is_known):
+    def interrupted(frames, camera, unknowns, device, report, *masks):
         signal.raise_signal(signal.SIGINT)
         report(0.1)
         pytest.fail("the request was not heard")
 
-    monkeypatch.setattr(readout, "find_readout", interrupted)
+    monkeypatch.setattr(self_calibration, "self_calibrate", interrupted)
     source, listener = open_source(folder, InputConfig(INTRINSICS)), Listener()
-    assert with_shutter_found(source, listener, Interruption()) is source
+    assert self_calibrated(source, progress=listener, stop=Interruption()) is source
     assert "global shutter" in listener.said[0]
 
 

@@ -4,18 +4,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from geogs.application.calibrate import self_calibrated, with_shutter_found
+    from geogs.application.calibrate import self_calibrated
     from geogs.application.progress.run_progress import RunProgress
     from geogs.application.results.result import Result
     from geogs.application.results.write import write_results
 
-__all__ = ["Result", "RunProgress", "self_calibrated", "with_shutter_found", "write_results"]
+__all__ = ["Result", "RunProgress", "self_calibrated", "write_results"]
 
 _HOMES = {
     "Result": "geogs.application.results.result",
     "RunProgress": "geogs.application.progress.run_progress",
     "self_calibrated": "geogs.application.calibrate",
-    "with_shutter_found": "geogs.application.calibrate",
     "write_results": "geogs.application.results.write",
 }
 

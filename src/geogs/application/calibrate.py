@@ -5,13 +5,14 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import cv2
 import torch
 
 from geogs.application.interrupt import Stop
 from geogs.application.progress.run_progress import RunProgress
+from geogs.camera.shutter.readout import FoundReadout
 from geogs.camera.shutter.shutter import Shutter
 from geogs.config import Config
 from geogs.io.sources.calibration import Calibration, FocalRefinement
@@ -19,10 +20,9 @@ from geogs.io.sources.frame_source import Source
 from geogs.types import FoundLens
 
 if TYPE_CHECKING:
-    from geogs.camera.shutter.readout import FoundReadout
     from geogs.tracking.calibration.self_calibration import SelfCalibration
+    from geogs.tracking.calibration.unknowns import Unknowns
 
-F = TypeVar("F")
 Report = Callable[[float], None]
 
 
@@ -53,46 +53,69 @@ def self_calibrated(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
 ) -> Source:
-    """The source with its focal length refined, if that is a guess or nominal and may be refined.
+    """The source with what nobody said of its camera estimated from the video, in one adjustment.
 
-    Where the video does not tell, or after a request to stop, the guess stays and ``progress``
-    says so.
+    That are the focal length and the distortion where they are a guess or nominal and may be
+    refined, and the readout of the shutter. Where the video does not tell, or after a request to
+    stop, the guess stays, the shutter counts as global, and ``progress`` says so.
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
-    if not (config.calibration.refine and source.is_calibration_open):
-        if source.calibration.is_guess:
-            progress.write(
-                f"warning: the intrinsics are unknown; assuming {source.intrinsics_origin}. Give "
-                "--intrinsics fx,fy,cx,cy for a better result."
-            )
+    asks_lens = config.calibration.refine and source.is_calibration_open
+    if source.calibration.is_guess and not asks_lens:
+        progress.write(
+            f"warning: the intrinsics are unknown; assuming {source.intrinsics_origin}. Give "
+            "--intrinsics fx,fy,cx,cy for a better result."
+        )
+    if not (asks_lens or source.is_shutter_open):
         return source
-    ask = partial(_self_calibration, source, config.calibration.radial, device)
-    found = _found("calibration", progress, stop, ask)
+    unknowns = _unknowns(source, asks_lens, config.calibration.radial)
+    found = _found(progress, stop, partial(_self_calibration, source, unknowns, device))
     if found is None:
         progress.write(
-            f"Calibration stopped; going on with {source.intrinsics_origin}. "
-            "Press Ctrl-C again to end."
+            f"Calibration stopped; going on with {source.intrinsics_origin} and "
+            f"{'a global' if source.is_shutter_open else 'the given'} shutter. Press Ctrl-C again "
+            "to end."
         )
         return source
-    calibration = refined(source.calibration, source.camera.fx, found)
-    progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
-    return source.with_calibration(calibration)
+    known = source
+    if asks_lens:
+        calibration = refined(source.calibration, source.camera.fx, found)
+        progress.write(_calibration_sentence(calibration, source.intrinsics_origin))
+        known = known.with_calibration(calibration)
+    if source.is_shutter_open:
+        known = known.with_shutter(_shutter(found.readout))
+        if found.readout.is_believed:
+            progress.write(
+                f"Rolling shutter: {_evidence(found.readout)} from the first to the last row; rows "
+                "are rectified."
+            )
+    return known
+
+
+def _unknowns(source: Source, asks_lens: bool, radial: bool) -> "Unknowns":
+    """What the video is asked for; a lens that is not known, too, where only the readout counts."""
+    from geogs.tracking.calibration.unknowns import Unknowns
+
+    readout = None if source.is_shutter_open else source.shutter.readout
+    calibration = source.calibration
+    may_bend = radial if asks_lens else calibration.is_unknown_lens
+    return Unknowns(
+        focal=asks_lens or calibration.is_guess,
+        radial=may_bend and not calibration.is_distorted,
+        rolling=None if readout == 0 else source.rolling_camera,
+        readout=readout,
+    )
 
 
 def _self_calibration(
-    source: Source, radial: bool, device: str | torch.device, report: Report
+    source: Source, unknowns: "Unknowns", device: str | torch.device, report: Report
 ) -> "SelfCalibration":
-    """Lens of the images of a source, whose rows are as they came."""
     from geogs.tracking.calibration.self_calibration import self_calibrate
 
-    known = None if source.is_shutter_open else source.shutter.readout
-    raw = source.with_shutter(Shutter()) if known else source
-    with closing(raw.linked_frames()) as frames:
+    with closing(source.as_recorded()) as frames:
         return self_calibrate(
-            frames, source.camera, radial and not source.calibration.is_distorted, device, report,
-            source.mask, source.black_is_masked, None if known == 0 else source.rolling_camera,
-            known,
-        )  # fmt: skip
+            frames, source.camera, unknowns, device, report, source.mask, source.black_is_masked
+        )
 
 
 def refined(
@@ -166,62 +189,25 @@ def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> 
     )
 
 
-def with_shutter_found(
-    source: Source, progress: RunProgress | None = None, stop: Stop | None = None
-) -> Source:
-    """The source with the readout of its rolling shutter found, if nobody gave it.
-
-    Where the video does not show one, or after a request to stop, the shutter counts as global, and
-    the frames stay as they are.
-    """
-    progress, stop = progress or RunProgress(), stop or Stop()
-    if not source.is_shutter_open:
-        return source
-    found = _found("shutter", progress, stop, partial(_readout, source))
-    if found is None:
-        progress.write(
-            "The search for the shutter's readout is stopped; going on with a global shutter. "
-            "Press Ctrl-C again to end."
-        )
-        return source
-    if found.is_believed:
-        progress.write(
-            f"Rolling shutter: {1000 * found.readout:.1f} ms from the first to the last row "
-            f"({_evidence(found)}); rows are rectified."
-        )
-    return source.with_shutter(_shutter(found))
-
-
-def _readout(source: Source, report: Report) -> "FoundReadout":
-    from geogs.camera.distortion import USUAL_BEND
-    from geogs.camera.shutter.readout import find_readout
-
-    calibration = source.calibration
-    focal = max(calibration.focal_deviation, 1e-4)  # 0 where somebody said it
-    lens = (focal, *USUAL_BEND) if calibration.is_unknown_lens else ()
-    return find_readout(source.followed_clips, source.rolling_camera, report, lens)
-
-
-def _shutter(found: "FoundReadout") -> Shutter:
+def _shutter(found: FoundReadout) -> Shutter:
     """The shutter that was found, global where none is believed."""
-    said = _evidence(found)
-    origin = f"found in the video: {said}" if found.is_believed else said
-    return Shutter(found.readout, origin, found.left_open)
-
-
-def _evidence(found: "FoundReadout") -> str:
-    """Why the readout is believed, or why a global shutter is."""
     if not math.isfinite(found.error):
-        return "the video does not tell"
-    best, error = 1000 * found.best, 1000 * found.error
-    return f"{found.clips} clips say {best:.1f} ms, standard error {error:.1f} ms"
+        return Shutter(origin="the video does not tell", error=found.left_open)
+    told = f"the video says {_evidence(found)}"
+    return Shutter(found.readout, told, found.left_open)
 
 
-def _found(stage: str, progress: RunProgress, stop: Stop, find: Callable[[Report], F]) -> F | None:
+def _evidence(found: FoundReadout) -> str:
+    return f"{1000 * found.best:.1f} +- {1000 * found.error:.1f} ms"
+
+
+def _found(
+    progress: RunProgress, stop: Stop, find: Callable[[Report], "SelfCalibration"]
+) -> "SelfCalibration | None":
     """What is found; none after a request to stop."""
 
     def report(fraction: float) -> None:
-        progress.stage(stage, fraction)
+        progress.stage("calibration", fraction)
         stop.check()
 
     with stop:

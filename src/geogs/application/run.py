@@ -1,12 +1,11 @@
 """A run, from the paths of its videos to the files of its result; or on from a checkpoint."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.application.calibrate import self_calibrated, with_shutter_found, without_overlay
+from geogs.application.calibrate import self_calibrated, without_overlay
 from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.driver import Driver
@@ -89,14 +88,11 @@ def run(
             progress.plan(plan)
         if settings.offline:
             from geogs.application.structure_from_motion.offline import (
-                MIN_CLIP_FPS,
                 PlacedOffline,
                 beginning_with,
             )
 
             found = self_calibrated(opened, config, device, progress, stop)
-            if found.recorded_fps >= MIN_CLIP_FPS:
-                found = with_shutter_found(found, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, found)))
         work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
         return _completed(driver, settings, work)
@@ -141,7 +137,8 @@ def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> Pl
     settings = driver.settings
     if not isinstance(settings, RunSettings) or source.length is None:
         return None
-    calibrates = settings.config.calibration.refine and source.is_calibration_open
+    refines = settings.config.calibration.refine and source.is_calibration_open
+    calibrates = refines or source.is_shutter_open
     on_gpu = driver.device.type == "cuda"
     if settings.offline:
         return offline_plan(settings.config, source, on_gpu, calibrates)
@@ -164,20 +161,16 @@ def _begun(
 ) -> TrackedVideo:
     """A system for an opened source, calibrated; in the map of ``base`` if that is given."""
     config, progress, stop = settings.config, driver.progress, driver.stop
-    calibrated = self_calibrated(opened, config, driver.device, progress, stop)
-    prior = open_prior(config.prior, calibrated.camera, driver.device)
-    # A system loads much; meanwhile the images tell of the shutter, which does not concern it.
-    with ThreadPoolExecutor(1, thread_name_prefix="system") as thread:
-        made = thread.submit(
-            Slam, calibrated.camera, config, str(driver.device), prior, calibrated.is_live,
-            calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, driver.observer),
-            None, calibrated.calibration.focal_deviation,
-        )  # fmt: skip
-        source = with_shutter_found(calibrated, progress, stop)
-        slam = made.result()
+    source = self_calibrated(opened, config, driver.device, progress, stop)
+    prior = open_prior(config.prior, source.camera, driver.device)
+    slam = Slam(
+        source.camera, config, str(driver.device), prior, source.is_live, source.mask,
+        source.black_is_masked, maps_at_the_end(settings, driver.observer),
+        focal_deviation=source.calibration.focal_deviation,
+    )  # fmt: skip
     if base is not None:
         go_on_in(slam, base)
-    found = None if calibrated is opened else calibrated.calibration
+    found = None if source.calibration is opened.calibration else source.calibration
     metadata = RunMetadata(
         settings.absolute(), driver.device.type, source.fingerprint(), found, shutter=source.shutter
     )

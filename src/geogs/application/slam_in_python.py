@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from geogs.application.calibrate import self_calibrated, with_shutter_found
+from geogs.application.calibrate import self_calibrated
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.output_folder import claimed
@@ -56,7 +56,6 @@ def track(
     if slam is None:
         if stream is not source:
             stream = self_calibrated(stream, settings, require_device(device))
-            stream = with_shutter_found(stream)
         slam = Slam(
             stream.camera, settings, device, None, stream.is_live, stream.mask,
             stream.black_is_masked, focal_deviation=stream.calibration.focal_deviation,

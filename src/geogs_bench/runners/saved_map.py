@@ -6,7 +6,7 @@ The paper saves the map before its final bundle adjustment and moves that one ma
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.application.calibrate import with_shutter_found
+from geogs.application.calibrate import self_calibrated
 from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, SavedRun, run_state
 from geogs.application.prior_choice import open_prior
@@ -60,7 +60,7 @@ def _saved(place: Path, settings: RunSettings) -> SavedRun | None:
 def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> SavedRun:
     """Track and map up to the end of the stream, and keep that."""
     config, device = settings.config, require_device(settings.device)
-    source = with_shutter_found(open_source(settings.source, config.input))
+    source = self_calibrated(open_source(settings.source, config.input), config, device)
     slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
     metadata = RunMetadata(
         settings, device.type, source.fingerprint(), None, shutter=source.shutter

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from geogs.application.calibrate import with_shutter_found
+from geogs.application.calibrate import self_calibrated
 from geogs.application.results.summary import state_spans
 from geogs.application.results.verdict import verdict
 from geogs.application.run_settings import RunSettings
@@ -35,7 +35,9 @@ def track_to_folder(
         DeviceError, OutputError: the device, or the folder.
     """
     device = require_device(settings.device)
-    source = with_shutter_found(open_source(settings.source, settings.config.input))
+    source = self_calibrated(
+        open_source(settings.source, settings.config.input), settings.config, device
+    )
     folder = prepare_output_folder(output)
     slam = Slam(source.camera, settings.config, str(device))
     start = time.perf_counter()

@@ -131,7 +131,6 @@ def test_another_plan_goes_on_at_the_pace_of_the_machine():
     forecast.stage("calibration", 0.0)
     now[0] = 3 * plan.seconds(0)["calibration"]
     forecast.stage("calibration", 1.0)
-    forecast.stage("shutter", 0.0)
     other = PosedPlan(ReconstructConfig(), 50, SIZE, False)
     forecast.change(other)
     for _ in range(20):

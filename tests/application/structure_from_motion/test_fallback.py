@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from geogs.application import remedy
-from geogs.application.calibrate import with_shutter_found
+from geogs.application.calibrate import self_calibrated
 from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, run_state
 from geogs.application.results.result import Result
@@ -146,7 +146,7 @@ def tracked(once) -> Path:
 
     def track(folder: Path) -> None:
         settings = record(RunSettings, parse(write_video(folder.parent / "video")[1:]))
-        source = with_shutter_found(open_source(settings.source, settings.config.input))
+        source = self_calibrated(open_source(settings.source, settings.config.input))
         slam = Slam(source.camera, settings.config, "cpu", defers_map=True)
         for frame in source:
             slam.process(frame)

@@ -9,10 +9,9 @@ import pytest
 from geogs.camera.shutter.shutter import Shutter
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources import readout_clips as clips
 from geogs.io.sources.frame_source import Source
 from geogs.io.sources.sniff import open_source
-from io_samples import write_image, write_video
+from io_samples import write_image
 from rolling_scenes import RATE, READOUT, global_image, hand_held, rolling_frames, rolling_image
 
 INTRINSICS = "150,150,95.5,71.5"
@@ -127,41 +126,15 @@ def test_distortion_and_rows_are_undone_at_once(tmp_path):
     assert difference(both, true) < 0.35 * difference(one, true)
 
 
-def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
-    monkeypatch.setattr(clips, "CLIP", 3)
-    monkeypatch.setattr(clips, "CLIPS", 3)
-    for k in range(14):
+def test_images_as_recorded_skip_none_and_are_not_rectified(tmp_path):
+    for k in range(10):
         write_image(tmp_path / f"{k:03d}.png", np.full((48, 64, 3), k, np.uint8))
-    source = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=1, stop=13, stride=2))
-    given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.followed_clips.read(0)]
-    assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
-    short = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=2, stop=11))
-    monkeypatch.setattr(clips, "CLIP", 30)
-    given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in short.followed_clips.read(0)]
-    assert given == [[2, 3, 4, 5], [4, 5, 6, 7], [7, 8, 9, 10]]
-    assert clips.clip_starts(0, 2, 3) == []
-    assert clips.clip_starts(4, 5, 3) == [4, 6]
-    assert clips.clip_starts(4, 4, 3) == [4]
-
-
-def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
-    monkeypatch.setattr(clips, "CLIP", 3)
-    images = [np.full((48, 64, 3), 12 * k, np.uint8) for k in range(12)]
-    write_video(tmp_path / "video.mp4", images)
-    source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5", start=1))
-    given = [
-        [round(raw.image.mean() / 12) for raw in clip] for clip in source.followed_clips.read(0)
-    ]
-    assert given == [[1, 2, 3], [3, 4, 5], [5, 6, 7], [7, 8, 9], [9, 10, 11]]
-
-
-@pytest.mark.parametrize(("interval", "images"), [(200, 15), (10_000, 1)])
-def test_clips_of_few_images_a_second_last_three_seconds(tmp_path, interval, images):
-    shown = [np.full((48, 64, 3), 6 * k, np.uint8) for k in range(40)]
-    times = [interval * k for k in range(40)]
-    write_video(tmp_path / "video.mp4", shown, times)
-    source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5"))
-    assert {len(clip) for clip in source.followed_clips.read(0)} == {images}
+    config = InputConfig("50,50,31.5,23.5", start=1, stop=8, stride=3, readout=READOUT)
+    source = open_source(tmp_path, config)
+    frames = list(source.as_recorded())
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == list(range(1, 8))
+    assert all(frame.rows is None for frame in frames)
+    assert [int(frame.image[0, 0, 0]) for frame in source] == [1, 4, 7]
 
 
 def test_who_says_what_the_shutter_is(folder):

@@ -12,11 +12,13 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.growing_bundle import LEAST_DECREASE, PATIENT
+from geogs.tracking.calibration.unknowns import Unknowns
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 GUESS = Camera(277.1, 277.1, 159.5, 119.5, 320, 240)
 BARREL = GUESS.with_focal(224.0).moved(0.0, -0.185, 0.06)
+LENS = Unknowns(radial=True)
 NOISE = 0.3
 """Pixels."""
 
@@ -45,8 +47,8 @@ def swung(views: int, degrees: float) -> list[FlowMatch]:
 
 def test_a_barrel_is_found():
     flows = swung(8, 20.0)
-    tried = candidates(GUESS, radial=True)
-    starts = [try_candidate(lens, flows, 3.0, radial=True) for lens in tried]
+    tried = candidates(GUESS, LENS)
+    starts = [try_candidate(lens, flows, 3.0, LENS) for lens in tried]
     for lens, start in zip(tried, starts, strict=True):
         if start is not None:
             print(round(lens.fx), lens.k1, "->", start.lens, round(start.cost, 3))
@@ -59,7 +61,7 @@ def test_from_both_sides_of_a_flat_valley_an_adjustment_comes_to_the_same_lens()
     """Of a turn by four degrees, which leaves the focal length open to some per cent."""
     flows, found = swung(8, 4.0), []
     for begun in (GUESS, BARREL):
-        start = try_candidate(begun, flows, 3.0, radial=True)
+        start = try_candidate(begun, flows, 3.0, LENS)
         assert start is not None
         n = len(flows) + 1
         problem = BundleProblem(
@@ -81,8 +83,9 @@ def test_from_both_sides_of_a_flat_valley_an_adjustment_comes_to_the_same_lens()
 
 
 def test_of_a_known_distortion_only_pinholes_are_tried():
-    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, radial=False))
-    assert {lens.fx for lens in candidates(GUESS, radial=False)} > {GUESS.fx}
+    assert all(lens.k1 == lens.k2 == 0 for lens in candidates(GUESS, Unknowns()))
+    assert {lens.fx for lens in candidates(GUESS, Unknowns())} > {GUESS.fx}
+    assert candidates(GUESS, Unknowns(focal=False)) == [GUESS]
 
 
 def test_of_two_minima_the_lens_that_bends_as_lenses_do_counts():

@@ -10,13 +10,15 @@ import torch
 
 import tracking_scenes
 from geogs.bundle.lens import lens_rays
+from geogs.camera.shutter.readout import FoundReadout
 from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import self_calibration, stretch
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
-from geogs.tracking.calibration.self_calibration import self_calibrate
+from geogs.tracking.calibration.self_calibration import _row_times, self_calibrate
+from geogs.tracking.calibration.unknowns import Unknowns
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
 
@@ -59,9 +61,9 @@ def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkey
     """Of a room rendered row by row; taken for those of a global shutter the lens is off."""
     readout, bundles, adjust = 0.025, [], GrowingBundle.adjust
 
-    def noted(bundle: GrowingBundle, radial: bool) -> bool:
+    def noted(bundle: GrowingBundle) -> bool:
         bundles.append(bundle)
-        return adjust(bundle, radial)
+        return adjust(bundle)
 
     monkeypatch.setattr(GrowingBundle, "adjust", noted)
     monkeypatch.setattr(stretch, "MAX_COST", np.inf)
@@ -69,7 +71,7 @@ def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkey
     guess, rolling = CAMERA.with_focal(0.8 * CAMERA.fx), RollingCamera(CAMERA)
     off, residuals = [], []
     for given in ({}, {"rolling": rolling, "readout": readout}, {"rolling": rolling}):
-        self_calibrate(iter(video), guess, **given)
+        self_calibrate(iter(video), guess, Unknowns(**given))
         off.append(abs(bundles[-1].lens.fx / CAMERA.fx - 1))
         residuals.append(bundles[-1].residual)
     print(off, residuals, bundles[-1].readout)
@@ -81,9 +83,39 @@ def test_rows_of_a_known_and_of_an_unknown_readout_are_seen_with_the_lens(monkey
 def test_images_that_are_far_apart_in_time_say_nothing_of_rows():
     slow = [replace(f, timestamp=float(f.index)) for f in frames(swinging(22))]
     guess = CAMERA.with_focal(0.8 * CAMERA.fx)
-    found = self_calibrate(slow, guess, rolling=RollingCamera(CAMERA))
+    found = self_calibrate(slow, guess, Unknowns(rolling=RollingCamera(CAMERA)))
     assert found.failure is None
     assert found.camera == self_calibrate(slow, guess).camera
+    assert found.readout == FoundReadout()
+
+
+def test_the_readout_is_found_where_the_lens_is_given():
+    """Of a room rendered row by row; the lens stays as it is given."""
+    for readout in (0.025, 0.0):
+        unknowns = Unknowns(focal=False, rolling=RollingCamera(CAMERA))
+        found = self_calibrate(rolled(30, readout), CAMERA, unknowns)
+        print(found.readout)
+        assert (found.camera, found.distortion, found.failure) == (CAMERA, None, None)
+        assert found.deviation == 0
+        assert abs(found.readout.best - readout) < max(2.5 * found.readout.error, 0.002)
+        assert found.readout.error < 0.004
+        assert found.readout.is_believed == (readout > 0)
+
+
+def test_times_of_rows_are_those_of_the_image_as_it_came():
+    """A quarter turn reads columns; of a barrel lens the times are nearest to the true ones."""
+    turned = _row_times(RollingCamera(CAMERA, quarter_turns=1), CAMERA)
+    first, last = turned.of(torch.tensor([[0.0, 0.0], [CAMERA.width - 1.0, 0.0]])).tolist()
+    assert (first, last) == (pytest.approx(0.5), pytest.approx(-0.5))
+    assert turned.per_row == pytest.approx(0.0, abs=1e-9)
+    barrel = RollingCamera(CAMERA, (-0.2, 0.05, 0.0, 0.0))
+    small = CAMERA.with_long_edge(CAMERA.long_edge // 2)
+    times = _row_times(barrel, small)
+    pixels = torch.rand(200, 2) * torch.tensor([small.width - 1.0, small.height - 1.0])
+    rays = np.c_[small.plane(pixels.double()).numpy(), np.ones(200)]
+    true = torch.from_numpy(barrel.line_times(barrel.pixels(rays)))
+    assert float((times.of(pixels) - true).abs().max()) < 0.04
+    assert float((times.of(pixels) - true).square().mean().sqrt()) < 0.012
 
 
 def rolled(count: int, readout: float) -> Iterator[Frame]:
@@ -105,7 +137,7 @@ def rolled(count: int, readout: float) -> Iterator[Frame]:
 
 @pytest.mark.long
 def test_the_distortion_of_a_pinhole_is_about_none():
-    found = self_calibrate(frames(swinging(22)), CAMERA.with_focal(200.0), radial=True)
+    found = self_calibrate(frames(swinging(22)), CAMERA.with_focal(200.0), Unknowns(radial=True))
     assert found.failure is None
     assert found.distortion is not None
     assert found.deviations is not None
@@ -127,7 +159,7 @@ def test_finds_the_distortion_of_a_barrel_lens():
         Frame(k, k / 30, cv2.remap(render(T, wide)[0], at, None, cv2.INTER_CUBIC))
         for k, T in enumerate(swinging(22))
     ]
-    found = self_calibrate(video, CAMERA.with_focal(190.0), radial=True)
+    found = self_calibrate(video, CAMERA.with_focal(190.0), Unknowns(radial=True))
     assert found.failure is None
     assert found.distortion is not None
     assert found.deviations is not None
@@ -157,7 +189,7 @@ def test_a_camera_that_only_turns_tells_its_focal_length():
 def test_a_camera_that_never_turns_does_not_tell_it():
     path = [pose(-0.5 + 0.04 * k, 0.1 * np.sin(0.5 * k), 0.0, 0.0) for k in range(24)]
     guess = CAMERA.with_focal(120.0)
-    found = self_calibrate(frames(path), guess, radial=True)
+    found = self_calibrate(frames(path), guess, Unknowns(radial=True))
     assert found.failure is not None
     assert "leaves the focal length unsure" in found.failure
     assert found.camera == guess

@@ -11,7 +11,7 @@ from geogs.tracking.flow.classical_flow import SMALL_IMAGE
 
 PIXELS = 320 * 240
 """Pixels of the images of the reference on a CPU, and of its maps."""
-BEFORE_MAP = ("calibration", "shutter", "frames", "bundle adjustment")
+BEFORE_MAP = ("calibration", "frames", "bundle adjustment")
 """Stages of a run until all keyframes have been adjusted."""
 AT_START = 12
 """Keyframes that the start of the map takes."""
@@ -24,7 +24,6 @@ class RunCosts:
     """Seconds of each part of a run on a machine of reference."""
 
     calibration: float
-    shutter: float
     frame: float
     start: float
     """The start of the map, from the first frames."""
@@ -55,7 +54,7 @@ class PosedCosts:
 
 # An H200: of runs at 600 x 340 with eight cores, whatever the size; of known poses at 800 pixels.
 # On a CPU two cores are the reference.
-RUN_ON_GPU = RunCosts(1.5, 0.3, 0.006, 0.5, 0.03, 0.02, 0.02, 0.004, 0.05, 3.0, 1.0)
+RUN_ON_GPU = RunCosts(5.0, 0.006, 0.5, 0.03, 0.02, 0.02, 0.004, 0.05, 3.0, 1.0)
 POSED_ON_GPU = PosedCosts(1.0, 0.01, 0.02, 0.01, 0.006, 0.05, 3.0, 1.0)
 
 
@@ -86,8 +85,7 @@ class RunPlan:
         matched = worked_on if fine or longer <= SMALL_IMAGE else worked_on / 4
         rendered = worked_on * min(self.config.mapping.render_long_edge / longer, 1.0) ** 2
         return RunCosts(
-            calibration=3.0 + 9.0 * worked_on,
-            shutter=0.7 * worked_on,
+            calibration=2.0 + 4.0 * worked_on,
             frame=0.025 * worked_on,
             start=2.2 * worked_on,
             keyframe=0.36 * worked_on,
@@ -119,7 +117,6 @@ class RunPlan:
             search *= mapping.final_depth
         return {
             "calibration": c.calibration * self.calibrates,
-            "shutter": c.shutter,
             "frames": self.tracked(self.frames, keyframes),
             "bundle adjustment": c.adjusted_keyframe * keyframes,
             "depth": search,

@@ -31,5 +31,5 @@ def offline_plan(
     before = {"choosing frames": _SECONDS_TO_CHOOSE * length, **seconds_to_place(chosen, length)}
     if not is_begun:
         begun = RunPlan(config, length, size, on_gpu, calibrates, True).seconds(0)
-        before = {stage: begun[stage] for stage in ("calibration", "shutter")} | before
+        before = {"calibration": begun["calibration"]} | before
     return PosedPlan(offline_config(config), chosen, size, on_gpu, before)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from geogs.camera.shutter.clip_tracks import FollowedClips
 from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.camera.shutter.shutter import Shutter
 from geogs.errors import InputError
@@ -211,17 +210,12 @@ class Source:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images of ``followed_clips``."""
+        """The camera of the first recording's images at working size, lens and rows as stored."""
         return self._recordings[0].rolling_camera
 
-    @property
-    def followed_clips(self) -> FollowedClips:
-        """Clips of the first recording's images at working size, lens and rows as stored."""
-        return self._recordings[0].followed_clips
-
-    def linked_frames(self) -> Generator[Frame, None, None]:
-        """The frames of the first recording, between which there is no cut."""
-        return iter(Source(self._recordings[:1]))
+    def as_recorded(self) -> Generator[Frame, None, None]:
+        """All frames of the first recording, whatever the stride, with their rows as they came."""
+        return iter(Source([self._recordings[0].as_recorded()]))
 
     def fingerprint(self) -> str:
         """Sixteen digits for each recording that change with the names and sizes of its files."""

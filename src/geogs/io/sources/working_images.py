@@ -4,14 +4,13 @@ A format supplies a reader (how images are stored); :class:`WorkingImages` adds 
 common: the selection, the calibration, the shutter, the working resolution and reading ahead.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from geogs.camera.shutter.angular_motion import AngularMotion
-from geogs.camera.shutter.clip_tracks import FollowedClips
 from geogs.camera.shutter.neighbours import with_angular_motion
 from geogs.camera.shutter.rolling_camera import RollingCamera
 from geogs.camera.shutter.rows import RowOffsets
@@ -35,7 +34,6 @@ from geogs.io.sources.reader import (
     read_ahead,
     read_side_by_side,
 )
-from geogs.io.sources.readout_clips import read_clips
 from geogs.io.sources.undistort import Rectifier, mask_as_image
 from geogs.threads import Each
 from geogs.types import MeasuredDepth, SeenRows
@@ -59,14 +57,13 @@ class WorkingImages:
         calibration: Calibration | None = None,
         shutter: Shutter | None = None,
         focal: float | None = None,
-        followed_clips: FollowedClips | None = None,
         overlay: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
         """``calibration`` of the upright images, instead of the reader's.
 
         ``shutter``, instead of the settings'; ``focal`` of the working images, instead of what the
-        settings ask for; ``followed_clips`` of the same recording; ``overlay``, true where all
-        images at working size show a static overlay.
+        settings ask for; ``overlay``, true where all images at working size show a static
+        overlay.
         """
         info = reader.info
         _check_selection(config, info.length)
@@ -93,8 +90,6 @@ class WorkingImages:
         self.shutter = shutter or given
         """The shutter by which rows are rectified; a global one until it is estimated."""
         self._focal = focal
-        self.followed_clips = followed_clips or FollowedClips(self._clips)
-        """Clips from all over the selection, at working size, with lens and rows as stored."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view, focal)
         self.camera = self._rectifier.camera
         """The pinhole camera of the working images."""
@@ -148,8 +143,15 @@ class WorkingImages:
         known = calibration.fit(info.width, info.height) if calibration else self.calibration
         return WorkingImages(
             self.reader, self._config, known, shutter or self.shutter, focal or self._focal,
-            self.followed_clips, self._overlay if overlay is None else overlay,
+            self._overlay if overlay is None else overlay,
         )  # fmt: skip
+
+    def as_recorded(self) -> "WorkingImages":
+        """All images of the selection, whatever the stride, with their rows as they came."""
+        config = replace(self._config, stride=1)
+        return WorkingImages(
+            self.reader, config, self.calibration, Shutter(), self._focal, self._overlay
+        )
 
     def spread(self, count: int) -> Iterator[RawFrame]:
         """So many images from all over the selection, at working size, lens and rows as stored;
@@ -175,14 +177,11 @@ class WorkingImages:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images of ``followed_clips``."""
+        """The camera of the images at working size, lens and rows as stored."""
         info = self.reader.info
         turns = info.quarter_turns
         lines = info.width if turns % 2 else info.height
         return self._rectifier.rolling_camera(lines, turns)
-
-    def _clips(self, first: int) -> Generator[list[RawFrame], None, None]:
-        return read_clips(self.reader, self._config, self._at_working_size, first)
 
     def _at_working_size(self, raw: RawFrame) -> RawFrame:
         """The image at working size, lens and rows as stored."""

@@ -19,6 +19,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.camera.distortion import USUAL_BEND
 from geogs.geometry.camera import Camera
+from geogs.tracking.calibration.unknowns import Unknowns
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.two_view import best_two_view, without
 from geogs.types import FlowMatch
@@ -55,19 +56,21 @@ class Start:
         return self.cost + BEND_COST * sum((k / usual) ** 2 for k, usual in bends)
 
 
-def candidates(camera: Camera, radial: bool) -> list[Camera]:
-    """The guess, pinholes of other fields of view, and barrels if lenses are ``radial``."""
+def candidates(camera: Camera, unknowns: Unknowns) -> list[Camera]:
+    """The guess, and where it may be wrong pinholes of other fields of view, and barrels."""
+    if not unknowns.focal:
+        return [camera]
     guess = camera.with_focal(camera.fx)
     pinholes = [guess, *map(camera.with_field_of_view, FIELDS_OF_VIEW)]
-    wide = [guess, camera.with_field_of_view(OF_BARREL)] if radial else []
+    wide = [guess, camera.with_field_of_view(OF_BARREL)] if unknowns.radial else []
     return [*pinholes, *(c.moved(0.0, *BARREL) for c in wide)]
 
 
 def try_candidate(
-    lens: Camera, flows: list[FlowMatch], min_parallax: float, radial: bool
+    lens: Camera, flows: list[FlowMatch], min_parallax: float, unknowns: Unknowns
 ) -> Start | None:
     """Place the keyframes by the pinhole of a lens and adjust them from there, at last with k1 and
-    k2 if ``radial``; None where it shows no parallax."""
+    k2 where these are unknown; None where it shows no parallax."""
     camera, flows = lens.pinhole, [f.on_cpu() for f in flows]
     grid = SampleGrid(camera)
     found = best_two_view(camera, flows[1::2], min_parallax)
@@ -89,7 +92,7 @@ def try_candidate(
         torch.arange(n) > 0, torch.ones(n, dtype=torch.bool),
         pixels=torch.cat([f.pixels for f in flows]), weight=torch.cat([f.weight for f in flows]),
     )  # fmt: skip
-    result = _adjusted(problem, LensBlock(lens, grid.pixels), radial)
+    result = _adjusted(problem, LensBlock(lens, grid.pixels, unknowns.focal), unknowns.radial)
     if result is None:
         return None
     return Start(
@@ -98,7 +101,7 @@ def try_candidate(
 
 
 def _adjusted(problem: BundleProblem, block: LensBlock, radial: bool) -> SharedResult | None:
-    """The problem adjusted from forgiving to strict, always with the focal length."""
+    """The problem adjusted from forgiving to strict, in the end with k1 and k2 if ``radial``."""
     result = None
     for huber, steps in _STAGES:
         block = replace(block, radial=radial and huber == _STAGES[-1][0])

@@ -7,11 +7,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from geogs.bundle.lens import UNIT
 from geogs.bundle.uncertainty.lens_error import STANDARD_ERRORS, LensEstimate
 from geogs.camera.distortion import USUAL_BEND
+from geogs.camera.shutter.readout import FoundReadout
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.degeneracy import MAX_RESIDUAL, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
+from geogs.tracking.calibration.unknowns import Unknowns
 
 LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree; nor are k1 and k2."""
@@ -32,6 +35,8 @@ class Estimate:
     covariance: Float64[Tensor, "3 3"]
     """Covariance of log focal length, k1 and k2; zero for those that are known."""
     keyframes: int
+    readout: FoundReadout | None = None
+    """None where it was not asked for, or images are too far apart to show it."""
 
     @property
     def deviations(self) -> tuple[float, float, float]:
@@ -45,8 +50,8 @@ class Estimate:
         return self.deviations[0]
 
 
-def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
-    """Estimate by an adjusted stretch, with k1 and k2 if ``radial``, or why it is not believed."""
+def estimate(bundle: GrowingBundle, unknowns: Unknowns) -> Estimate | str:
+    """Estimate by an adjusted stretch, or why it is not believed."""
     result = bundle.result
     assert result is not None
     lens = result.block.lens
@@ -56,11 +61,15 @@ def estimate(bundle: GrowingBundle, radial: bool) -> Estimate | str:
     bends = zip((lens.k1, lens.k2), USUAL_BEND, strict=True)
     if any(abs(k) > MOST_BEND * usual for k, usual in bends):
         return "its lens seems to bend as none does"
-    if bundle.residual > MAX_RESIDUAL:
+    if unknowns.focal and bundle.residual > MAX_RESIDUAL:
         return Degeneracy.UNEXPLAINED.value
-    asked = torch.tensor([1, radial, radial], dtype=torch.float64)
-    covariance = STANDARD_ERRORS**2 * result.covariance[:3, :3] + LEAST_DEVIATION**2 * asked.diag()
-    said = with_prior(Estimate(lens, covariance, len(bundle)))
+    asked = torch.tensor([unknowns.focal, unknowns.radial, unknowns.radial]).double()
+    whole = STANDARD_ERRORS**2 * result.covariance
+    covariance = whole[:3, :3] + LEAST_DEVIATION**2 * asked.diag()
+    readout = None
+    if result.block.rows is not None and result.block.rolls:
+        readout = FoundReadout(result.block.readout, UNIT * float(whole[3, 3].sqrt()))
+    said = with_prior(Estimate(lens, covariance, len(bundle), readout))
     if said.deviation < UNRELIABLE:
         return said
     return f"its motion leaves the focal length unsure by {100 * said.deviation:.0f} %"
@@ -75,4 +84,4 @@ def with_prior(said: Estimate) -> Estimate:
     for n, deviation in enumerate(USUAL_BEND, 1):
         told = told.told(n, 0.0, deviation)
     moved = lens.moved(*(told.size - size).tolist())
-    return Estimate(moved, told.covariance, said.keyframes)
+    return Estimate(moved, told.covariance, said.keyframes, said.readout)

@@ -5,16 +5,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.row_motions import RowMotions, RowTimes, fitted_twists
+from geogs.bundle.row_motions import RowMotions, fitted_twists
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared, usual_residual
 from geogs.geometry.lie import scaled
 from geogs.tracking.calibration.focal_candidates import Start
+from geogs.tracking.calibration.unknowns import OpenRows, Unknowns
 from geogs.tracking.calibration.view_gatherer import View
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.matching.pnp import pnp
@@ -39,17 +40,6 @@ class _Edge:
     fine: bool
 
 
-@dataclass(frozen=True)
-class OpenRows:
-    """Rows of a rolling shutter in images as they came."""
-
-    times: RowTimes
-    velocity: Callable[[View], tuple[Float[Tensor, "p 2"], Bool[Tensor, "p"]]]
-    """Pixels per second of what the cells of a view show, and where they are known."""
-    readout: float | None = None
-    """Seconds, where it is known."""
-
-
 class GrowingBundle:
     """Views placed so far, and the edges between them; mutable. Poses are on the CPU."""
 
@@ -59,13 +49,14 @@ class GrowingBundle:
         operator: FlowOperator,
         views: list[View],
         start: Start,
+        unknowns: Unknowns,
         rows: OpenRows | None = None,
     ) -> None:
         """The views that a candidate has placed, with the depth of the first one; ``rows`` where
         they may not all be seen at once."""
         self.grid = grid
         """Grid of the guess: of its camera nothing but the size is used."""
-        self._operator, self._rows = operator, rows
+        self._operator, self._unknowns, self._rows = operator, unknowns, rows
         self.lens = start.lens
         self.readout = (rows and rows.readout) or 0.0
         """Seconds."""
@@ -156,12 +147,12 @@ class GrowingBundle:
             weight=torch.stack([e.weight for e in edges]).cpu(),
         )
 
-    def adjust(self, radial: bool) -> bool:
-        """Solve for everything, k1 and k2 if ``radial``, and take it over; False if that fails."""
-        problem, rows = self.problem(), self._rows
+    def adjust(self) -> bool:
+        """Solve for everything and take it over; False if that fails."""
+        problem, asked = self.problem(), self._unknowns
         block = LensBlock(
-            self.lens, self.grid.pixels.cpu(), True, radial, self._motions(problem.inverse_depth),
-            self.readout, rows is not None and rows.readout is None,
+            self.lens, self.grid.pixels.cpu(), asked.focal, asked.radial,
+            self._motions(problem.inverse_depth), self.readout, asked.readout is None,
         )  # fmt: skip
         result = solve_shared(problem, block, PATIENT, LEAST_DECREASE)
         if not result.finite:

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate
-from geogs.tracking.calibration.growing_bundle import GrowingBundle, OpenRows
+from geogs.tracking.calibration.growing_bundle import GrowingBundle
+from geogs.tracking.calibration.unknowns import OpenRows, Unknowns
 from geogs.tracking.calibration.view_gatherer import View, ViewGatherer, flows_from_first
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
@@ -15,9 +16,10 @@ START_KEYFRAMES = 12
 """Keyframes of a stretch that are solved first, and by which it then grows."""
 KEYFRAMES = 24
 """Most keyframes of a stretch; they are added until the focal length is known well enough."""
-ENOUGH_DEVIATION = 0.01
-"""Relative deviation of the focal length from which no more keyframes of a stretch are used: all
-matches of the run are asked again at its end (docs/notebook/lens.md)."""
+ENOUGH_DEVIATION, ENOUGH_ERROR = 0.01, 0.003
+"""Relative deviation of the focal length, and seconds of the readout's, from which no more
+keyframes of a stretch are used: all matches of the run are asked again at its end
+(docs/notebook/lens.md)."""
 SMALL_IMAGE = 400
 """Pixels of the long edge of images that are matched at full resolution from the start, larger ones
 at half of it first."""
@@ -39,13 +41,12 @@ class Stretch:
         grid: SampleGrid,
         operator: FlowOperator,
         gatherer: ViewGatherer,
-        radial: bool,
+        unknowns: Unknowns,
         report: Report,
         rows: OpenRows | None = None,
     ) -> None:
-        """``radial``: whether k1 and k2 are found, too; so is the readout of ``rows`` that may not
-        all be seen at once."""
-        self.grid, self.operator, self.radial = grid, operator, radial
+        """``rows`` of a shutter that may roll."""
+        self.grid, self.operator, self.unknowns = grid, operator, unknowns
         self._gatherer, self._report, self._rows = gatherer, report, rows
         self._views: list[View] = []
         self._done = 0.0
@@ -67,7 +68,9 @@ class Stretch:
         start = self._start()
         if isinstance(start, Degeneracy):
             return start.value
-        bundle = GrowingBundle(self.grid, self.operator, self._views, start, self._rows)
+        bundle = GrowingBundle(
+            self.grid, self.operator, self._views, start, self.unknowns, self._rows
+        )
         said: Estimate | str = NOT_FOLLOWED
         while True:
             for view in self._views[len(bundle) :]:
@@ -78,9 +81,9 @@ class Stretch:
             for fine in (self.grid.camera.long_edge <= SMALL_IMAGE, True):
                 if not self._adjusted(bundle, fine):
                     return said
-            said = estimate(bundle, self.radial)
+            said = estimate(bundle, self.unknowns)
             self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
-            if isinstance(said, Estimate) and said.deviation < ENOUGH_DEVIATION:
+            if isinstance(said, Estimate) and _is_enough(said):
                 return said
             if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
                 return said
@@ -88,7 +91,7 @@ class Stretch:
     def _adjusted(self, bundle: GrowingBundle, fine: bool) -> bool:
         """Whether views were matched and adjusted."""
         bundle.measure(fine, self._tick)
-        return bundle.adjust(self.radial)
+        return bundle.adjust()
 
     def _start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
@@ -109,12 +112,12 @@ class Stretch:
     def _solve_start(self, flows: list[FlowMatch]) -> Start | Degeneracy:
         camera = self.grid.camera
         wrong = degeneracy(camera, flows, self._min_parallax)
-        if wrong is not None:
+        if wrong is not None and (self.unknowns.focal or wrong is not Degeneracy.PLANAR):
             return wrong
         # One after the other: beside each other their many small operations wait for Python.
         starts = (
-            try_candidate(lens, flows, self._min_parallax, self.radial)
-            for lens in candidates(camera, self.radial)
+            try_candidate(lens, flows, self._min_parallax, self.unknowns)
+            for lens in candidates(camera, self.unknowns)
         )
         found = [s for s in starts if s is not None]
         if not found:
@@ -123,3 +126,9 @@ class Stretch:
         # Rows that roll are not explained yet.
         is_explained = best.cost <= MAX_COST or self._rows is not None
         return best if is_explained else Degeneracy.UNEXPLAINED
+
+
+def _is_enough(said: Estimate) -> bool:
+    """Whether more keyframes need not be asked."""
+    readout = said.readout
+    return said.deviation < ENOUGH_DEVIATION and (readout is None or readout.error < ENOUGH_ERROR)
