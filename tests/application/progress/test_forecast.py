@@ -93,7 +93,7 @@ def test_a_run_that_goes_on_expects_only_what_is_left():
         now[0] += 0.12
         forecast.frame(frame, frame // 4)
     seconds = plan.seconds(250)
-    after = sum(seconds.values()) - seconds["frames"] - seconds["shutter"]
+    after = sum(seconds.values()) - seconds["frames"]
     assert forecast.left() == pytest.approx(after, rel=0.2)
 
 
