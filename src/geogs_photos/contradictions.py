@@ -30,7 +30,7 @@ MAX_ROTATION_DISAGREEMENT_DEG = 20.0
 step to the side makes of a scene that is equally far everywhere."""
 FOLLOWING_WEIGHT = 200
 """Times that matches of frames that follow one another count; those that speak for the poses twice
-that, as few false ones are among many true ones anywhere (docs/photographs.md)."""
+that, as few false ones are among many true ones anywhere (docs/notebook/photographs.md)."""
 _FOLLOWING_WEIGHT_IN_CUTS = 1000
 """Times that they do where a cut is looked for: it goes through others, however many, where it can,
 rather than around single frames that few hold."""

@@ -12,7 +12,8 @@ from geogs_photos.pycolmap_library import load_colmap
 
 COMMON_ERROR_FACTOR = 2.3
 """Times a deviation is larger than if all points erred by themselves: one that is seen a little
-beside its place is so in most views. Measured on videos with a truth (docs/photographs.md)."""
+beside its place is so in most views. Measured on videos with a truth
+(docs/notebook/photographs.md)."""
 NEAREST = 0.02
 """Part of the median depth of what a picture sees: a point nearer to it is false, and would be
 worth more than thousands of others. One in the very centre of a picture's camera, as false matches

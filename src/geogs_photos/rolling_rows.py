@@ -22,7 +22,7 @@ MAX_READOUT = 2.0
 """Largest readout, over the one that is tried."""
 UNSURE_FRACTION = 0.33
 """Part of what a readout moves that stays unsure, as motion between frames is only roughly known.
-Measured on videos with a truth (docs/photographs.md)."""
+Measured on videos with a truth (docs/notebook/photographs.md)."""
 _MAX_GAP = 2.5
 """Times the usual step of time from which on motion between two frames is not known."""
 

@@ -30,7 +30,7 @@ MAX_LOST = 250
 first, or every third, ..."""
 FACTOR_WITHOUT_READOUT = 3.0
 """Factor on deviations where no readout is known by which the rows could be rectified.
-Measured on a phone's video with a truth (docs/photographs.md)."""
+Measured on a phone's video with a truth (docs/notebook/photographs.md)."""
 STAGE = "lost frames"
 
 
