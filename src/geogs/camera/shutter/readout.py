@@ -9,8 +9,6 @@ LONGEST, SHORTEST = 0.036, 0.002
 """Seconds of a readout that is believed; less is nothing to care about."""
 LEAST_EVIDENCE = 4.0
 """Standard errors by which the readout differs from a global shutter's."""
-LARGEST_ERROR = 0.006
-"""Seconds of standard error with which a readout is believed."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +23,13 @@ class FoundReadout:
     @property
     def is_believed(self) -> bool:
         """Whether the video says that its shutter rolls."""
-        clear = self.error <= LARGEST_ERROR and self.best >= LEAST_EVIDENCE * self.error
-        return clear and SHORTEST <= self.best <= LONGEST
+        is_clear = self.best >= max(LEAST_EVIDENCE * self.error, SHORTEST)
+        return is_clear and self.best - self.error <= LONGEST
 
     @property
     def readout(self) -> float:
         """Seconds; 0 where no other is believed."""
-        return self.best if self.is_believed else 0.0
+        return min(self.best, LONGEST) if self.is_believed else 0.0
 
     @property
     def left_open(self) -> float:
