@@ -1,7 +1,6 @@
 """Photographs without poses: these are found once, kept beside the result, and read from there."""
 
 import json
-from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.replacement import replaced
-from geogs_photos.effort import features_for, stages_of_poses, what_does_not_fit
+from geogs_photos.effort import features_for, what_does_not_fit
 from geogs_photos.photograph import PhotoFolder, find_photographs
 from geogs_photos.poses import FoundPoses, find_poses
 
@@ -32,7 +31,6 @@ def open_photographs(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     seconds: float | None = None,
-    expects: Callable[[int, Mapping[str, float]], None] = lambda count, stages: None,
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
@@ -56,7 +54,6 @@ def open_photographs(
         count = len(some)
         progress.write(what_does_not_fit(count, seconds))
         most = features_for(count, seconds)
-        expects(count, stages_of_poses(count, most))
         with replaced(kept, "beside") as new:
             model_new = new / model.relative_to(kept)
             found = find_poses(chosen, model_new, selection.intrinsics, config.seed, report, most)

@@ -114,8 +114,8 @@ class Impatient(geogs.application.RunProgress):
         self.said: list[str] = []
         self.seen = 0
 
-    def expect(self, frames: int | None, begun: int = 0) -> None:
-        assert (frames, begun) == (FRAMES, 0)
+    def expect(self, frames: int | None) -> None:
+        assert frames == FRAMES
 
     def frame(self, status: PoseEstimate) -> None:
         self.seen = status.frames

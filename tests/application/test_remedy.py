@@ -1,6 +1,5 @@
 """What a run that lost its camera ends with: one command, that can be typed as it stands."""
 
-import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -42,11 +41,10 @@ def test_a_good_result_needs_none(photos):
     assert remedy(VIDEO, source(), GOOD, 90.0) == ""
 
 
-def test_where_structure_from_motion_was_not_tried_it_is_named_with_its_time(photos):
+def test_where_structure_from_motion_was_not_tried_it_is_named(photos):
     photos(False)
     said = remedy(VIDEO, source(), LOST, 90.0)
     assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --offline ")
-    assert re.search(r"in about [2-7] min", said)
     photos(True)
     said = remedy(replace(VIDEO, fallback=False), source(), LOST, 90.0)
     assert said.startswith("geogs run 'my video.mp4' --offline places")

@@ -79,9 +79,9 @@ def test_a_file_known_for_something_else_is_left_alone(places, monkeypatch):
 
 
 def test_of_several_files_the_first_of_the_catalogue_is_taken(places):
-    put(places["cache"] / "omnidata_normal_dpt_hybrid.pth")
-    put(places["package"] / "metric3d-vit-small.onnx")
-    assert find_weights("prior").name == "metric3d-vit-small.onnx"
+    put(places["cache"] / "metric3d-vit-small.onnx")
+    put(places["package"] / "depth-anything-v2-small.onnx")
+    assert find_weights("prior").name == "depth-anything-v2-small.onnx"
 
 
 def test_the_cache_is_geogs_own_where_that_is_set(tmp_path, monkeypatch):

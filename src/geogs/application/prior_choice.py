@@ -42,10 +42,6 @@ def _open(
             f"{', '.join(card_names())}."
         )
     card = load_card(card_name)
-    if card.runtime == "omnidata":
-        from geogs.priors.omnidata import OmnidataPrior
-
-        return OmnidataPrior(Path(model), card, device)
     from geogs.priors.onnx import OnnxPrior
 
     return OnnxPrior(Path(model), card, camera, device)

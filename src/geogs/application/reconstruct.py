@@ -2,7 +2,7 @@
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
@@ -17,7 +17,6 @@ from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.output_cost import OutputForecast
 from geogs.application.posed_views import PosedViews
-from geogs.application.progress.plan import PosedPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result
@@ -137,15 +136,6 @@ def reconstruct_to_folder(
         wanted = Path("out") / source.name
         if not settings.resume:
             wanted = free_folder(wanted, source.fingerprint())
-    end = None if settings.budget is None else begin + settings.budget
-
-    def plan(views: int, size: tuple[int, int], before: Mapping[str, float]) -> None:
-        """Tell what is going to be done, as soon as it is known."""
-        progress.plan(PosedPlan(config, views, size, device.type == "cuda", before, end))
-
-    def finding_poses(photographs: int, stages: Mapping[str, float]) -> None:
-        edge = config.input.long_edge or RECORDED
-        plan(photographs, (edge, 3 * edge // 4), stages)
 
     with (
         claimed(settings.output or wanted) as output,
@@ -155,10 +145,9 @@ def reconstruct_to_folder(
             with stop:
                 source = open_photographs(
                     settings.source, config, output, settings.hold_out, settings.resume, progress,
-                    stop, settings.budget, finding_poses,
+                    stop, settings.budget,
                 )  # fmt: skip
         begin += _compiled(device, kernels, settings.budget, progress)
-        plan(len(source), (source.camera.width, source.camera.height), {})
         left = left_of(settings.budget, begin)
         scene = Reconstruction(source.camera, config, str(device), left)
         driver = Driver(settings, output, device, progress, stop)

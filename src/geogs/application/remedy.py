@@ -5,7 +5,6 @@ import shlex
 from geogs.application.results.verdict import Verdict
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.fallback import impossible, is_wanted, saw_lens_vary
-from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.config import InputConfig, preset_of
 from geogs.evaluation.duration import duration
@@ -45,11 +44,7 @@ def remedy(
     again = f", in about {duration(took)}" if took else ""
     if not (is_placed_enough or _was_placed(settings, source)):
         install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
-        plan = offline_plan(settings.config, source, False, False, is_begun=True)
-        return (
-            f"{install}{command} --offline places the frames by structure from motion, in about "
-            f"{duration(sum(plan.seconds(0).values()))}."
-        )
+        return f"{install}{command} --offline places the frames by structure from motion."
     if settings.map is not None:
         return f"{command} makes a map of its own{again}."
     if source.calibration.focal_deviation:

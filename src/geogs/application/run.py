@@ -14,7 +14,6 @@ from geogs.application.machine.compilation import Compilation, compiling
 from geogs.application.machine.device import compile_gpu_kernels, gpu_errors_in_a_sentence
 from geogs.application.named_files import options_missing, with_files_of
 from geogs.application.prior_choice import open_prior
-from geogs.application.progress.plan import Plan, RunPlan
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.remedy import remedy
 from geogs.application.results.output_folder import claimed, free_folder
@@ -24,7 +23,6 @@ from geogs.application.run_settings import RunSettings
 from geogs.application.scale.known_length import SensorScale, scale_source
 from geogs.application.slam_in_python import go_on_in
 from geogs.application.structure_from_motion.fallback import TrackedOrPlaced
-from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.tracked_video import TrackedVideo
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
@@ -84,8 +82,6 @@ def run(
         compile_gpu_kernels(device)
         driver = Driver(settings, output, device, progress, stop, observer, kernels)
         opened = without_overlay(opened, progress)
-        if (plan := _plan(driver, opened)) is not None:
-            progress.plan(plan)
         if settings.offline:
             from geogs.application.structure_from_motion.offline import (
                 PlacedOffline,
@@ -94,7 +90,7 @@ def run(
 
             found = self_calibrated(opened, config, device, progress, stop)
             return driver.complete(PlacedOffline(config, beginning_with(opened, found)))
-        work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened, plan)
+        work = TrackedOrPlaced(_begun(settings, driver, opened, base), opened)
         return _completed(driver, settings, work)
 
 
@@ -130,22 +126,6 @@ def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool
         return False
     is_shown = observer is not None or settings.online_results or settings.map is not None
     return mapping.when == "after" or not is_shown
-
-
-def _plan(driver: Driver, source: Source, maps_at_end: bool | None = None) -> Plan | None:
-    """What is going to be done, where that is known."""
-    settings = driver.settings
-    if not isinstance(settings, RunSettings) or source.length is None:
-        return None
-    refines = settings.config.calibration.refine and source.is_calibration_open
-    calibrates = refines or source.is_shutter_open
-    on_gpu = driver.device.type == "cuda"
-    if settings.offline:
-        return offline_plan(settings.config, source, on_gpu, calibrates)
-    if maps_at_end is None:
-        maps_at_end = maps_at_the_end(settings, driver.observer)
-    size = source.camera.width, source.camera.height
-    return RunPlan(settings.config, source.length, size, on_gpu, calibrates, maps_at_end)
 
 
 def seen_by(base: SavedResult, config: Config) -> InputConfig:
@@ -222,9 +202,7 @@ def resume(
         frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, metadata, folder)
         driver = Driver(settings, folder, device, progress, stop, observer, kernels)
-        if (plan := _plan(driver, source, slam.world.maps_at_end)) is not None:
-            progress.plan(plan)
-        return _completed(driver, settings, TrackedOrPlaced(work, opened, plan))
+        return _completed(driver, settings, TrackedOrPlaced(work, opened))
 
 
 def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:

@@ -14,7 +14,6 @@ from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
 from geogs.application.machine.compilation import KERNELS_OF_MAP, KERNELS_OF_SEARCH
-from geogs.application.progress.plan import RunPlan
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
@@ -24,8 +23,8 @@ from geogs.slam import Slam
 from geogs.stopwatch import Stopwatch
 from geogs.types import Frame
 
-MIN_PREVIEW_SECONDS = 15.0
-"""Seconds for map and mesh, on the machine of reference, from which there is a preview."""
+MIN_PREVIEW_KEYFRAMES = 20
+"""Keyframes from which map and mesh take so long on a CPU that there is a preview."""
 INTERRUPTED_SECONDS = 40.0
 """Seconds for a map after an interruption, where there is none yet."""
 
@@ -62,7 +61,7 @@ class TrackedVideo:
         slam, source, progress = self.scene, self.source, driver.progress
         if not slam.world.maps_at_end:
             driver.kernels.wait(progress.stage)
-        progress.expect(source.length, slam.frames)
+        progress.expect(source.length)
         with closing(self.frames):
             outcome = self._track(driver, checkpoint)
         if outcome is not Outcome.MEMORY_FULL and outcome is not Outcome.FINISHED:
@@ -135,12 +134,9 @@ class TrackedVideo:
 
     def _write_preview(self, driver: Driver) -> None:
         """A rough mesh for who would wait long for the other."""
-        slam, settings = self.scene, self.metadata.settings
-        if slam.world.keyframes.grid.on_gpu:  # there the map is made in seconds
-            return
-        size = slam.camera.width, slam.camera.height
-        plan = RunPlan(settings.config, slam.frames, size, False, False, maps_at_end=True)
-        if plan.seconds_to_map(len(slam.segments.main.segment.ids)) < MIN_PREVIEW_SECONDS:
+        slam = self.scene
+        is_short = len(slam.segments.main.segment.ids) < MIN_PREVIEW_KEYFRAMES
+        if is_short or slam.world.keyframes.grid.on_gpu:  # there the map is made in seconds
             return
         from geogs.application.results.preview import NAME, write_preview
 

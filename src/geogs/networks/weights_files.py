@@ -63,11 +63,6 @@ CATALOGUE = (
         _HUB + "onnx-community/metric3d-vit-small (onnx/model.onnx)",
         "CC0-1.0 by that page; BSD-2-Clause repository of the authors",
     ),
-    KnownWeights(
-        "omnidata_normal_dpt_hybrid.pth", "prior",
-        "Omnidata DPT-hybrid: normals; a PyTorch checkpoint",
-        _HUB + "sashasax/omnidata_normal_dpt_hybrid_384", "CC-BY-NC-4.0",
-    ),
 )  # fmt: skip
 """In the order of preference for each purpose."""
 

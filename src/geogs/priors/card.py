@@ -24,8 +24,6 @@ class PriorCard:
     source: str
     """Where the network is described, and where its file comes from."""
     licence: str
-    runtime: Literal["onnx", "omnidata"] = "onnx"
-    """onnx, or omnidata for the published checkpoints of that network."""
     note: str = ""
     """What a user should know; what could not be confirmed."""
     resize: Literal["stretch", "at_least", "pad", "multiple"] = "stretch"

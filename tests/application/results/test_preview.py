@@ -36,7 +36,7 @@ class Looked(RunProgress):
 @pytest.mark.system
 @pytest.mark.usefixtures("no_report")
 def test_it_is_there_before_the_map_and_gone_with_the_result(small_room, tmp_path, monkeypatch):
-    monkeypatch.setattr(tracked_video, "MIN_PREVIEW_SECONDS", 0.0)
+    monkeypatch.setattr(tracked_video, "MIN_PREVIEW_KEYFRAMES", 0)
     config = quick_config(pose_iterations=0, final_iterations=10)
     config = replace(config, input=InputConfig(stop=FRAMES))
     output = tmp_path / "out"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.structure_from_motion import chosen_frames, offline_plan
+from geogs.application.structure_from_motion import chosen_frames, offline
 from geogs.application.structure_from_motion.offline import beginning_with
 from geogs.camera.shutter.shutter import Shutter
 from geogs.cli.main import main
@@ -39,7 +39,7 @@ def test_a_readout_found_of_few_images_a_second_is_left_to_their_residuals(
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(chosen_frames, "MIN_FRAMES", FRAMES // 2)
-    monkeypatch.setattr(offline_plan, "reconstruct_preset", lambda _: BRIEF)
+    monkeypatch.setattr(offline, "reconstruct_preset", lambda _: BRIEF)
     place, others = Localiser.place, list[int]()
 
     def place_but_one(self: Localiser, frame: Frame) -> np.ndarray | None:

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from geogs.application.progress.plan import Plan
     from geogs.pose_estimate import PoseEstimate
 
 
@@ -13,11 +12,8 @@ class RunProgress:
     def write(self, text: str) -> None:
         """A sentence for the user; nothing if it is empty."""
 
-    def plan(self, plan: "Plan") -> None:
-        """Called before the work that is planned so."""
-
-    def expect(self, frames: int | None, begun: int = 0) -> None:
-        """Called before the first of so many frames, if known; ``begun`` were done before."""
+    def expect(self, frames: int | None) -> None:
+        """Called before the first of so many frames, if known."""
 
     def frame(self, status: "PoseEstimate") -> None:
         """Called after each frame."""

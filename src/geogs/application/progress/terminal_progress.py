@@ -12,14 +12,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from geogs.application.machine.device import peak_memory
-from geogs.application.progress.forecast import Forecast
 from geogs.application.progress.run_progress import RunProgress
 from geogs.application.run_settings import Verbosity
 from geogs.errors import OutputError
 from geogs.evaluation.duration import duration
 
 if TYPE_CHECKING:
-    from geogs.application.progress.plan import Plan
     from geogs.pose_estimate import PoseEstimate
 
 _LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
@@ -54,7 +52,6 @@ class TerminalProgress(RunProgress):
         self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
         self._frames: int | None = None
         self._dropped = 0
-        self._forecast: Forecast | None = None
         self._printed = self._phase_began = time.perf_counter()
         self._phase = self._stage = self._last = ""
         self._memory, self._measured = "", -math.inf
@@ -93,18 +90,9 @@ class TerminalProgress(RunProgress):
             Console(stderr=True, highlight=False).print(text, soft_wrap=True, markup=False)
         self._bar.console.print(text, soft_wrap=True, markup=False)
 
-    def plan(self, plan: "Plan") -> None:
-        """From now on the time that is left is that of all of it."""
-        if self._forecast is None:
-            self._forecast = Forecast(plan)
-        else:
-            self._forecast.change(plan)
-
-    def expect(self, frames: int | None, begun: int = 0) -> None:
+    def expect(self, frames: int | None) -> None:
         """Begin with the frames."""
         self._frames = frames
-        if self._forecast is not None:
-            self._forecast.expect(begun)
         self._enter("frames")
 
     def dropped(self, frames: int) -> None:
@@ -127,8 +115,6 @@ class TerminalProgress(RunProgress):
         info = "  ".join([*parts, self._memory_used()])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"
-        if self._forecast is not None:
-            self._forecast.frame(status.frames, status.keyframes)
         # Frames up to the first keyframes cost other than those after.
         stage = "frames" if status.keyframes else "first frames"
         self._show(stage, f"frame {status.frames}/{self._frames or '?'}", info, done)
@@ -143,8 +129,6 @@ class TerminalProgress(RunProgress):
     def stage(self, name: str, fraction: float) -> None:
         """Move the line to a stage, or within it."""
         self._enter(name.split(":")[0])
-        if self._forecast is not None:
-            self._forecast.stage(name, fraction)
         self._show(name, name, "", fraction)
 
     def _enter(self, phase: str) -> None:
@@ -179,8 +163,6 @@ class TerminalProgress(RunProgress):
         self._last = f", {info}" if info else ""
         self._bar.update(self._task, completed=done or 0.0)
         left = self._bar.tasks[0].time_remaining
-        if self._forecast is not None:
-            left = self._forecast.left()
         ahead = "" if left is None else f"about {duration(left)} left"
         self._bar.update(
             self._task, description=f"{what:<20}", percent=percent, info=info, left=ahead

@@ -9,7 +9,6 @@ import torch
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Driver, Outcome, Work
-from geogs.application.progress.plan import Plan
 from geogs.application.results.result import Result
 from geogs.application.results.verdict import (
     MAX_DEPTH_DEVIATION,
@@ -19,12 +18,10 @@ from geogs.application.results.verdict import (
 from geogs.application.run_settings import RunSettings
 from geogs.application.structure_from_motion.agreement import has_wrong_joint, rotations_agree
 from geogs.application.structure_from_motion.completion import LostFrames
-from geogs.application.structure_from_motion.offline_plan import offline_plan
 from geogs.application.structure_from_motion.photos import has_pycolmap
 from geogs.application.tracked_video import TrackedVideo
 from geogs.camera.straight_view import FrameViews, StraightView
 from geogs.errors import InputError, TrackingLost
-from geogs.evaluation.duration import duration
 from geogs.io.sources.frame_source import Source
 from geogs.slam import Slam
 from geogs.types import FoundFrames
@@ -47,10 +44,9 @@ class TrackedOrPlaced(Work):
     to be better, and wherever it fails or is stopped, the tracked result is what is kept.
     """
 
-    def __init__(self, tracked: TrackedVideo, opened: Source, plan: Plan | None = None) -> None:
-        """``opened`` is the video as it came, before the run calibrated it; ``plan`` is of the run
-        that tracks it, where that is known."""
-        self._tracked, self._opened, self._plan = tracked, opened, plan
+    def __init__(self, tracked: TrackedVideo, opened: Source) -> None:
+        """``opened`` is the video as it came, before the run calibrated it."""
+        self._tracked, self._opened = tracked, opened
         self._take(tracked)
 
     @property
@@ -78,8 +74,6 @@ class TrackedOrPlaced(Work):
                 placed = self._placed(driver, judged)
                 if placed is not None and self._is_mapped(placed, driver, checkpoint):
                     return Outcome.STOPPED if driver.stop.requested else outcome
-                if self._plan is not None:
-                    driver.progress.plan(self._plan)
                 if judged is not None and not judged.is_reliable:
                     self._find_lost(driver, self._result())
             outcome = Outcome.STOPPED if driver.stop.requested else outcome
@@ -142,17 +136,9 @@ class TrackedOrPlaced(Work):
 
         video = beginning_with(self._opened, self._tracked.source)
         placed = PlacedOffline(settings.config, video, self._tracked.scene.stopwatch)
-        if video.length is not None:
-            on_gpu = driver.device.type == "cuda"
-            plan = offline_plan(settings.config, video, on_gpu, False, is_begun=True)
-            driver.progress.plan(plan)
         if not self._succeeds(driver, lambda: placed.choose(driver)):
             return None
-        seconds = placed.seconds_to_place
-        say(
-            f"{_in_words(tracked)} Trying structure from motion, about {duration(seconds)}; Ctrl-C "
-            "keeps what was tracked."
-        )
+        say(f"{_in_words(tracked)} Trying structure from motion; Ctrl-C keeps what was tracked.")
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
         placed.scene.lens_varies = tracked is not None and saw_lens_vary(tracked)

@@ -13,16 +13,13 @@ from geogs.application.driver import Driver, Outcome, Work
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.application.structure_from_motion.chosen_frames import ChosenFrames, choose_frames
 from geogs.application.structure_from_motion.completion import LostFrames
-from geogs.application.structure_from_motion.offline_plan import offline_config
 from geogs.application.structure_from_motion.photos import (
     PlacedVideo,
     localiser,
     place_frames,
-    seconds_to_place,
 )
 from geogs.camera.straight_view import FrameViews, StraightView
-from geogs.config import Config, ReconstructConfig
-from geogs.evaluation.duration import duration
+from geogs.config import Config, ReconstructConfig, preset_of, reconstruct_preset
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import Source
@@ -34,6 +31,12 @@ from geogs.types import FoundFrames, Trajectory, Uncertainty
 MIN_CLIP_FPS = 8.0
 """Images a second, as recorded, below which a readout that nobody gave is not searched in clips:
 all images are placed then, and their residuals tell it with its error (docs/photographs.md)."""
+
+
+def offline_config(config: Config) -> ReconstructConfig:
+    """How the map is made of frames that were placed so, with the settings of a run."""
+    made = reconstruct_preset(preset_of(config))
+    return replace(made, seed=config.seed, input=config.input, mesh=config.mesh)
 
 
 class PlacedOffline(Work):
@@ -70,9 +73,6 @@ class PlacedOffline(Work):
             KeyboardInterrupt: it was stopped before there was a map.
         """
         self.choose(driver)
-        driver.progress.write(
-            f"Finding where they were taken takes about {duration(self.seconds_to_place)}."
-        )
         self.place(driver)
         return self.map(driver, checkpoint)
 
@@ -81,13 +81,6 @@ class PlacedOffline(Work):
         video = self.source
         with self._stopwatch("choosing frames"):
             self._chosen = choose_frames(video, video.fps, video.length, driver.report)
-
-    @property
-    def seconds_to_place(self) -> float:
-        """About how long :meth:`place` takes, once frames have been chosen."""
-        chosen = self._chosen
-        assert chosen is not None, "no frames have been chosen"
-        return sum(seconds_to_place(len(chosen.frames), len(chosen.timestamps)).values())
 
     def place(self, driver: Driver) -> None:
         """Poses of the chosen frames by structure from motion, of the others against their points.

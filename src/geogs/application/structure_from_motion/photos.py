@@ -1,7 +1,7 @@
 """Structure from motion of photographs and of videos, as another package registers it."""
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,7 +19,6 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.stopwatch import StageProgress
-from geogs.threads import worker_count
 from geogs.types import FoundFrames, Frame
 
 GROUP = "geogs.photos"
@@ -34,7 +33,6 @@ SECONDS_PER_FRAME = {
 }  # fmt: skip
 """Seconds of one core, by stage, to find where such a frame was taken: some 22 pairs of each are
 matched (50 frames of 512 pixels)."""
-SECONDS_PER_OTHER, SECONDS_TO_ADD = 0.3, 0.1
 """Seconds of one core to place another frame against their points, and to take one that has been
 placed into the map."""
 
@@ -70,15 +68,6 @@ class PlacedVideo:
     def all_points(self) -> Float64[np.ndarray, "k 3"]:
         """Every point once."""
         return np.unique(np.concatenate(self.positions), axis=0)
-
-
-def seconds_to_place(chosen: int, length: int) -> dict[str, float]:
-    """About how long the stages take that find where the frames of a video were taken, of which so
-    many are given to structure from motion."""
-    cores = worker_count()
-    found = {stage: chosen * seconds / cores for stage, seconds in SECONDS_PER_FRAME.items()}
-    placing = SECONDS_PER_OTHER * (length - chosen) / cores + SECONDS_TO_ADD * chosen
-    return {**found, "placing frames": placing}
 
 
 def has_pycolmap() -> bool:
@@ -157,7 +146,6 @@ def open_photographs(
     progress: RunProgress | None = None,
     stop: Stop | None = None,
     seconds: float | None = None,
-    expects: Callable[[int, Mapping[str, float]], None] = lambda count, stages: None,
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
@@ -173,8 +161,6 @@ def open_photographs(
         stop: ends it.
         seconds: for poses and map together; where they are few the poses take less effort, and
             ``progress`` hears at once what does not fit. None is no limit.
-        expects: hears, where poses have to be found, of how many photographs, and how many seconds
-            each stage of that takes.
 
     Raises:
         InputError: pycolmap is missing, or the photographs do not tell where they were taken.
@@ -182,9 +168,7 @@ def open_photographs(
         KeyboardInterrupt: it was stopped.
     """
     open_them = _registered("open_photographs")
-    source: PosedSource = open_them(
-        folder, config, kept, hold_out, again, progress, stop, seconds, expects
-    )
+    source: PosedSource = open_them(folder, config, kept, hold_out, again, progress, stop, seconds)
     return source
 
 
