@@ -12,7 +12,6 @@ from geogs.mesh.decimation.collapse import CollapsingMesh
 from geogs.mesh.decimation.deviation import device_deviations, host_deviations
 from geogs.mesh.denoise import denoised
 from geogs.mesh.triangle_mesh import Mesh
-from geogs.threads import worker_count
 
 QUANTILE = 0.99
 """Part of the vertices that may not lie farther from the decimated surface than is allowed."""
@@ -24,6 +23,9 @@ _BOUNDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 1.0)
 """Fractions of what is allowed to which costs of edges are held, one after the other."""
 _WORTH_A_LOOK = 0.98
 """Part of the triangles to which a wider bound has to bring a mesh, if that is to be checked."""
+_FIRST_BOUND, _LAST_BOUND, _WIDER = 1e-4, 0.02, 1.5
+"""Of a mesh that is to have no more than so many triangles: the first bound and the last, of its
+extent, and what each is times the one before."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
 
@@ -39,14 +41,7 @@ def decimate(mesh: Mesh, tolerance: float, smoothing: float = 0.0) -> Mesh:
     few = merged(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces), tolerance)
     if few is None:
         return mesh
-    colours = None
-    if mesh.colours is not None:
-        given = torch.from_numpy(mesh.colours).float()
-        mean, _ = few.means(given, torch.ones(len(given), dtype=torch.bool))
-        colours = (mean + 0.5).to(torch.uint8).numpy()
-    vertices = denoised(few.position, few.faces, smoothing)
-    new = Mesh.from_triangles(vertices.numpy(), few.faces.numpy())
-    return remove_degenerate_faces(replace(new, colours=colours))
+    return _coloured(mesh, few, denoised(few.position, few.faces, smoothing))
 
 
 def merged(
@@ -87,49 +82,49 @@ def _deviation(mesh: CollapsingMesh, before: Float[Tensor, "n 3"]) -> Float[np.n
 
 
 def with_at_most(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with about so many triangles, whatever that does to its surface; if it has no more
-    than that, the same."""
+    """The mesh with no more than so many triangles; if it has no more, the same.
+
+    Edges are collapsed up to a cost that grows until they are few enough. Borders are not: if the
+    mesh has too many, vertices are clustered in cubes that grow likewise.
+    """
     if len(mesh.faces) <= faces:
         return mesh
-    fewer = _simplified(mesh.vertices, mesh.faces, faces / len(mesh.faces))
-    if len(fewer[1]) > faces:  # of a mesh in scraps most is border
-        fewer = _simplified(*fewer, faces / len(fewer[1]), keep_borders=False)
-    return remove_degenerate_faces(_with_colours_of(mesh, *fewer))
+    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    bound = _FIRST_BOUND * size
+    few = CollapsingMesh(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces))
+    while len(few.faces) > faces and bound < _LAST_BOUND * size:
+        few = few.reduced(bound)
+        bound *= _WIDER
+    made = _coloured(mesh, few, few.position)
+    cube = _FIRST_BOUND * size
+    clustered = made
+    while len(clustered.faces) > faces:
+        clustered = _clustered(made, cube)
+        cube *= _WIDER
+    return clustered
 
 
-def _simplified(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    fraction: float,
-    keep_borders: bool = True,
-) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "l 3"]]:
-    """About that fraction of the faces."""
-    import fast_simplification
+def _clustered(mesh: Mesh, side: float) -> Mesh:
+    """The mesh with the vertices in each cube of this side merged into their mean."""
+    _, cluster = np.unique(np.floor(mesh.vertices / side), axis=0, return_inverse=True)
+    cluster = cluster.ravel()
+    number = np.bincount(cluster)[:, None]
+    means = [
+        np.stack([np.bincount(cluster, column) for column in values.T], 1) / number
+        for values in (mesh.vertices, mesh.colours)
+        if values is not None
+    ]
+    made = Mesh.from_triangles(means[0], cluster[mesh.faces])
+    colours = None if mesh.colours is None else (means[1] + 0.5).astype(np.uint8)
+    return remove_degenerate_faces(replace(made, colours=colours))
 
-    count = max(int(fraction * len(faces)), 4)
-    vertices, faces = fast_simplification.simplify(
-        vertices, faces, target_count=count, preserve_border=keep_borders
-    )
-    return vertices.astype(np.float32), faces.astype(np.int32)
 
-
-def _with_colours_of(
-    mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
-) -> Mesh:
-    """The vertices and faces with the colours of the mesh that they were made from.
-
-    Normals are their own: those of the mesh before, averaged, are noisier (of two rendered rooms
-    0.3 degrees farther from the truth in the median).
-    """
-    from scipy.spatial import cKDTree
-
-    made = Mesh.from_triangles(vertices, faces)
-    if mesh.colours is None:
-        return made
-    _, nearest = cKDTree(vertices).query(mesh.vertices, workers=worker_count())
-    count = np.bincount(nearest, minlength=len(vertices))
-    total = [np.bincount(nearest, channel, len(vertices)) for channel in mesh.colours.T]
-    colours = np.stack(total, -1) / np.maximum(count, 1)[:, None]
-    _, closest = cKDTree(mesh.vertices).query(vertices[count == 0])
-    colours[count == 0] = mesh.colours[closest]
-    return replace(made, colours=(colours + 0.5).astype(np.uint8))
+def _coloured(mesh: Mesh, few: CollapsingMesh, vertices: Float[Tensor, "k 3"]) -> Mesh:
+    """A decimated mesh with its vertices; colours are means of those that each stands for."""
+    colours = None
+    if mesh.colours is not None:
+        given = torch.from_numpy(mesh.colours).float()
+        mean, _ = few.means(given, torch.ones(len(given), dtype=torch.bool))
+        colours = (mean + 0.5).to(torch.uint8).numpy()
+    new = Mesh.from_triangles(vertices.numpy(), few.faces.numpy())
+    return remove_degenerate_faces(replace(new, colours=colours))
