@@ -13,7 +13,6 @@ from geogs.application.calibrate import lens_sentence
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.run_state import RunMetadata, RunState, run_state
 from geogs.application.driver import Driver, Outcome
-from geogs.application.machine.compilation import KERNELS_OF_MAP, KERNELS_OF_SEARCH
 from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import make_metric
 from geogs.application.scale.known_length import scale_source
@@ -123,12 +122,12 @@ class TrackedVideo:
     def _refine(self, driver: Driver) -> None:
         """The map; compiled is first what its depths need."""
         kernels = driver.kernels
-        kernels.wait(driver.report, KERNELS_OF_SEARCH)
+        kernels.wait(driver.report, "search")
 
         def report(stage: str, fraction: float) -> None:
             driver.report(stage, fraction)
             if fraction >= SEARCHED:
-                kernels.wait(driver.report, KERNELS_OF_MAP)
+                kernels.wait(driver.report, "train")
 
         self.scene.refine(report)
 

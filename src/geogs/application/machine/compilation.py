@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -21,18 +21,15 @@ from geogs.gpu.kernel_source import PACKAGE
 from geogs.kernel_folder import kernel_folder
 from geogs.stopwatch import StageProgress
 
-PARTS = {"search": 26, "train": 14, "mesh": 13}
-"""What is compiled side by side, and how many kernels that are called from Python; what is needed
-first goes first."""
-KERNELS_OF_SEARCH = PARTS["search"]
-KERNELS_OF_MAP = KERNELS_OF_SEARCH + PARTS["train"]
-KERNELS = sum(PARTS.values())
-ON_GPU = {"planes": 4, "turn": 3, "lens": 3}
+PARTS = "search", "train", "mesh"
+"""What is compiled side by side; what is needed first goes first."""
+ON_GPU = "planes", "turn", "lens"
 """The same where a GPU does the rest; what takes longest goes first."""
-POSED_ON_GPU = {"look": 5, "planes": 4}
+POSED_ON_GPU = "look", "planes"
 """The same where poses are known, too."""
 _NICENESS = 5
 """Added to the niceness of each part over what goes before it, images first of all."""
+_POLL_SECONDS = 0.05
 _OBJECTS = 100_000
 """New objects after which Python looks for garbage; a compiler makes many that stay."""
 _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
@@ -41,44 +38,36 @@ _SOURCES = ("**/*_kernels.py", "splat/cpu/*.py")
 class Compilation:
     """What other processes compile, each a part; nothing where all is there."""
 
-    def __init__(self, parts: "Sequence[tuple[subprocess.Popen[str], int]]" = ()) -> None:
-        """Processes in the order in which their kernels are needed, and how many each compiles."""
-        self._processes = [process for process, _ in parts]
-        self._kernels = [kernels for _, kernels in parts]
-        self._done = [0] * len(parts)
+    def __init__(self, parts: "Mapping[str, subprocess.Popen[str]] | None" = None) -> None:
+        """Processes by their parts, in the order in which these are needed."""
+        self._processes = parts or {}
 
     @property
     def is_working(self) -> bool:
         """Whether something has still to be compiled."""
-        return any(process.poll() is None for process in self._processes)
+        return any(process.poll() is None for process in self._processes.values())
 
-    def wait(self, report: StageProgress, first: int | None = None) -> float:
-        """Until all is compiled, or the ``first`` so many; how many seconds that took from now on.
+    def wait(self, report: StageProgress, last: str | None = None) -> float:
+        """Until all is compiled, or the parts up to the ``last`` that is needed, if that is among
+        them; how many seconds that took from now on.
 
         What ``report`` raises ends it early; what has failed is compiled when it is used.
         """
         start = time.perf_counter()
-        needed = sum(self._kernels) if first is None else first
-        left = needed
-        for part, process in enumerate(self._processes):
-            assert process.stdout is not None
-            wanted = min(left, self._kernels[part])
-            left -= wanted
-            while self._done[part] < wanted:
-                is_working = process.poll() is None
-                if not process.stdout.readline():
-                    break
-                self._done[part] += 1
-                if is_working:
-                    report("compiling, once", min(sum(self._done) / needed, 1.0))
+        names = [*self._processes]
+        needed = names[: names.index(last) + 1] if last in names else names
+        for done, part in enumerate(needed):
+            while self._processes[part].poll() is None:
+                report("compiling, once", done / len(needed))
+                time.sleep(_POLL_SECONDS)
         return time.perf_counter() - start
 
     def stop(self) -> None:
         """End the processes that still work."""
-        for process in self._processes:
+        for process in self._processes.values():
             process.terminate()
-        for process in self._processes:
-            process.communicate()
+        for process in self._processes.values():
+            process.wait()
 
 
 @contextmanager
@@ -89,13 +78,11 @@ def compiling(device: torch.device, knows_poses: bool = False) -> Iterator[Compi
     if is_compiled(parts) or not sys.executable:
         yield Compilation()
         return
-    none, pipe = subprocess.DEVNULL, subprocess.PIPE
-    begun = []
-    for part, kernels in parts.items():
+    none, begun = subprocess.DEVNULL, {}
+    for part in parts:
         command = [sys.executable, "-m", __name__, part]
         with contextlib.suppress(OSError):  # no memory, no more processes: compiled when it is used
-            process = subprocess.Popen(command, stdin=none, stdout=pipe, stderr=none, text=True)
-            begun.append((process, kernels))
+            begun[part] = subprocess.Popen(command, stdin=none, stdout=none, stderr=none, text=True)
     compilation = Compilation(begun)
     try:
         yield compilation
@@ -110,39 +97,16 @@ def is_compiled(parts: Iterable[str] = PARTS) -> bool:
     return False
 
 
-def compile_now(
-    parts: Iterable[str] = PARTS, report: Callable[[str], None] = lambda name: None
-) -> int:
-    """Compile what is not; ``report`` gets the name of each. Returns how many kernels that were."""
-    from numba.core import event
-
+def compile_now(parts: Iterable[str] = PARTS) -> None:
+    """Compile what is not, and keep a record of it."""
     from geogs.application.machine.rehearsal import rehearse
 
-    compiled: list[str] = []
-    depth = 0
-
-    class Listener(event.Listener):
-        """Kernels that others call are part of these; one at a time is compiled."""
-
-        def on_start(self, event: event.Event) -> None:
-            nonlocal depth
-            depth += 1
-
-        def on_end(self, event: event.Event) -> None:
-            nonlocal depth
-            depth -= 1
-            if not depth:
-                compiled.append(event.data["dispatcher"].py_func.__name__)
-                report(compiled[-1])
-
-    with event.install_listener("numba:compile", Listener()):
-        for part in parts:
-            rehearse(part)
+    for part in parts:
+        rehearse(part)
     with contextlib.suppress(OSError):
         for record in map(_record, parts):
             record.parent.mkdir(parents=True, exist_ok=True)
             record.write_text(_made_of())
-    return len(compiled)
 
 
 def _record(part: str) -> Path:
@@ -160,15 +124,15 @@ def _made_of() -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Compile all, or the parts that are named, with a line for each kernel."""
+    """Compile all, or the parts that are named."""
     parts = arguments or [*PARTS]
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # nobody reads them
     gc.freeze()
     gc.set_threshold(_OBJECTS)
     with contextlib.suppress(AttributeError, OSError):
-        os.nice(_NICENESS * (1 + [*(ON_GPU | POSED_ON_GPU | PARTS)].index(parts[0])))
+        os.nice(_NICENESS * (1 + [*POSED_ON_GPU, *ON_GPU, *PARTS].index(parts[0])))
     if not is_compiled(parts):
-        compile_now(parts, lambda name: print(name, flush=True))
+        compile_now(parts)
 
 
 if __name__ == "__main__":
