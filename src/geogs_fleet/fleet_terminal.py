@@ -39,7 +39,7 @@ def closing_message(rows: list[Row], computed: int, output: str, seconds: float)
     doubtful = sum(row.is_reliable is False for row in rows)
     parts = [f"{len(rows) - failed} of {_sources(len(rows))} done"]
     parts += [f"{failed} failed"] if failed else []
-    parts += [f"{doubtful} not to be relied on"] if doubtful else []
+    parts += [f"{doubtful} not reliable"] if doubtful else []
     said = f"{', '.join(parts)}; {computed} computed in {duration(seconds)}."
     return f"{said}\nOpen {output.rstrip('/')}/index.html in a browser."
 

@@ -38,7 +38,7 @@ class Row:
 
     @property
     def trouble(self) -> tuple[int, float]:
-        """Higher comes first in the table: failed, not to be relied on, much of it lost."""
+        """Higher comes first in the table: failed, not reliable, much of it lost."""
         rank = 3 if self.state != "done" else {False: 2, None: 1, True: 0}[self.is_reliable]
         return rank, self.numbers.get("lost", 0.0)
 

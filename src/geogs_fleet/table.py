@@ -83,7 +83,7 @@ def _figures(rows: Sequence[Row], waiting: int, seconds: float) -> FiguresSectio
     done = [row for row in rows if row.state == "done"]
     doubtful = sum(row.is_reliable is False for row in done)
     shown = [
-        ("done", len(done)), ("failed", len(rows) - len(done)), ("not to be relied on", doubtful),
+        ("done", len(done)), ("failed", len(rows) - len(done)), ("not reliable", doubtful),
         ("waiting", waiting),
     ]  # fmt: skip
     frames = sum(row.numbers.get("frames", 0) for row in done)

@@ -212,8 +212,8 @@ def test_a_lens_that_was_found_is_said_and_written(small_room, tmp_path, capfd, 
     with monkeypatch.context() as patched:
         patched.setattr(patch, bent)
         assert cli.main(["run", *argv, "-o", str(folder)]) == 0
-    (said,) = re.findall(r"Lens, by all matches, .*", capfd.readouterr().err)
-    assert "(none): k1 0.1000 +- 0.0020, k2 -0.0500 +- 0.0030" in said
+    (said,) = re.findall(r"Lens re-estimated: .*", capfd.readouterr().err)
+    assert "k1 0.1000 +- 0.0020, k2 -0.0500 +- 0.0030. Reuse it" in said
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["lens"] == asdict(found)
     document = json.loads((folder / "intrinsics.json").read_text())

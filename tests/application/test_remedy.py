@@ -47,7 +47,7 @@ def test_where_structure_from_motion_was_not_tried_it_is_named(photos):
     assert said.startswith("pip install 'geogs[photos]' && geogs run 'my video.mp4' --offline ")
     photos(True)
     said = remedy(replace(VIDEO, fallback=False), source(), LOST, 90.0)
-    assert said.startswith("geogs run 'my video.mp4' --offline places")
+    assert said.startswith("geogs run 'my video.mp4' --offline locates")
     metric = replace(VIDEO, scale_from="height:1.6")
     assert remedy(metric, source(), None).startswith("geogs run 'my video.mp4' --offline")
 
@@ -55,7 +55,11 @@ def test_where_structure_from_motion_was_not_tried_it_is_named(photos):
 @pytest.mark.parametrize(
     ("settings", "focal_deviation", "said"),
     [
-        (VIDEO, 0.09, " --intrinsics fx,fy,cx,cy takes the focal length that you know, in a"),
+        (
+            VIDEO,
+            0.09,
+            "If you know the focal length: geogs run 'my video.mp4' --intrinsics fx,fy,cx,cy, in a",
+        ),
         (VIDEO, 0.0, RECORD_AGAIN),
         (replace(VIDEO, offline=True), 0.0, RECORD_AGAIN),
         (replace(VIDEO, map=Path("old")), 0.0, " makes a map of its own, in about 1 min 30"),
@@ -70,7 +74,7 @@ def test_structure_from_motion_is_not_named_where_depths_are_what_is_not_known(p
     photos(False)
     flat = replace(GOOD, is_reliable=False, depth=0.29)
     assert remedy(VIDEO, source(), flat, 90.0) == RECORD_AGAIN
-    assert " --intrinsics fx,fy,cx,cy takes" in remedy(VIDEO, source(False, 0.09), flat, 90.0)
+    assert " --intrinsics fx,fy,cx,cy" in remedy(VIDEO, source(False, 0.09), flat, 90.0)
 
 
 def test_of_a_camera_the_recording_helps(photos):

@@ -40,8 +40,8 @@ def without_overlay(source: Source, progress: RunProgress | None = None) -> Sour
     if found is None:
         return source
     (progress or RunProgress()).write(
-        f"note: {found.mean():.1%} of the images always show the same, as a time stamp or a "
-        "bonnet would, and are masked out; --input.no-mask-overlay keeps that."
+        f"note: {found.mean():.1%} of each image never changes, as a time stamp or a bonnet, and "
+        "is masked out. --input.no-mask-overlay keeps it."
     )
     return source.without_overlay(found)
 
@@ -160,32 +160,32 @@ def _calibration_sentence(calibration: Calibration, assumed: str) -> str:
     if failure is None:
         return f"Intrinsics: {calibration.origin}."
     return (
-        f"warning: the video does not tell its focal length: {failure}; {assumed} is assumed until "
-        "all matches are asked at the end. Move sideways and turn while recording, or give "
-        "--intrinsics fx,fy,cx,cy."
+        f"warning: the focal length could not be estimated before the run: {failure}. Assuming "
+        f"{assumed}; it is estimated again at the end. Move sideways and turn while recording, or "
+        "give --intrinsics fx,fy,cx,cy."
     )
 
 
 def lens_sentence(before: Calibration, found: FoundLens, after: Calibration) -> str:
-    """What was known of a lens, what all matches say of it, and what was done, in a sentence."""
-    was = ",".join(f"{k:.4g}" for k in before.distortion) if before.is_distorted else "none"
-    focal = ""
+    """The lens as the final adjustment estimated it, and how to use it again, for a reader."""
+    changes = []
     if found.focal != 1:
         deviation = found.deviation_focal * after.fx
-        focal = f"fx {after.fx:.1f} +- {deviation:.1f} instead of {before.fx:.1f}, "
+        changes.append(f"fx {after.fx:.1f} +- {deviation:.1f} pixels (was {before.fx:.1f})")
     if found.is_off_centre:
         deviation = found.deviation_centre * after.fx
-        focal += f"principal point {after.cx:.1f}, {after.cy:.1f} +- {deviation:.1f}, "
+        changes.append(f"principal point {after.cx:.1f}, {after.cy:.1f} +- {deviation:.1f}")
     if found.varies_focal > 0:
-        focal += f"fx varies from image to image by {found.varies_focal:.2%} (focusing or a zoom), "
+        changes.append(f"fx varies by {found.varies_focal:.2%} from image to image")
     if found.varies_centre > 0:
         pixels = found.varies_centre * after.fx
-        focal += f"the principal point from image to image by {pixels:.1f} pixels (stabilisation), "
+        changes.append(f"the principal point varies by {pixels:.1f} pixels from image to image")
+    changes.append(f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}")
+    changes.append(f"k2 {found.k2:.4f} +- {found.deviation_k2:.4f}")
+    beside = " beyond the distortion given" if before.is_distorted else ""
     return (
-        f"Lens, by all matches, beside what was said of its distortion ({was}): {focal}"
-        f"k1 {found.k1:.4f} +- {found.deviation_k1:.4f}, k2 {found.k2:.4f} +- "
-        f"{found.deviation_k2:.4f}; poses, depths and the images of the map are corrected. Next "
-        f"time give --intrinsics {after.numbers} (intrinsics.json has it)."
+        f"Lens re-estimated: {', '.join(changes)}{beside}. Reuse it: --intrinsics {after.numbers} "
+        "(or intrinsics.json)."
     )
 
 

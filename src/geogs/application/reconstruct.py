@@ -195,7 +195,7 @@ class MappedImages(Work):
             resumed = read_work(driver.output, self._made_from)
             place = resumed.map.place
             done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
-            progress.write(f"Going on after {done}, {resumed.seconds:.0f} s into the work.")
+            progress.write(f"Continuing after {done}, {resumed.seconds:.0f} s into the work.")
         checks = progress if settings.check_poses and settings.poses == "given" else None
 
         def report(stage: str, fraction: float) -> None:

@@ -1,4 +1,4 @@
-"""What to do where a run lost its camera, or is not to be relied on: the command that may help."""
+"""What to do where a run lost its camera, or is not reliable: the command that may help."""
 
 import shlex
 
@@ -12,13 +12,12 @@ from geogs.io.sources.frame_source import Source
 from geogs.io.sources.posed.posed_source import PosedSource
 
 RECORD_AGAIN = (
-    "No setting is likely to help. Record it again: slowly, moving sideways instead of turning on "
-    "the spot, in good light, and geogs run it."
+    "Record the scene again: move slowly and sideways instead of turning on the spot, in good "
+    "light."
 )
 
 WITHOUT_STABILISATION = (
-    "No setting is likely to help. Record it again with stabilisation and autofocus off, without "
-    "zooming, and geogs run it."
+    "Record the scene again with stabilisation and autofocus off, and without zooming."
 )
 
 
@@ -44,11 +43,11 @@ def remedy(
     again = f", in about {duration(took)}" if took else ""
     if not (is_placed_enough or _was_placed(settings, source)):
         install = "" if has_pycolmap() else "pip install 'geogs[photos]' && "
-        return f"{install}{command} --offline places the frames by structure from motion."
+        return f"{install}{command} --offline locates the frames by structure from motion."
     if settings.map is not None:
         return f"{command} makes a map of its own{again}."
     if source.calibration.focal_deviation:
-        return f"{command} --intrinsics fx,fy,cx,cy takes the focal length that you know{again}."
+        return f"If you know the focal length: {command} --intrinsics fx,fy,cx,cy{again}."
     if settings.config.input.stride > 1:
         every = duration(settings.config.input.stride * took)
         return f"{command} --stride 1 takes every frame, in about {every}."

@@ -156,8 +156,8 @@ def _begun(
     )
     if has_checkpoint(driver.output):
         progress.write(
-            f"Starting anew; geogs run --resume {driver.output} would go on with the unfinished "
-            "run there, until the first checkpoint of this one."
+            f"Starting anew. geogs run --resume {driver.output} continues the unfinished run "
+            "there, until this one writes a checkpoint."
         )
     return TrackedVideo(slam, source, iter(source), metadata, driver.output)
 
@@ -197,7 +197,7 @@ def resume(
                 black_is_masked=source.black_is_masked, world=world,
                 focal_deviation=source.calibration.focal_deviation,
             )  # fmt: skip
-        progress.write(f"Going on after {slam.frames} frames.")
+        progress.write(f"Continuing after {slam.frames} frames.")
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = source.frames_after(saved.metadata.place)
         work = TrackedVideo(slam, source, frames, metadata, folder)

@@ -238,7 +238,7 @@ def _statistics(
     if unjoined:
         sentence += f" Nothing of the others was recognised in {', '.join(unjoined)}."
     if unreliable:
-        sentence += f" Not to be relied on by themselves: {', '.join(unreliable)}."
+        sentence += f" Not reliable by themselves: {', '.join(unreliable)}."
     return {
         "source": " + ".join(str(result.summary.get("source", result.name)) for result in results),
         "kind": "joined parts",

@@ -141,7 +141,7 @@ def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     assert "other settings" in said.splitlines()[-1]
     assert "Traceback" not in said
     assert cli.main([*map(str, call), "--resume"]) == 0
-    assert "Going on after" in capsys.readouterr().err
+    assert "Continuing after" in capsys.readouterr().err
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["interrupted"] is False
     assert "depth" not in summary["seconds"]

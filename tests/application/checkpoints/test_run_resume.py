@@ -108,12 +108,12 @@ def test_a_killed_run_goes_on_even_after_another_interruption(
     out = tmp_path / "out"
     shutil.copytree(killed, out)
     said = stop(["run", "--resume", str(out), *OFTEN], signal.SIGINT, checkpoints=2)
-    assert "Going on after" in said
+    assert "Continuing after" in said
     assert f"geogs run --resume {out} goes on from here." in said
     summary = json.loads((out / "summary.json").read_text())
     assert summary["interrupted"] is True
     assert summary["frames"] < FRAMES
-    assert f"Going on after {summary['frames']} frames." in goes_on(out, capsys)
+    assert f"Continuing after {summary['frames']} frames." in goes_on(out, capsys)
     assert not (out / "checkpoint").exists()
     for name in ("trajectory.tum", "keyframes.tum", "mesh.ply", "keyframes/rows.safetensors"):
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
@@ -172,7 +172,7 @@ def test_a_run_whose_gpu_fails_and_is_full_goes_on_each_time(
     assert said.endswith(way)
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["frames"], summary["interrupted"]) == (18, True)
-    assert "Going on after" in goes_on(out, capsys)
+    assert "Continuing after" in goes_on(out, capsys)
     assert not fails
     for name in ("trajectory.tum", "mesh.ply"):
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
@@ -192,8 +192,8 @@ def test_a_run_killed_in_its_final_stages_does_only_those_again(
     command = [sys.executable, "-c", STOPPED, str(int(signal.SIGKILL)), "trajectory.tum", "1"]
     done = subprocess.run([*command, *call], capture_output=True, text=True, timeout=1800)
     assert "exit code -9" in done.stdout, done.stderr
-    assert f"Starting anew; geogs run --resume {out} would go on" in " ".join(done.stderr.split())
-    assert f"Going on after {FRAMES} frames." in goes_on(out, capsys)
+    assert f"Starting anew. geogs run --resume {out} continues" in " ".join(done.stderr.split())
+    assert f"Continuing after {FRAMES} frames." in goes_on(out, capsys)
     assert (out / "mesh.ply").read_bytes() == (whole / "mesh.ply").read_bytes()
     assert [path.name for path in (out / "checkpoint").iterdir()] == ["notes.txt"]
     assert foreign.read_text() == "mine"

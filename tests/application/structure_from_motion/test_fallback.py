@@ -195,7 +195,7 @@ def test_placed_frames_are_taken_where_they_are_better(ended, tmp_path, monkeypa
     assert summary["seconds"]["structure from motion"] > 0
     assert summary["interrupted"] is False
     said = capfd.readouterr().err
-    assert "Trying structure from motion, about" in said
+    assert "Trying structure from motion;" in said
     assert "that is mapped now" in said
     placed = read_tum_trajectory(tmp_path / "out" / "trajectory.tum").T_wc[:, :3, 3]
     steps, truth = (
@@ -218,11 +218,11 @@ def test_what_was_tracked_stays_where_nothing_better_comes_of_it(
     plain = ended("plain")
     last = capfd.readouterr().out.splitlines()[-1]
     assert "pip install 'geogs[photos]' && geogs run" in last
-    assert "--offline places the frames by structure from motion." in last
+    assert "--offline locates the frames by structure from motion." in last
     monkeypatch.setattr(fallback, "has_pycolmap", lambda: True)
     monkeypatch.setattr(PlacedOffline, "place", fails)
     summary = ended()
-    assert "what was tracked stays" in capfd.readouterr().err
+    assert "the tracked result is kept" in capfd.readouterr().err
     assert "offline" not in summary
     assert summary["verdict"] == plain["verdict"]
     one, other = (tmp_path / name / "trajectory.tum" for name in ("plain", "out"))

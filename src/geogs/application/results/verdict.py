@@ -101,52 +101,52 @@ def verdict(
     depth, rotation = _median(known.depth), float(np.degrees(_median(known.rotation)))
     reasons = []
     if lost > MAX_LOST:
-        reasons.append(f"the camera was lost in {lost:.0%} of the frames")
+        reasons.append(f"{lost:.0%} of the frames are lost")
     if orientation_only > MAX_ORIENTATION_ONLY:
-        reasons.append(f"of {orientation_only:.0%} of the frames only the orientation is known")
+        reasons.append(f"{orientation_only:.0%} of the frames have an orientation but no position")
     if not position <= MAX_POSITION_DEVIATION:
-        known_to = "its place is known only to {:.0%} of the extent of its path"
-        reasons.append(_known_to(position, known_to, "nothing tells its place"))
+        known_to = "the expected position error is {:.0%} of the path's size"
+        reasons.append(_known_to(position, known_to, "positions could not be determined"))
     if not depth <= MAX_DEPTH_DEVIATION:
-        known_to = "even the best known depths are known only to {:.0%}"
-        reasons.append(_known_to(depth, known_to, "nothing tells the depths of what it sees"))
+        known_to = "the expected error of the best depths is {:.0%}"
+        reasons.append(_known_to(depth, known_to, "depths could not be determined"))
     if not known.focal <= MAX_FOCAL_DEVIATION:
-        known_to = "the video tells it only to {:.0%}"
-        focal = _known_to(known.focal, known_to, "the video does not tell it")
-        reasons.append(f"nobody said its focal length and {focal}: give --intrinsics")
+        known_to = "the focal length is uncertain by {:.0%}"
+        focal = _known_to(known.focal, known_to, "the focal length could not be estimated")
+        reasons.append(f"{focal}: give --intrinsics")
     elif not is_explained:
         reasons.append(
-            "no camera explains how its first views move, as if much of what they show moves "
-            "itself, and nobody said its focal length: give --intrinsics"
+            "no camera explains the motion at the start, perhaps because much of the view moves: "
+            "give --intrinsics"
         )
     if known.focal_change > MAX_FOCAL_CHANGE:
         reasons.append(
-            "parts of the video want focal lengths that differ by more than "
-            f"{known.focal_change:.0%}, as where somebody zooms"
+            f"the focal length differs by {known.focal_change:.0%} between parts of the video, as "
+            "with a zoom"
         )
     most = MAX_LENS_CHANGE_LEFT if known.lens_varies else MAX_LENS_CHANGE
     is_changing = known.lens_change > most
     if is_changing:
         reasons.append(
-            "the lens changes from image to image (stabilisation, focus, zoom) in a way that the "
-            "video does not tell"
+            "the lens changes from image to image (stabilisation, focus, zoom), and the change "
+            "could not be estimated"
         )
     if known.misfit > MAX_MISFIT:
         reasons.append(
-            f"the matches of a tenth of its keyframes fit {known.misfit:.1f} times less well than "
-            "the others', as where tracking fails"
+            f"a tenth of the keyframes fit their matches {known.misfit:.1f} times worse than the "
+            "others, as when tracking fails"
         )
     if known.joined < MIN_JOINED:
         reasons.append(
-            "nothing says how parts of its path stand to each other, the longest of which has "
-            f"{known.joined:.0%} of the keyframes, as where something fills the view"
+            f"only {known.joined:.0%} of the keyframes form one rigid structure, as when something "
+            "fills the view"
         )
     if reasons:
-        sentence = f"Not to be relied on: {'; '.join(reasons)}."
+        sentence = f"Not reliable: {'; '.join(reasons)}."
     else:
         sentence = (
-            "Trajectory and shape are reliable: the camera's place is known to "
-            f"{_finely(position)} of the extent of its path, the best known depths to {depth:.1%}."
+            "Trajectory and shape are reliable. Expected position error: "
+            f"{_finely(position)} of the path's size. Expected depth error: {depth:.1%}."
         )
     return Verdict(
         not reasons, sentence, lost, orientation_only, position, rotation, depth, known.focal,

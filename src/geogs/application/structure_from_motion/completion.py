@@ -80,17 +80,14 @@ class LostFrames:
         if not self.numbers or not self.known:
             return FoundFrames.none()
         say = driver.progress.write
-        say(
-            f"Frames without a place: {len(self.numbers)}; looking for it, about "
-            f"{duration(self.seconds)}."
-        )
+        say(f"{len(self.numbers)} frames not located; searching, about {duration(self.seconds)}.")
         try:
             with stopwatch(STAGE):
                 found = self._found(driver.report)
         except (InputError, RuntimeError) as error:  # of a library
-            say(f"That failed, they stay lost: {error}")
+            say(f"The search failed: {error}")
             return FoundFrames.none()
-        say(f"Structure from motion finds the place of {len(found)} of them.")
+        say(f"Structure from motion locates {len(found)} of them.")
         return found
 
     def _found(self, report: StageProgress) -> FoundFrames:

@@ -40,7 +40,7 @@ class TrackedOrPlaced(Work):
     """A tracked video, or its frames placed by structure from motion where that is clearly better.
 
     That is tried after the last frame and the adjustment, before there is a map, where the verdict
-    is that tracking is not to be relied on, or where many frames have no place. Until it is known
+    is that tracking is not reliable, or where many frames have no place. Until it is known
     to be better, and wherever it fails or is stopped, the tracked result is what is kept.
     """
 
@@ -128,7 +128,9 @@ class TrackedOrPlaced(Work):
             return None
         why_not = impossible(settings, self._opened)
         if why_not:
-            say(f"note: Structure from motion, which may place more frames, is left out: {why_not}")
+            say(
+                f"note: Structure from motion could locate more frames, but is not tried: {why_not}"
+            )
             return None
         if not has_pycolmap():
             return None
@@ -138,7 +140,7 @@ class TrackedOrPlaced(Work):
         placed = PlacedOffline(settings.config, video, self._tracked.scene.stopwatch)
         if not self._succeeds(driver, lambda: placed.choose(driver)):
             return None
-        say(f"{_in_words(tracked)} Trying structure from motion; Ctrl-C keeps what was tracked.")
+        say(f"{_in_words(tracked)} Trying structure from motion; Ctrl-C keeps the tracked result.")
         if not self._succeeds(driver, lambda: placed.place(driver)):
             return None
         placed.scene.lens_varies = tracked is not None and saw_lens_vary(tracked)
@@ -146,10 +148,10 @@ class TrackedOrPlaced(Work):
         is_other = tracked is not None and self._rotates_otherwise(placed)
         is_taken = is_better(found, tracked) and not is_other
         say(
-            f"Structure from motion places {_placed_part(found):.0%} of the frames, tracking "
-            f"{_placed_part(tracked):.0%}: "
-            + ("it turns the camera otherwise than tracking saw it, so " if is_other else "")
-            + ("that is mapped now." if is_taken else "what was tracked stays.")
+            f"Structure from motion locates {_placed_part(found):.0%} of the frames, tracking "
+            f"{_placed_part(tracked):.0%}. "
+            + ("Their rotations disagree. " if is_other else "")
+            + ("Its result is mapped." if is_taken else "The tracked result is kept.")
         )
         placed.scene.instead_of = _in_words(tracked)
         return placed if is_taken else None
@@ -174,7 +176,9 @@ class TrackedOrPlaced(Work):
         except (InputError, RuntimeError) as error:  # of a library; or the GPU's memory is full
             if isinstance(error, torch.cuda.OutOfMemoryError):
                 torch.cuda.empty_cache()
-            driver.progress.write(f"Structure from motion failed, what was tracked stays: {error}")
+            driver.progress.write(
+                f"Structure from motion failed; the tracked result is kept. {error}"
+            )
         return False
 
 
@@ -182,7 +186,7 @@ def is_wanted(tracked: Verdict | None) -> bool:
     """Whether another way to place the frames is worth its time; none where nothing was tracked."""
     if tracked is None or tracked.is_reliable:
         return _placed_part(tracked) < 1 - MAX_UNKNOWN
-    # As many frames are not to be relied on either where one lens for all of them is wrong.
+    # As many frames are not reliable either where one lens for all of them is wrong.
     as_many = _is_shape_known(tracked) and not saw_lens_vary(tracked)
     return as_many or _placed_part(tracked) <= 1 - CLEARLY_MORE
 

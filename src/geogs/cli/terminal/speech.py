@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     from geogs.application.results.result import Result
 
 
-NOT_JUDGED = (
-    "How far this is to be relied on was not worked out: the adjustment of all keyframes is "
-    "missing."
-)
+NOT_JUDGED = "Reliability unknown: the run was interrupted before the final adjustment."
 """Said of a run that was stopped."""
 
 
@@ -57,7 +54,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Result"]) -> "
 
 
 def _remedy(options: Verbosity, result: "Result") -> list[str]:
-    """The command that may help where a run came to its end and is not to be relied on."""
+    """The command that may help where a run came to its end and is not reliable."""
     from geogs.application.remedy import remedy
 
     if not isinstance(options, RunSettings) or result.is_interrupted:
