@@ -53,6 +53,7 @@ test-all: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python tests/budget.py
 	$(BIN)/lint-imports
 	$(BIN)/mypy
 
